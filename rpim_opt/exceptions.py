@@ -1,0 +1,47 @@
+"""Errors: each names the culprit, what was found, what is accepted, and the remedy."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+
+class RpimError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class InputError(RpimError):
+    """Something a user wrote cannot be used.
+
+    Reads as one sentence: ``file, where: found ..., accepted ...``. The parts stay
+    available as attributes ``file``, ``where``, ``found`` and ``accepted``.
+    """
+
+    def __init__(self, where: str, found: str, accepted: str, file: object = None):
+        self.file, self.where, self.found, self.accepted = file, where, found, accepted
+        place = f"{file}, {where}" if file else where
+        super().__init__(f"{place}: found {found}, accepted: {accepted}.")
+
+    def within(self, file: object) -> InputError:
+        """Return the same error with the file it occurred in."""
+        return self if self.file else InputError(self.where, self.found, self.accepted, file)
+
+
+class NoSolutionFound(RpimError):
+    """A convex program was not solved; ``program``, ``weight`` and ``status`` are the evidence."""
+
+    def __init__(self, program: Any, weight: float, status: str):
+        self.program, self.weight, self.status = program, weight, status
+        super().__init__(
+            f"Formulation '{program.formulation.name}' at weight {weight:.3g}: the solver ended with "
+            f"'{status}'; check that constraints and data can hold together, or change the weight."
+        )
+
+
+def choices(found: str, known: Iterable[str]) -> str:
+    """List what is known, what resembles ``found`` first."""
+    names = list(known)
+    close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
+    listed = ", ".join(names) if names else "nothing"
+    return f"{listed} (did you mean {' or '.join(close)}?)" if close else listed

@@ -1,0 +1,147 @@
+"""Files at the border: TOML in, checked against a model; JSON out, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+
+from rpim_opt.exceptions import InputError, choices
+from rpim_opt.units import UNITS, accepted_units, split_unit
+
+Length = Annotated[float, "length"]
+Angle = Annotated[float, "angle"]
+
+
+class Misfit(ValueError):
+    """A key that a table cannot have: pydantic adds where it stands."""
+
+    def __init__(self, key: str, found: str, accepted: str):
+        super().__init__(found)
+        self.key, self.found, self.accepted = key, found, accepted
+
+
+class Table(BaseModel):
+    """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
+
+    A field annotated ``Length`` or ``Angle`` (or listing both) is given under its name plus a unit.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
+
+    @classmethod
+    def _dimensions(cls) -> dict[str, tuple[str, ...]]:
+        known = {unit.dimension for unit in UNITS.values()}
+        return {
+            name: tuple(m for m in field.metadata if m in known)
+            for name, field in cls.model_fields.items()
+            if any(m in known for m in field.metadata)
+        }
+
+    @classmethod
+    def _accepted(cls) -> list[str]:
+        quantity = cls._dimensions()
+        names = []
+        for name, field in cls.model_fields.items():
+            dims = quantity.get(name)
+            names += [f"{name}_{u}" for d in dims for u in accepted_units(d)] if dims else [field.alias or name]
+        return names
+
+    @model_validator(mode="before")
+    @classmethod
+    def _to_si(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        quantity, si = cls._dimensions(), {}
+        plain = {field.alias or name for name, field in cls.model_fields.items() if name not in quantity}
+        for key, value in table.items():
+            stem, unit = split_unit(key)
+            if key in plain:
+                si[key] = value
+                continue
+            if stem not in quantity:
+                raise Misfit("", f"unknown key '{key}'", choices(key, cls._accepted()))
+            if unit is None or unit.dimension not in quantity[stem]:
+                names = [f"{stem}_{u}" for d in quantity[stem] for u in accepted_units(d)]
+                raise Misfit(key, "no unit that fits", ", ".join(names))
+            if stem in si:
+                raise Misfit(key, "the same quantity twice", "one of them")
+            si[stem] = _scaled(key, value, unit.si)
+        return si
+
+
+def _scaled(key: str, value: Any, si: float) -> Any:
+    if isinstance(value, list):
+        return [_scaled(key, v, si) for v in value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) == float("inf") or value != value:
+        raise Misfit(key, repr(value), "a finite number")
+    return float(value) * si
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return a TOML file's content.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is no TOML (with line and column).
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
+        raise InputError("the file", "nothing", choices(path.name, near), path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("the TOML text", str(error), "TOML 1.0", path) from None
+
+
+def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
+    """Return ``content`` as ``model``, or raise an InputError for the first thing that does not fit."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        misfit = (first.get("ctx") or {}).get("error")
+        where = _where(first["loc"])
+        if isinstance(misfit, Misfit):
+            where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
+            raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
+        if first["type"] == "missing":
+            raise InputError(f"key {where}", "nothing", "this key is required", file) from None
+        wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
+
+
+def _where(loc: tuple[int | str, ...]) -> str:
+    """Format pydantic's location the way a person counts: ``joint 3.a``."""
+    text = ""
+    for part in loc:
+        text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            json.dump(content, stream, indent=2, allow_nan=False)
+            stream.write("\n")
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+

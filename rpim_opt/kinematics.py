@@ -1,0 +1,146 @@
+"""Symbolic kinematics in CasADi: homogeneous transforms, the MDH chain, frames.
+
+Every function takes and returns CasADi ``SX`` (numbers are welcome) and builds 4 x 4 matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.robot import MDH, Array, Robot
+
+FRAME = ("x", "y", "z", "rx", "ry", "rz")
+"""A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
+
+JOINT_EXTRAS = {"ratio": "ratio", "ecc_cos": "angle", "ecc_sin": "angle", "compliance": "compliance"}
+"""Parameters of a joint beyond its MDH row, with their dimensions; all are zero in a nominal robot."""
+
+Symbol = Any  # ca.SX or a number: CasADi ships no types
+
+
+def rotation_x(angle: Symbol) -> ca.SX:
+    """Rot(x, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0])
+
+
+def rotation_y(angle: Symbol) -> ca.SX:
+    """Rot(y, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0])
+
+
+def rotation_z(angle: Symbol) -> ca.SX:
+    """Rot(z, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0])
+
+
+def translation(x: Symbol = 0, y: Symbol = 0, z: Symbol = 0) -> ca.SX:
+    """Trans(x, y, z)."""
+    return _rows([1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z])
+
+
+def _rows(*rows: Sequence[Symbol]) -> ca.SX:
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows), ca.horzcat(0, 0, 0, 1))
+
+
+def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> ca.SX:
+    """Return Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta), the paper's Eq. (1)."""
+    along_x = rotation_x(alpha) @ translation(x=a)
+    along_z = rotation_z(theta) @ translation(z=d)
+    return along_x @ along_z @ rotation_y(beta)
+
+
+def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
+    """Return Rz(rz) Ry(ry) Rx(rx): roll, pitch, yaw about fixed axes, as in URDF."""
+    return rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx)
+
+
+def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> ca.SX:
+    """Return a frame displaced from its nominal place.
+
+    The deviation (x, y, z, rx, ry, rz) is along and about the axes of the *parent* frame::
+
+        origin = nominal origin + (x, y, z)
+        R      = R(rx, ry, rz) R(nominal)
+
+    so that it is regular wherever the nominal frame points: adding to roll, pitch and yaw
+    instead would be singular at a nominal pitch of 90 degrees.
+    """
+    origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
+    return translation(*origin) @ rotation_rpy(*deviation[3:]) @ rotation_rpy(*nominal[3:])
+
+
+def chain(
+    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
+) -> ca.SX:
+    """Return the transform from the robot's base to its flange.
+
+    ``value("alpha2")`` gives the parameters. Joint i moves by
+
+        (1 + ratio) q + ecc_cos cos q + ecc_sin sin q + compliance torque        revolute
+        (1 + ratio) q                                                            prismatic
+
+    with the model's joint value q [rad or m] and the joint's torque [Nm].
+    """
+    T = ca.SX.eye(4)
+    for i, kind in enumerate(joint_types, start=1):
+        alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
+        motion = (1 + value(f"ratio{i}")) * q[i - 1]
+        if kind == "revolute":
+            motion += value(f"ecc_cos{i}") * ca.cos(q[i - 1]) + value(f"ecc_sin{i}") * ca.sin(q[i - 1])
+            motion += value(f"compliance{i}") * torque[i - 1]
+            T = T @ link(alpha, a, theta + motion, d, beta)
+        else:
+            T = T @ link(alpha, a, theta, d + motion, beta)
+    return T
+
+
+def forward_kinematics(robot: Robot, q: Array) -> Array:
+    """Return the flange's transforms (N, 4, 4) for the controller's joint values q (N, dof) [rad or m].
+
+    >>> from rpim_opt.robot import Robot
+    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> forward_kinematics(arm, np.zeros((1, 2)))[0, :3, 3].tolist()
+    [0.4, 0.0, 0.0]
+    """
+    configurations = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
+    symbol = ca.SX.sym("q", robot.dof)
+    nominal = {f"{column}{i + 1}": robot.mdh[i, j] for i in range(robot.dof) for j, column in enumerate(MDH)}
+    T = chain(robot.joint_types, ca.vertsplit(symbol), (0,) * robot.dof, lambda name: nominal.get(name, 0))
+    function = ca.Function("forward_kinematics", [symbol], [T])
+    return call_rows(function, [], configurations)[0].reshape(-1, 4, 4).transpose(0, 2, 1)
+
+
+def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+    """Evaluate a CasADi function on every row of a table in one call, without copies.
+
+    Parameters
+    ----------
+    function
+        Inputs: one column for each of ``shared``, then one column that changes with the row.
+    shared
+        Inputs that are the same for all rows.
+    rows
+        (N, k), one input column a row.
+
+    Returns
+    -------
+    For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
+    """
+    N = len(rows)
+    mapped = ca.Function.map(function, "rows", "serial", N, list(range(len(shared))), [], {})
+    results = [np.zeros((N, *reversed(function.size_out(i)))) for i in range(function.n_out())]
+    buffer, trigger = mapped.buffer()
+    arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
+    for i, values in enumerate(arguments):
+        buffer.set_arg(i, memoryview(values))
+    for i, values in enumerate(results):
+        buffer.set_res(i, memoryview(values))
+    trigger()
+    return results

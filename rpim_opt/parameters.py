@@ -1,0 +1,229 @@
+"""The parameters of a calibration: names, nominal values, expected sizes, tolerances, and which are identified."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.exceptions import InputError, choices
+from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, rotation_rpy
+from rpim_opt.robot import MDH, Array, Robot
+from rpim_opt.units import quantities, split_unit
+
+DEFAULT_SCALE = {
+    ("length", "length"): 1e-3,
+    ("angle", "angle"): 1e-3,
+    ("ratio", "ratio"): 1e-3,
+    ("compliance", "compliance"): 1e-5,
+    ("tool", "length"): 10e-3,
+    ("tool", "angle"): 10e-3,
+    ("base", "length"): 100e-3,
+    ("base", "angle"): 100e-3,
+}
+"""Expected size of deviations by (group, dimension), in SI, where a problem states none."""
+
+MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
+FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """A table of model parameters, one entry each in every field.
+
+    Parameters
+    ----------
+    names
+        ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz``
+        and those of the measurement; with several reflectors ``tool_A_x, ...``.
+    dimensions
+        ``length``, ``angle``, ``ratio``, ``compliance`` or ``number``.
+    nominal
+        (P,) where the deviations count from [SI].
+    scale
+        (P,) expected size of a deviation, its prior standard deviation [SI].
+    tolerance
+        (P,) largest deviation that a bounded calibration allows [SI]; infinite where there is none.
+    identified
+        (P,) which parameters a calibration may change.
+    """
+
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    nominal: Array
+    scale: Array
+    tolerance: Array
+    identified: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def take(self, index: np.ndarray) -> Parameters:
+        """Return the entries at ``index``."""
+        return Parameters(
+            tuple(self.names[i] for i in index),
+            tuple(self.dimensions[i] for i in index),
+            self.nominal[index],
+            self.scale[index],
+            self.tolerance[index],
+            self.identified[index],
+        )
+
+    @cached_property
+    def free(self) -> Parameters:
+        """Return the identified parameters alone, in the order of a calibration's unknowns."""
+        return self.take(np.flatnonzero(self.identified))
+
+    def identify(self, patterns: Iterable[str]) -> Parameters:
+        """Return the same table with just the parameters identified that match one of the patterns.
+
+        A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``.
+        """
+        chosen = np.zeros(len(self), dtype=bool)
+        for pattern in patterns:
+            hits = [fnmatchcase(name, pattern) for name in self.names]
+            if not any(hits):
+                raise InputError("key identify", f"pattern '{pattern}'", _summary(self.names, pattern))
+            chosen |= hits
+        return self._with(identified=chosen)
+
+    def values(self, x: Array) -> Array:
+        """Return the parameters' values (n,) at the deviations x (n,) of a table that holds just these.
+
+        A sum, except for the roll, pitch and yaw of a frame, whose deviation is a rotation about the
+        parent's axes (`kinematics.frame`): there the angles of the composed rotation.
+        """
+        result = self.nominal + x
+        index = {name: i for i, name in enumerate(self.names)}
+        for name in [n for n in self.names if n.endswith("_rx")]:
+            triple = [index.get(name[:-1] + axis) for axis in "xyz"]
+            if None not in triple:
+                R = ca.DM(rotation_rpy(*x[triple]) @ rotation_rpy(*self.nominal[triple])).full()
+                result[triple] = roll_pitch_yaw(R)
+        return result
+
+    def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
+        """Return the same table with other scales, given as in a problem file's ``[scale]``.
+
+        Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, or a single
+        parameter's name or pattern with a unit, ``d5_mm``.
+        """
+        return self._with(scale=self._overlay(self.scale, table, "scale", file))
+
+    def toleranced(self, table: Mapping[str, float], file: object = None) -> Parameters:
+        """Return the same table with other tolerances, given as in a problem file's ``[tolerance]``."""
+        return self._with(tolerance=self._overlay(self.tolerance, table, "tolerance", file))
+
+    def _with(self, **changes: np.ndarray) -> Parameters:
+        return Parameters(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, **changes})
+
+    def _overlay(self, values: Array, table: Mapping[str, float], where: str, file: object) -> Array:
+        groups = [group_of(name, dim) for name, dim in zip(self.names, self.dimensions, strict=True)]
+        stems: dict[str, set[str]] = {}
+        for name, group, dimension in zip(self.names, groups, self.dimensions, strict=True):
+            stems.setdefault(group, set()).add(dimension)
+            stems.setdefault(name, set()).add(dimension)
+        patterns = [key for key in table if re.search(r"[*?\[]", key)]
+        for key in patterns:
+            stem = split_unit(key)[0]
+            dims = {d for n, d in zip(self.names, self.dimensions, strict=True) if fnmatchcase(n, stem)}
+            stems.setdefault(stem, set()).update(dims)
+        try:
+            given = quantities(table, {stem: tuple(sorted(dims)) for stem, dims in stems.items()}, f"table {where}")
+        except InputError as error:
+            raise error.within(file) from None
+        result = values.copy()
+        general_first = sorted(given.items(), key=lambda item: (item[0][0] in self.names, item[0][0] in patterns))
+        for (stem, dimension), value in general_first:
+            if not value > 0:
+                raise InputError(f"table {where}, key {stem}", f"{value:g}", "a number greater than zero", file)
+            for i, name in enumerate(self.names):
+                if self.dimensions[i] == dimension and (stem == groups[i] or fnmatchcase(name, stem)):
+                    result[i] = value
+        return result
+
+
+def group_of(name: str, dimension: str) -> str:
+    """Return the group whose scale a parameter has: ``tool``, ``base``, or its dimension.
+
+    What a measurement adds of its own (an anchor, a plane) is placed like the instrument: ``base``.
+    """
+    if name.startswith(("tool_", "tool.")):
+        return "tool"
+    on_the_robot = re.fullmatch(rf"({'|'.join((*MDH, *JOINT_EXTRAS))})\d+", name)
+    return dimension if on_the_robot else "base"
+
+
+def model_parameters(
+    robot: Robot,
+    base: Sequence[float] = (0.0,) * 6,
+    tools: Mapping[str, Sequence[float]] | None = None,
+    own: Mapping[str, tuple[str, float]] | None = None,
+) -> Parameters:
+    """Return every parameter of a model, none of them identified yet.
+
+    Parameters
+    ----------
+    robot
+        Gives the MDH parameters' nominal values.
+    base
+        The robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
+    tools
+        Reflectors in the flange frame by marker; ``{"": frame}`` for the only one.
+    own
+        Further parameters, those of the measurement: name to (dimension, nominal value).
+    """
+    entries: list[tuple[str, str, float]] = []
+    for i in range(robot.dof):
+        entries += [(f"{c}{i + 1}", MDH_DIMENSION[c], robot.mdh[i, j]) for j, c in enumerate(MDH)]
+    for i, kind in enumerate(robot.joint_types, start=1):
+        extras = JOINT_EXTRAS if kind == "revolute" else {"ratio": "ratio"}
+        entries += [(f"{extra}{i}", dimension, 0.0) for extra, dimension in extras.items()]
+    places = {"base_": base}
+    for marker, tool in (tools or {"": (0.0,) * 6}).items():
+        places[f"tool_{marker}_" if marker else "tool_"] = tool
+    for prefix, place in places.items():
+        entries += [(prefix + c, FRAME_DIMENSION[c], v) for c, v in zip(FRAME, place, strict=True)]
+    entries += [(name, dimension, value) for name, (dimension, value) in (own or {}).items()]
+    names, dimensions, nominal = zip(*entries, strict=True)
+    scale = [DEFAULT_SCALE.get((group_of(n, d), d), 1.0) for n, d, _ in entries]
+    return Parameters(
+        names,
+        dimensions,
+        np.array(nominal, dtype=float),
+        np.array(scale),
+        np.full(len(names), np.inf),
+        np.zeros(len(names), dtype=bool),
+    )
+
+
+def roll_pitch_yaw(R: Array) -> Array:
+    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx; at a pitch of 90 degrees, where roll is arbitrary, roll 0."""
+    horizontal = np.hypot(R[0, 0], R[1, 0])
+    pitch = np.arctan2(-R[2, 0], horizontal)
+    if horizontal < 1e-12:
+        return np.array([0.0, pitch, np.arctan2(-R[0, 1], R[1, 1])])
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+
+
+def _summary(names: Sequence[str], pattern: str) -> str:
+    """List the known names, runs of a joint parameter shortened: ``alpha1..6``."""
+    runs: dict[str, list[int]] = {}
+    others = []
+    for name in names:
+        match = re.fullmatch(r"([a-z_]*[a-z])(\d+)", name)
+        if match:
+            runs.setdefault(match[1], []).append(int(match[2]))
+        else:
+            others.append(name)
+    known = [f"{stem}{min(n)}..{max(n)}" for stem, n in runs.items()]
+    hint = choices(pattern, names)
+    close = hint[hint.rfind(" (did") :] if " (did" in hint else ""
+    return "names or patterns of " + ", ".join(known + others) + close
+
+

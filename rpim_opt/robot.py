@@ -1,0 +1,151 @@
+"""The robot as its drawing says: a modified Denavit-Hartenberg table with Hayati's parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from rpim_opt.exceptions import InputError
+from rpim_opt.files import Angle, Length, Misfit, Table, read_toml, validate
+from rpim_opt.units import UNITS, accepted_units
+
+MDH = ("alpha", "a", "theta", "d", "beta")
+"""Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial arm.
+
+    Link i moves frame i-1 to frame i by (Craig's convention; paper, Eq. 1)::
+
+        Rot(x, alpha) Trans(x, a) Rot(z, theta + q) Trans(z, d) Rot(y, beta)      revolute
+        Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d + q) Rot(y, beta)      prismatic
+
+    where q are the joint values of the model, ``joint_map @ (joint values of the controller)``.
+
+    Parameters
+    ----------
+    name
+        What to call it.
+    mdh
+        (dof, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad].
+    joint_types
+        ``"revolute"`` or ``"prismatic"`` for every joint; all revolute by default.
+    joint_map
+        (dof, dof), the identity by default: signs and couplings between the controller's
+        joint values and the model's (a FANUC counts joint 3 from the horizontal).
+    limits
+        (dof, 2) lower and upper joint values of the controller [rad or m]; infinite where unknown.
+    source
+        Where the table comes from.
+    """
+
+    name: str
+    mdh: Array
+    joint_types: tuple[str, ...] = ()
+    joint_map: Array = field(default_factory=lambda: np.empty((0, 0)))
+    limits: Array = field(default_factory=lambda: np.empty((0, 0)))
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        mdh = _frozen(self.mdh)
+        if mdh.ndim != 2 or mdh.shape[1] != 5 or not len(mdh) or not np.isfinite(mdh).all():
+            raise InputError("mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)", self.name)
+        dof = len(mdh)
+        types = tuple(self.joint_types) or ("revolute",) * dof
+        if len(types) != dof or not set(types) <= {"revolute", "prismatic"}:
+            raise InputError("joint_types", repr(types), f"{dof} times revolute or prismatic", self.name)
+        joint_map = _frozen(self.joint_map) if np.size(self.joint_map) else _frozen(np.eye(dof))
+        if joint_map.shape != (dof, dof) or not abs(np.linalg.det(joint_map)) > 1e-9:
+            raise InputError("joint_map", f"{joint_map.tolist()}", f"an invertible {dof} x {dof} matrix", self.name)
+        unlimited = np.tile([-np.inf, np.inf], (dof, 1))
+        limits = _frozen(self.limits) if np.size(self.limits) else _frozen(unlimited)
+        if limits.shape != (dof, 2) or not (limits[:, 0] < limits[:, 1]).all():
+            raise InputError("limits", f"{limits.tolist()}", f"{dof} pairs lower < upper", self.name)
+        object.__setattr__(self, "mdh", mdh)
+        object.__setattr__(self, "joint_types", types)
+        object.__setattr__(self, "joint_map", joint_map)
+        object.__setattr__(self, "limits", limits)
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return len(self.mdh)
+
+    @property
+    def joint_dimensions(self) -> tuple[str, ...]:
+        """``"angle"`` for a revolute joint, ``"length"`` for a prismatic one."""
+        return tuple("angle" if kind == "revolute" else "length" for kind in self.joint_types)
+
+
+def _frozen(values: ArrayLike) -> Array:
+    array = np.array(values, dtype=float)
+    array.setflags(write=False)
+    return array
+
+
+class _JointTable(Table):
+    alpha: Angle = 0.0
+    a: Length = 0.0
+    theta: Angle = 0.0
+    d: Length = 0.0
+    beta: Angle = 0.0
+    type: Literal["revolute", "prismatic"] = "revolute"
+    sign: Literal[1, -1] = 1
+    limits: Annotated[list[float] | None, "angle", "length"] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_fit_the_type(cls, table: Any) -> Any:
+        if isinstance(table, dict):
+            moves = "length" if table.get("type") == "prismatic" else "angle"
+            wrong = [u for u, unit in UNITS.items() if f"limits_{u}" in table and unit.dimension != moves]
+            if wrong:
+                accepted = ", ".join(f"limits_{u}" for u in accepted_units(moves))
+                raise Misfit(f"limits_{wrong[0]}", "a unit that does not fit the joint's type", accepted)
+        return table
+
+
+class _RobotTable(Table):
+    name: str
+    source: str = ""
+    joint: list[_JointTable] = Field(min_length=1)
+    coupling: list[list[Annotated[float, Field(strict=False)]]] | None = None
+
+
+def read_robot(path: str | Path) -> Robot:
+    """Return the robot of a ``robot.toml`` file (its format: README, "Your own robot").
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key, what was found and what is accepted.
+    """
+    path = Path(path)
+    table = validate(_RobotTable, read_toml(path), path)
+    dof = len(table.joint)
+    coupling = np.eye(dof)
+    if table.coupling is not None:
+        if len(table.coupling) != dof or any(len(row) != dof for row in table.coupling):
+            raise InputError("key coupling", f"{table.coupling}", f"{dof} rows of {dof} numbers", path)
+        coupling = np.array(table.coupling)
+    limits = [j.limits or [-np.inf, np.inf] for j in table.joint]
+    for number, pair in enumerate(limits, start=1):
+        if len(pair) != 2 or not pair[0] < pair[1]:
+            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]", path)
+    return Robot(
+        name=table.name,
+        mdh=np.array([[getattr(j, column) for column in MDH] for j in table.joint]),
+        joint_types=tuple(j.type for j in table.joint),
+        joint_map=np.diag([float(j.sign) for j in table.joint]) @ coupling,
+        limits=np.array(limits, dtype=float),
+        source=table.source,
+    )
