@@ -145,28 +145,29 @@ class _Posed:
     def __init__(self, formulation: Formulation, model: LinearModel):
         m, n = model.A.shape
         self.formulation, self.n = formulation, n
-        self.z = cp.Variable(n)
-        self.constraints = [c(self.z, model.parameters) for c in formulation.constraints]
+        self.probe = cp.Variable(n)
+        self.checks = [c(self.probe, model.parameters) for c in formulation.constraints]
         self.quadratic = formulation.loss is cp.sum_squares and formulation.penalty in (None, cp.sum_squares)
         self.reduced = formulation.loss in ROTATION_INVARIANT
         rows = n + 1 if self.reduced else m
         if self.quadratic:
             u = cp.Variable(n)
             self.basis, self.centre = cp.Parameter((n, n)), cp.Parameter(n)
-            posed = cp.sum_squares(u), [self.z == self.basis @ u + self.centre]
+            self.z, objective = self.basis @ u + self.centre, cp.sum_squares(u)
         else:
+            self.z = cp.Variable(n)
             self.A, self.b, self.weight = cp.Parameter((rows, n)), cp.Parameter(rows), cp.Parameter(nonneg=True)
             objective = formulation.loss(self.A @ self.z - self.b)
             if formulation.penalty is not None:
                 objective = objective + self.weight * formulation.penalty(self.z)
-            posed = objective, []
-        self.problem = cp.Problem(cp.Minimize(posed[0]), posed[1] + self.constraints)
+        constraints = [c(self.z, model.parameters) for c in formulation.constraints]
+        self.problem = cp.Problem(cp.Minimize(objective), constraints)
         if not self.problem.is_dcp():
             raise InputError(f"formulation '{formulation.name}'", "a program that is not convex", "CVXPY's DCP rules")
 
     def violation(self, z: Array) -> float:
-        self.z.value = z
-        return max((float(np.max(c.violation())) for c in self.constraints), default=0.0)
+        self.probe.value = z
+        return max((float(np.max(c.violation())) for c in self.checks), default=0.0)
 
     def solve(self, program: ConvexProgram, weight: float) -> Array:
         self._set(program.model, weight)
@@ -190,7 +191,7 @@ class _Posed:
     def _set(self, model: LinearModel, weight: float) -> None:
         if self.quadratic:
             beta, s, Vt = model.svd
-            if self.constraints and not s.all():
+            if self.checks and not s.all():
                 # a nominal value for unseen directions may not meet the constraints: let them move, at a price
                 weight = max(weight, 1e-16 * s[0] ** 2)
             D = np.sqrt(s**2 + weight)

@@ -1,0 +1,66 @@
+"""Robot calibration by convex optimization.
+
+Names are imported when they are first used, so that ``import rpim_opt`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rpim_opt.calibration import Calibration as Calibration
+    from rpim_opt.calibration import calibrate as calibrate
+    from rpim_opt.dataset import Dataset as Dataset
+    from rpim_opt.dataset import read_csv as read_csv
+    from rpim_opt.exceptions import InputError as InputError
+    from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
+    from rpim_opt.exceptions import RpimError as RpimError
+    from rpim_opt.formulation import Formulation as Formulation
+    from rpim_opt.formulation import bounded as bounded
+    from rpim_opt.formulation import least_squares as least_squares
+    from rpim_opt.formulation import tikhonov as tikhonov
+    from rpim_opt.formulation import within_tolerance as within_tolerance
+    from rpim_opt.instances import Instance as Instance
+    from rpim_opt.instances import load as load
+    from rpim_opt.kinematics import forward_kinematics as forward_kinematics
+    from rpim_opt.measurement import Measurement as Measurement
+    from rpim_opt.parameters import Parameters as Parameters
+    from rpim_opt.parameters import model_parameters as model_parameters
+    from rpim_opt.problem import CalibrationProblem as CalibrationProblem
+    from rpim_opt.problem import LinearModel as LinearModel
+    from rpim_opt.robot import Robot as Robot
+    from rpim_opt.robot import read_robot as read_robot
+    from rpim_opt.selection import Selection as Selection
+    from rpim_opt.selection import l_curve as l_curve
+    from rpim_opt.selection import two_step as two_step
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "calibration": ("Calibration", "calibrate"),
+    "dataset": ("Dataset", "read_csv"),
+    "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
+    "formulation": ("Formulation", "bounded", "least_squares", "tikhonov", "within_tolerance"),
+    "instances": ("Instance", "load"),
+    "kinematics": ("forward_kinematics",),
+    "measurement": ("Measurement",),
+    "parameters": ("Parameters", "model_parameters"),
+    "problem": ("CalibrationProblem", "LinearModel"),
+    "robot": ("Robot", "read_robot"),
+    "selection": ("Selection", "l_curve", "two_step"),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+__all__ = sorted(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'rpim_opt' has no attribute '{name}'")
+    value = getattr(import_module(f"rpim_opt.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

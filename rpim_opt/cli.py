@@ -1,0 +1,158 @@
+"""The command line ``rpim-opt``. Commands import what they need when they run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rpim_opt.exceptions import RpimError
+
+if TYPE_CHECKING:
+    from rpim_opt.calibration import Calibration
+    from rpim_opt.dataset import Dataset
+    from rpim_opt.instances import Instance
+
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
+    help="Robot calibration by convex optimization.",
+)  # fmt: skip
+
+
+@app.callback()
+def _commands() -> None:
+    """Robot calibration by convex optimization."""
+
+
+@app.command()
+def calibrate(
+    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
+    variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
+    select: Annotated[str | None, typer.Option(help="How to choose the weight: l_curve, two_step, a number.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
+) -> None:
+    """Calibrate a problem: print the parameters and the errors before and after, write result.json.
+
+    Exit codes: 0 converged, 1 not converged, 2 unusable input, 3 no solution found.
+    """
+    with _progress() as say:
+        from rpim_opt.calibration import calibrate
+        from rpim_opt.files import write_json
+        from rpim_opt.instances import load, parse_weight
+
+        say("reading the problem")
+        instance = load(problem, variant)
+        weight = instance.weight if select is None else parse_weight(select)
+        say("choosing the weight")
+        result = calibrate(
+            instance.problem, instance.formulation, weight,
+            progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
+        )  # fmt: skip
+    print(f"{instance.title}\n{instance.source}\n")  # noqa: T201
+    print(describe(instance, result))  # noqa: T201
+    if out is not None:
+        try:
+            write_json(out / "result.json", result_json(instance, result))
+        except OSError as error:
+            raise RpimError(f"{out / 'result.json'}: cannot be written: {error}.") from None
+        print(f"\nWritten: {out / 'result.json'}")  # noqa: T201
+    if not result.converged:
+        raise typer.Exit(1)
+
+
+def describe(instance: Instance, result: Calibration) -> str:
+    """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
+    from rpim_opt.text import table
+
+    parameters = [
+        [r["name"], r["unit"], f"{r['nominal']:.4f}", f"{r['identified']:.4f}", f"{r['deviation']:+.4f}",
+         "-" if r["std"] is None else f"{r['std']:.4f}"]
+        for r in result.parameter_rows()
+    ]  # fmt: skip
+    errors = []
+    for name, data in _data(instance).items():
+        published = instance.published.get(name, {})
+        for method, each in (("nominal", result.nominal_errors(data)), ("identified", result.errors(data))):
+            stats = _statistics(each)
+            figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
+            errors.append([f"{name}, {method}", str(stats["count"]), *figures])
+        errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
+    model = result.program.model
+    lines = [
+        table(["parameter", "unit", "nominal", "identified", "deviation", "std"], parameters),
+        "",
+        table(["position error [mm]", "rows", "mean", "RMS", "max"], errors),
+        "",
+        result.weight_sentence(),
+        f"{len(model.b)} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
+        result.message,
+    ]
+    return "\n".join(lines)
+
+
+def result_json(instance: Instance, result: Calibration) -> dict[str, Any]:
+    """Return what ``result.json`` holds; its keys are relied upon by others."""
+    data = _data(instance)
+    validation = data.get("validation")
+    return {
+        "title": instance.title,
+        "nominal": {name: _statistics(result.nominal_errors(part)) for name, part in data.items()},
+        "identification": _statistics(result.errors()),
+        "validation": _statistics(result.errors(validation)) if validation else None,
+        "weight": result.weight,
+        "selector": result.selection.name if result.selection else "given",
+        "corner": result.selection.interior if result.selection else None,
+        "formulation": result.formulation.name,
+        "converged": result.converged,
+        "iterations": len(result.history),
+        "flagged": [],
+        "parameters": result.parameter_rows(),
+    }
+
+
+def _data(instance: Instance) -> dict[str, Dataset]:
+    sets = {"identification": instance.problem.data}
+    return {**sets, "validation": instance.validation} if instance.validation else sets
+
+
+def _statistics(errors: Any) -> dict[str, float | int]:
+    mm = 1e3 * errors
+    rms = float((mm**2).mean() ** 0.5)
+    return {"mean_mm": float(mm.mean()), "rms_mm": rms, "max_mm": float(mm.max()), "count": len(mm)}
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str], None]]:
+    """Show what is going on, once it has taken a second, where a person is watching."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    status = console.status("starting")
+    timer = Timer(1.0, status.start)
+    timer.daemon = True
+    if console.is_terminal:
+        timer.start()
+    try:
+        yield lambda text: status.update(text)
+    finally:
+        timer.cancel()
+        status.stop()
+
+
+def main() -> None:
+    """Run the command line; what a user can mend is one sentence, never a traceback."""
+    from rpim_opt.exceptions import NoSolutionFound
+
+    try:
+        app()
+    except NoSolutionFound as error:
+        print(error, file=sys.stderr)  # noqa: T201
+        sys.exit(3)
+    except RpimError as error:
+        print(error, file=sys.stderr)  # noqa: T201
+        sys.exit(2)

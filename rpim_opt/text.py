@@ -1,0 +1,22 @@
+"""Tables as text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import StringIO
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> str:
+    """Return a plain-text table; the first column is aligned left, the others right."""
+    grid = Table(*header, box=SIMPLE_HEAD, title=title or None, title_justify="left", pad_edge=False)
+    for column in grid.columns[1:]:
+        column.justify = "right"
+    for row in rows:
+        grid.add_row(*row)
+    stream = StringIO()
+    Console(file=stream, width=120, color_system=None, markup=False).print(grid)
+    return "\n".join(line.rstrip() for line in stream.getvalue().rstrip().splitlines())
