@@ -121,17 +121,21 @@ class Calibration:
             )
         return rows
 
+    def parameter_table(self) -> str:
+        """Return the identified parameters as a table of text."""
+        head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
+        rows = []
+        for r in self.parameter_rows():
+            std = "-" if r["std"] is None else f"{r['std']:.4f}"
+            figures = [f"{r['nominal']:.4f}", f"{r['identified']:.4f}", f"{r['deviation']:+.4f}", std]
+            rows.append([r["name"], r["unit"], *figures])
+        return table(head, rows)
+
     def __str__(self) -> str:
         """Return the parameters and errors as a person reads them."""
-        rows = [
-            [r["name"], r["unit"], f"{r['nominal']:.4f}", f"{r['identified']:.4f}", f"{r['deviation']:+.4f}",
-             "-" if r["std"] is None else f"{r['std']:.4f}"]
-            for r in self.parameter_rows()
-        ]  # fmt: skip
-        head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
         before, after = (1e3 * e.mean() for e in (self.nominal_errors(), self.errors()))
-        lines = [table(head, rows), f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."]
-        return "\n".join([*lines, self.weight_sentence(), self.message])
+        errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
+        return "\n".join([self.parameter_table(), "", errors, self.weight_sentence(), self.message])
 
     def weight_sentence(self) -> str:
         """Say the weight and where it came from."""
@@ -146,6 +150,7 @@ def calibrate(
     formulation: Formulation = tikhonov,
     weight: float | Selector = 0.0,
     *,
+    start: Array | None = None,
     max_iterations: int = 20,
     tolerance: float = 1e-8,
     progress: Callable[[Iteration], None] | None = None,
@@ -154,7 +159,7 @@ def calibrate(
 
     Every pass linearizes at the current deviations, solves for the *total* deviation and takes the
     step, halved until the nonlinear objective falls. The loop ends when a step is shorter than
-    ``tolerance * (1 + |z|)``; its fixed point is a stationary point of the nonlinear problem.
+    ``tolerance * (1 + ||z||)``; its fixed point is a stationary point of the nonlinear problem.
 
     Parameters
     ----------
@@ -165,6 +170,9 @@ def calibrate(
     weight
         A number, or a selector, which sees identification data only. It is asked anew until the steps
         become small; then the weight stays.
+    start
+        (n,) deviations [SI] to begin with; nominal by default. The answer does not depend on it,
+        as long as the loop converges: the deviations count from nominal all the same.
     max_iterations, tolerance
         When to stop. A calibration that did not converge says so in ``converged`` and ``message``.
     progress
@@ -178,8 +186,8 @@ def calibrate(
         When a convex program fails.
     """
     scale = problem.parameters.free.scale
-    z = np.zeros(len(scale))
-    model = problem.linearize(z)
+    z = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float) / scale
+    model = problem.linearize(scale * z)
     fixed = None if callable(weight) else float(weight)
     if len(model.b) < len(z) and (formulation.penalty is None or fixed == 0):
         raise InputError(
@@ -188,7 +196,10 @@ def calibrate(
         )  # fmt: skip
     program, selection, history = formulation.compile(model), None, []
     lam, settled = fixed or 0.0, fixed is not None or formulation.penalty is None
-    converged, message = False, f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight."
+    converged, message = (
+        False,
+        f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight.",
+    )
     for _ in range(max_iterations):
         if not settled and callable(weight):
             selection = weight(program)
@@ -214,9 +225,7 @@ def calibrate(
             converged, message = True, f"Converged after {len(history)} passes."
             break
         settled = settled or length <= SETTLED * room or len(history) >= max_iterations // 2
-    return Calibration(
-        problem, formulation, scale * z, lam, selection, converged, message, tuple(history), program
-    )
+    return Calibration(problem, formulation, scale * z, lam, selection, converged, message, tuple(history), program)
 
 
 def _objective(program: ConvexProgram, z: Array, weight: float) -> float:

@@ -69,11 +69,6 @@ def describe(instance: Instance, result: Calibration) -> str:
     """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
     from rpim_opt.text import table
 
-    parameters = [
-        [r["name"], r["unit"], f"{r['nominal']:.4f}", f"{r['identified']:.4f}", f"{r['deviation']:+.4f}",
-         "-" if r["std"] is None else f"{r['std']:.4f}"]
-        for r in result.parameter_rows()
-    ]  # fmt: skip
     errors = []
     for name, data in _data(instance).items():
         published = instance.published.get(name, {})
@@ -84,7 +79,7 @@ def describe(instance: Instance, result: Calibration) -> str:
         errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
     model = result.program.model
     lines = [
-        table(["parameter", "unit", "nominal", "identified", "deviation", "std"], parameters),
+        result.parameter_table(),
         "",
         table(["position error [mm]", "rows", "mean", "RMS", "max"], errors),
         "",

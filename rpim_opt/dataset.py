@@ -145,9 +145,7 @@ def _dataset(table: dict[str, list[str]], robot: Robot, noise: Mapping[str, floa
             raise InputError("the header", f"column '{name}' without a unit that fits", accepted)
         if stem in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
-        columns[stem] = unit.si * np.array(
-            [_number(cell, row, name) for cell, row in zip(cells, label, strict=True)]
-        )
+        columns[stem] = unit.si * np.array([_number(cell, row, name) for cell, row in zip(cells, label, strict=True)])
     for stem, dimension in {**joints, **kind.columns}.items():
         if stem not in columns:
             accepted = " or ".join(f"{stem}_{u}" for u in accepted_units(dimension))
@@ -157,7 +155,9 @@ def _dataset(table: dict[str, list[str]], robot: Robot, noise: Mapping[str, floa
         wrong = np.flatnonzero(columns.get(column, np.ones(N)) <= 0)
         if len(wrong):
             raise InputError(f"row {label[wrong[0]]}, column {column}", "zero or less", "a standard deviation > 0")
-    configuration = np.unique(table["configuration"], return_inverse=True)[1] if "configuration" in table else np.arange(N)
+    configuration = (
+        np.unique(table["configuration"], return_inverse=True)[1] if "configuration" in table else np.arange(N)
+    )
     q = np.column_stack([columns[name] for name in joints])
     return Dataset(q, np.column_stack([columns[name] for name in kind.columns]), covariance, label, configuration)
 
@@ -182,7 +182,12 @@ def _covariance(columns: Mapping[str, Array], noise: Mapping[str, float], kind: 
     sigma = []
     for name, dimension in kind.components.items():
         common = next((key for key, d in kind.noise.items() if d == dimension), "")
-        choice = [columns.get(f"sigma_{name}"), columns.get("sigma"), declared.get(name), declared.get(common)]
+        choice = [
+            columns.get(f"sigma_{name}"),
+            columns.get("sigma"),
+            declared.get(name),
+            declared.get(common),
+        ]
         value = next((v for v in choice if v is not None), None)
         if value is None:
             raise InputError("table noise", f"no standard deviation for '{name}'", f"{common}_mm or sigma_{name}_mm")

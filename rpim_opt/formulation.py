@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
@@ -25,13 +24,15 @@ FEASIBLE = 1e-9
 
 
 def squared_norm(value: Any) -> float:
-    """Return \\|value\\|^2 of an array."""
+    r"""Return \|value\|^2 of an array."""
     return float(np.sum(np.square(value)))
 
 
 @dataclass(frozen=True)
 class Formulation:
-    """A convex way to identify the scaled total deviation z from whitened equations A z ~ b::
+    """A convex way to identify the scaled total deviation z from whitened equations A z ~ b.
+
+    ::
 
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
@@ -134,10 +135,10 @@ class ConvexProgram:
 
 
 class _Posed:
-    """The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
+    r"""The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
 
     With a squared loss and a squared (or no) penalty, both terms are one squared norm: in the singular
-    basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = \\|u\\|^2 + const.
+    basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = \|u\|^2 + const.
     Posed in u the program is perfectly conditioned at every weight, where posed in z an interior-point
     solver calls answers "optimal" that have no correct digit.
     """
@@ -156,7 +157,11 @@ class _Posed:
             self.z, objective = self.basis @ u + self.centre, cp.sum_squares(u)
         else:
             self.z = cp.Variable(n)
-            self.A, self.b, self.weight = cp.Parameter((rows, n)), cp.Parameter(rows), cp.Parameter(nonneg=True)
+            self.A, self.b, self.weight = (
+                cp.Parameter((rows, n)),
+                cp.Parameter(rows),
+                cp.Parameter(nonneg=True),
+            )
             objective = formulation.loss(self.A @ self.z - self.b)
             if formulation.penalty is not None:
                 objective = objective + self.weight * formulation.penalty(self.z)

@@ -98,7 +98,9 @@ def find(name: str | Path) -> Path:
     known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
     if str(name) in known:
         return problems_folder() / str(name)
-    raise InputError("the problem", f"no folder '{name}'", "a folder with problem.toml, or " + choices(str(name), known))
+    raise InputError(
+        "the problem", f"no folder '{name}'", "a folder with problem.toml, or " + choices(str(name), known)
+    )
 
 
 def load(name: str | Path, variant: str | None = None) -> Instance:

@@ -136,6 +136,7 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     N = len(rows)
     mapped = ca.Function.map(function, "rows", "serial", N, list(range(len(shared))), [], {})
     results = [np.zeros((N, *reversed(function.size_out(i)))) for i in range(function.n_out())]
+    buffer: Any
     buffer, trigger = mapped.buffer()
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
     for i, values in enumerate(arguments):

@@ -41,7 +41,11 @@ class Measurement:
 _XYZ = {"x": "length", "y": "length", "z": "length"}
 
 position = Measurement(
-    "position", columns=_XYZ, components=_XYZ, noise={"position": "length"}, residual=lambda y, T: y - T[:3, 3]
+    "position",
+    columns=_XYZ,
+    components=_XYZ,
+    noise={"position": "length"},
+    residual=lambda y, T: y - T[:3, 3],
 )
 """A reflector's position in the instrument's frame: r = y - origin of T."""
 

@@ -101,8 +101,8 @@ class Parameters:
         result = self.nominal + x
         index = {name: i for i, name in enumerate(self.names)}
         for name in [n for n in self.names if n.endswith("_rx")]:
-            triple = [index.get(name[:-1] + axis) for axis in "xyz"]
-            if None not in triple:
+            triple = [index[name[:-1] + axis] for axis in "xyz" if name[:-1] + axis in index]
+            if len(triple) == 3:
                 R = ca.DM(rotation_rpy(*x[triple]) @ rotation_rpy(*self.nominal[triple])).full()
                 result[triple] = roll_pitch_yaw(R)
         return result
@@ -225,5 +225,3 @@ def _summary(names: Sequence[str], pattern: str) -> str:
     hint = choices(pattern, names)
     close = hint[hint.rfind(" (did") :] if " (did" in hint else ""
     return "names or patterns of " + ", ".join(known + others) + close
-
-

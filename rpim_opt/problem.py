@@ -51,7 +51,7 @@ class LinearModel:
 
     @cached_property
     def triangle(self) -> Array:
-        """Upper triangle R (n+1, n+1) of [A b] = QR: \\|A z - b\\| = \\|R [z; -1]\\| for every z."""
+        r"""Upper triangle R (n+1, n+1) of [A b] = QR: \|A z - b\| = \|R [z; -1]\| for every z."""
         n = self.A.shape[1]
         R = np.linalg.qr(np.column_stack([self.A, self.b]), mode="r")
         return np.vstack([R, np.zeros((n + 1 - len(R), n + 1))])
@@ -106,7 +106,7 @@ class CalibrationProblem:
 
     def errors(self, x: Array) -> Array:
         """Return the norm of every row's residual, (N,) [m]: for positions the position error."""
-        return np.linalg.norm(self._evaluate("residual", x)[0][:, 0], axis=1)
+        return np.sqrt(np.sum(self._evaluate("residual", x)[0][:, 0] ** 2, axis=1))
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values, -d residual / dx, (m, n) [SI]."""
@@ -125,7 +125,7 @@ class CalibrationProblem:
     def _whitening(self) -> Array:
         """L^-1 with covariance = L L'."""
         try:
-            return np.linalg.inv(np.linalg.cholesky(self.data.covariance))
+            return np.asarray(np.linalg.inv(np.linalg.cholesky(self.data.covariance)), dtype=float)
         except np.linalg.LinAlgError:
             raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
@@ -141,7 +141,11 @@ class CalibrationProblem:
 
 @lru_cache(maxsize=64)
 def _functions(
-    joint_types: tuple[str, ...], names: tuple[str, ...], identified: bytes, absent: bytes, measurement: Measurement
+    joint_types: tuple[str, ...],
+    names: tuple[str, ...],
+    identified: bytes,
+    absent: bytes,
+    measurement: Measurement,
 ) -> dict[str, ca.Function]:
     """Build residual and Jacobian of one row; one structure is built once and serves every problem of it."""
     dof, free = len(joint_types), np.frombuffer(identified, dtype=bool)

@@ -56,12 +56,13 @@ def weight_grid(program: ConvexProgram, count: int = 200) -> Array:
 
 
 def l_curve(program: ConvexProgram) -> Selection:
-    """Choose the corner of the L-curve: the largest curvature of (ln \\|A z - b\\|, ln \\|z\\|).
+    r"""Choose the corner of the L-curve: the largest curvature of (ln \|A z - b\|, ln \|z\|).
 
     With a closed form the derivatives are analytic (Hansen 1998, Rank-Deficient and Discrete Ill-Posed
     Problems, sec. 4.6; sign such that the corner of an L is positive) and the maximum is refined between
     the neighbours on the grid. Otherwise the curvature is that of the circle through three neighbouring
-    points (Cultrera and Callegaro 2020). A maximum at the edge, or none that is positive, is no corner.
+    points (Cultrera and Callegaro 2020). A maximum at the edge is no corner, and
+    neither is a curve bent the other way everywhere; the weight is then that edge, or the lower one.
     """
     if program.closed_form:
         weights = weight_grid(program)
@@ -72,25 +73,28 @@ def l_curve(program: ConvexProgram) -> Selection:
         tiny = np.finfo(float).tiny
         points = 0.5 * np.log([[max(e.loss, tiny), max(e.penalty, tiny)] for e in estimates])
         score = _menger(points)
-    best = int(np.argmax(score))
+    best = int(np.argmax(score)) if np.max(score) > 0 else 0
     if not (0 < best < len(weights) - 1 and score[best] > 0):
         note = (
-            f"the L-curve has no corner: its curvature is largest at the {'lower' if best == 0 else 'upper'} edge "
-            f"of the weights {weights[0]:.1e} to {weights[-1]:.1e}; the weight is that edge, give one with --select"
+            f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge "
+            f"of {weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
         )
         return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
     weight = float(weights[best])
     if program.closed_form:
         low, high = np.log(weights[best - 1]), np.log(weights[best + 1])
         fine = minimize_scalar(
-            lambda t: -_curvature(program, np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-6}
+            lambda t: -_curvature(program, np.exp([t]))[0],
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-6},
         )
         weight = float(np.exp(fine.x)) if -fine.fun > score[best] else weight
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
 
 
 def _curvature(program: ConvexProgram, weights: Array) -> Array:
-    """Curvature of t = ln weight -> (u, v) = (ln rho, ln eta) / 2 with rho = \\|Az - b\\|^2, eta = \\|z\\|^2.
+    r"""Curvature of t = ln weight -> (u, v) = (ln rho, ln eta) / 2 with rho = \|Az - b\|^2, eta = \|z\|^2.
 
     With z_i = s_i beta_i / (s_i^2 + w): eta' = d eta / dt = -2 w sum z_i^2 / (s_i^2 + w), and rho' = -w eta'.
     """

@@ -1,0 +1,61 @@
+"""Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``.
+
+Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+ENVIRONMENT = Path(os.environ.get("RPIM_OPT_VENV", ROOT / ".venv"))
+BIN = ENVIRONMENT / ("Scripts" if os.name == "nt" else "bin")
+CHECKS = {
+    "format": ["ruff", "format", "--check", "."],
+    "lint": ["ruff", "check", "."],
+    "types": ["basedpyright", "--level", "error", "--pythonpath", str(BIN / "python")],
+}
+
+
+def environment() -> None:
+    """Make the environment, or bring it up to date with the project's requirements."""
+    wanted = hashlib.sha256(b"".join((ROOT / f).read_bytes() for f in ("pyproject.toml", "constraints.txt")))
+    stamp = ENVIRONMENT / "requirements.sha256"
+    if stamp.is_file() and stamp.read_text() == wanted.hexdigest():
+        return
+    print(f"Setting up {ENVIRONMENT.name} (once, about a minute) ...", file=sys.stderr, flush=True)
+    venv.create(ENVIRONMENT, with_pip=True, clear=ENVIRONMENT.exists())
+    pip = [BIN / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+    subprocess.run([*pip, "-c", ROOT / "constraints.txt", "-e", f"{ROOT}[dev]"], check=True)
+    stamp.write_text(wanted.hexdigest())
+
+
+def run(*command: str | Path) -> int:
+    """Run a program of the environment in the caller's folder."""
+    return subprocess.run([BIN / command[0], *command[1:]], check=False).returncode
+
+
+def main(arguments: list[str]) -> int:
+    """Carry out one command line."""
+    what, *rest = arguments or ["help"]
+    if what not in ("run", "test", "check"):
+        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
+        return 2
+    environment()
+    if what == "run":
+        return run("rpim-opt", *rest)
+    os.chdir(ROOT)
+    if what == "test":
+        return run("pytest", *rest)
+    failed = [name for name, command in CHECKS.items() if run(*command)]
+    print(f"checks failed: {', '.join(failed)}" if failed else "all checks passed")
+    return len(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,82 @@
+"""Imports point one way, and heavy ones wait until they are needed."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "rpim_opt"
+NUMERIC = {"numpy", "scipy"}
+ORDER = {
+    "exceptions": set(),
+    "units": set(),
+    "files": {"pydantic"},
+    "robot": {"pydantic"},
+    "kinematics": {"casadi"},
+    "parameters": {"casadi"},
+    "measurement": set(),
+    "dataset": set(),
+    "problem": {"casadi"},
+    "formulation": {"cvxpy"},
+    "selection": set(),
+    "text": {"rich"},
+    "calibration": set(),
+    "instances": {"pydantic"},
+    "cli": {"typer", "rich"},
+}
+
+
+def imported(module: str) -> set[str]:
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(node.module or "")
+    return names
+
+
+def test_every_module_has_its_place() -> None:
+    assert {p.stem for p in PACKAGE.glob("*.py")} - {"__init__"} == set(ORDER)
+
+
+@pytest.mark.parametrize("module", ORDER)
+def test_a_module_imports_only_modules_above_it(module: str) -> None:
+    above = set(list(ORDER)[: list(ORDER).index(module)])
+    for name in imported(module):
+        top, _, rest = name.partition(".")
+        if top == "rpim_opt":
+            assert rest in above, f"{module} imports {name}, which is not above it"
+        else:
+            assert top in sys.stdlib_module_names | NUMERIC | ORDER[module], f"{module} imports {name}"
+
+
+@pytest.mark.parametrize(
+    "code", ["import rpim_opt", "from rpim_opt.cli import app; app(['--help'], standalone_mode=False)"]
+)
+def test_heavy_libraries_wait_until_they_are_used(code: str) -> None:
+    heavy = "{'cvxpy', 'casadi', 'numpy', 'scipy', 'pydantic'}"
+    script = f"{code}\nimport sys\nloaded = {heavy} & set(sys.modules)\nassert not loaded, loaded"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("module", [m for m in ORDER if m != "cli"])
+def test_examples_in_docstrings(module: str) -> None:
+    assert doctest.testmod(import_module(f"rpim_opt.{module}")).failed == 0
+
+
+def test_public_names_exist_and_are_documented() -> None:
+    import rpim_opt as ro
+
+    for name in ro.__all__:
+        assert getattr(ro, name).__doc__, name
+    with pytest.raises(AttributeError, match="no attribute 'callibrate'"):
+        ro.callibrate  # noqa: B018

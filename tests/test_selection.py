@@ -1,0 +1,88 @@
+"""Selectors: their formulas, and that they say when there is nothing to find."""
+
+from __future__ import annotations
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.selection import _curvature, _menger, held_out_error, weight_grid
+from tests.test_formulation import model
+
+
+def test_curvature_is_that_of_the_curve() -> None:
+    program = ro.tikhonov.compile(model())
+    t = np.linspace(-8, 0, 4001)
+    u, v = 0.5 * np.log([[e.loss, e.penalty] for e in program.path(np.exp(t))]).T
+    u1, v1 = np.gradient(u, t), np.gradient(v, t)
+    kappa = (u1 * np.gradient(v1, t) - v1 * np.gradient(u1, t)) / (u1**2 + v1**2) ** 1.5
+    inner = slice(10, -10)
+    assert _curvature(program, np.exp(t))[inner] == pytest.approx(kappa[inner], rel=2e-3, abs=1e-4)
+
+
+def test_menger_curvature_of_a_circle() -> None:
+    t = np.linspace(0, 2, 50)
+    points = 3 * np.column_stack([np.cos(t), np.sin(t)])
+    assert _menger(points)[1:-1] == pytest.approx(1 / 3, rel=1e-12)
+    assert _menger(points[::-1])[1:-1] == pytest.approx(-1 / 3, rel=1e-12)
+
+
+def test_the_corner_is_a_maximum_inside_the_grid() -> None:
+    program = ro.tikhonov.compile(model(condition=1e5))
+    corner = ro.l_curve(program)
+    assert corner.interior
+    around = _curvature(program, corner.weight * np.array([0.99, 1.0, 1.01]))
+    assert around[1] > max(around[0], around[2])
+    assert around[1] >= corner.score.max()
+
+
+def test_analytic_and_three_point_corners_agree() -> None:
+    """A constraint that is never active makes the path numerical, not different."""
+    loose = ro.Formulation("loose", penalty=cp.sum_squares, constraints=(lambda z, p: cp.abs(z) <= 1e6,))
+    m = model(condition=1e5)
+    analytic, numeric = ro.l_curve(ro.tikhonov.compile(m)), ro.l_curve(loose.compile(m))
+    step = numeric.weights[1] / numeric.weights[0]
+    assert 1 / step**2 < analytic.weight / numeric.weight < step**2
+
+
+def test_no_corner_is_said() -> None:
+    """Equal singular values and exact data: (u, v) bends the other way at every weight."""
+    m = model(condition=1.0)
+    exact = ro.LinearModel(m.A, m.A @ np.ones(12), m.group, m.parameters)
+    choice = ro.l_curve(ro.tikhonov.compile(exact))
+    assert not choice.interior
+    assert "no corner" in choice.note
+    assert choice.weight == choice.weights[0]
+
+
+def test_the_grid_follows_the_units_of_the_data() -> None:
+    m = model()
+    program, tenfold = (ro.tikhonov.compile(ro.LinearModel(f * m.A, f * m.b, m.group, m.parameters)) for f in (1, 10))
+    assert weight_grid(tenfold) == pytest.approx(100 * weight_grid(program))
+    assert ro.l_curve(tenfold).weight == pytest.approx(100 * ro.l_curve(program).weight, rel=1e-4)
+
+
+def test_held_out_error_is_that_of_fits_without_the_configuration() -> None:
+    m, weight = model(), 1e-3
+    total = 0.0
+    for group in range(10):
+        seen, out = m.group != group, m.group == group
+        A, b = m.A[seen], m.b[seen]
+        z = np.linalg.solve(A.T @ A + weight * np.eye(12), A.T @ b)
+        total += np.sum((m.A[out] @ z - m.b[out]) ** 2)
+    expected = np.sqrt(total / len(m.b))
+    assert held_out_error(ro.tikhonov.compile(m), np.array([weight]))[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:
+    program = ro.tikhonov.compile(model(condition=1e5))
+    choice = ro.two_step(program)
+    assert choice.weight < 1.7 * ro.l_curve(program).weight
+    assert len(choice.score) == 10
+    assert choice.weight == choice.weights[np.argmin(choice.score)]
+
+
+def test_a_selector_needs_a_penalty() -> None:
+    with pytest.raises(ro.InputError, match="without penalty"):
+        ro.l_curve(ro.least_squares.compile(model()))
