@@ -21,6 +21,7 @@ from rpim_opt.robot import read_robot
 from rpim_opt.selection import SELECTORS, Selector
 
 HERE = Path(__file__).resolve().parent
+ROLES = ("identification", "validation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,8 @@ class Instance:
     formulation, weight
         How the folder wants it solved.
     published
-        Mean errors [mm] that the source prints, by data and method, to show beside ours.
+        Mean errors [mm] that the source prints for the same table, by role (identification,
+        validation) and method, to show beside ours.
     reference
         Figures that a run must reproduce, by name: (value, tolerance).
     """
@@ -147,6 +149,9 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
     for file, part in zip(tables, data, strict=True):
         if not len(part):
             raise InputError("the table", "no row that is not excluded", "at least one", folder / file)
+    for key in table.published:
+        if not (folder / key).is_file():
+            raise InputError("table published", f"'{key}'", "the name of a table in this folder", path)
     for key, pair in table.reference.items():
         if len(pair) != 2:
             raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
@@ -157,7 +162,7 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
         validation=data[1] if len(data) > 1 else None,
         formulation=formulation,
         weight=parse_weight(table.selector, path),
-        published=table.published,
+        published={role: table.published.get(file, {}) for role, file in zip(ROLES, tables, strict=False)},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
     )
 

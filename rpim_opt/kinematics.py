@@ -140,8 +140,8 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     buffer, trigger = mapped.buffer()
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
     for i, values in enumerate(arguments):
-        buffer.set_arg(i, memoryview(values))
+        buffer.set_arg(i, values.data)
     for i, values in enumerate(results):
-        buffer.set_res(i, memoryview(values))
+        buffer.set_res(i, values.data)
     trigger()
     return results
