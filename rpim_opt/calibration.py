@@ -137,11 +137,18 @@ class Calibration:
         errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
         return "\n".join([self.parameter_table(), "", errors, self.weight_sentence(), self.message])
 
+    @property
+    def selector(self) -> str:
+        """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""
+        if self.formulation.penalty is None:
+            return "none"
+        return self.selection.name if self.selection else "given"
+
     def weight_sentence(self) -> str:
         """Say the weight and where it came from."""
         if self.formulation.penalty is None:
             return f"Formulation '{self.formulation.name}' has no penalty and needs no weight."
-        origin = f"{self.selection.name}: {self.selection.note}" if self.selection else "given"
+        origin = self.selector + (f": {self.selection.note}" if self.selection else "")
         return f"Weight {self.weight:.4g} ({origin}), formulation '{self.formulation.name}'."
 
 
@@ -186,20 +193,19 @@ def calibrate(
         When a convex program fails.
     """
     scale = problem.parameters.free.scale
-    z = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float) / scale
+    begin = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float)
+    if begin.shape != scale.shape or not np.isfinite(begin).all():
+        raise InputError("start", f"shape {begin.shape}", f"{len(scale)} deviations, finite, one a parameter")
+    z = begin / scale
     model = problem.linearize(scale * z)
     fixed = None if callable(weight) else float(weight)
     if len(model.b) < len(z) and (formulation.penalty is None or fixed == 0):
-        raise InputError(
-            "data", f"{len(model.b)} equations for {len(z)} parameters",
-            "at least as many equations as parameters, or a formulation with penalty and weight",
-        )  # fmt: skip
+        found = f"{len(model.b)} equations for {len(z)} parameters"
+        raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
     program, selection, history = formulation.compile(model), None, []
     lam, settled = fixed or 0.0, fixed is not None or formulation.penalty is None
-    converged, message = (
-        False,
-        f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight.",
-    )
+    converged = False
+    message = f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight."
     for _ in range(max_iterations):
         if not settled and callable(weight):
             selection = weight(program)

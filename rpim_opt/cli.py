@@ -100,7 +100,7 @@ def result_json(instance: Instance, result: Calibration) -> dict[str, Any]:
         "identification": _statistics(result.errors()),
         "validation": _statistics(result.errors(validation)) if validation else None,
         "weight": result.weight,
-        "selector": result.selection.name if result.selection else "given",
+        "selector": result.selector,
         "corner": result.selection.interior if result.selection else None,
         "formulation": result.formulation.name,
         "converged": result.converged,

@@ -92,8 +92,9 @@ def read_csv(
         Naming the file, the row or column, what was found and what is accepted.
     """
     path = Path(path)
+    declared = _declared(noise, measurement)  # outside: a mistake there is not the table's
     try:
-        return _dataset(_table(path), robot, noise, measurement)
+        return _dataset(_table(path), robot, declared, measurement)
     except InputError as error:
         raise error.within(path) from None
 
@@ -122,12 +123,14 @@ def _table(path: Path) -> dict[str, list[str]]:
     return {name: [row[i].strip() for row in lines[1:]] for i, name in enumerate(header)}
 
 
-def _dataset(table: dict[str, list[str]], robot: Robot, noise: Mapping[str, float], kind: Measurement) -> Dataset:
+def _dataset(table: dict[str, list[str]], robot: Robot, declared: Mapping[str, float], kind: Measurement) -> Dataset:
     N = len(next(iter(table.values())))
     label = tuple(table.get("label") or (str(i + 1) for i in range(N)))
+    seen: set[str] = set()
     for i, name in enumerate(label):
-        if not name or label.index(name) != i:
+        if not name or name in seen:
             raise InputError(f"row {i + 1}, column label", f"'{name}'", "a label that no other row has")
+        seen.add(name)
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
     sigmas = {f"sigma_{name}": dimension for name, dimension in kind.components.items()}
     optional = sigmas if len(set(kind.components.values())) > 1 else {"sigma": "length", **sigmas}
@@ -150,7 +153,7 @@ def _dataset(table: dict[str, list[str]], robot: Robot, noise: Mapping[str, floa
         if stem not in columns:
             accepted = " or ".join(f"{stem}_{u}" for u in accepted_units(dimension))
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
-    covariance = _covariance(columns, noise, kind)
+    covariance = _covariance(columns, declared, kind)
     for column in sigmas | {"sigma": ""}:
         wrong = np.flatnonzero(columns.get(column, np.ones(N)) <= 0)
         if len(wrong):
@@ -172,13 +175,18 @@ def _number(cell: str, row: str, column: str) -> float:
     return value
 
 
-def _covariance(columns: Mapping[str, Array], noise: Mapping[str, float], kind: Measurement) -> Array:
-    """Return (N or 1, k, k): a row's own standard deviations, else the declared ones."""
+def _declared(noise: Mapping[str, float], kind: Measurement) -> dict[str, float]:
+    """Return the standard deviations [SI] that hold where a table states none."""
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
     declared = {stem: value for (stem, _), value in quantities(noise, accepted, "table noise").items()}
     for stem, value in declared.items():
         if not value > 0:
             raise InputError(f"table noise, key {stem}", f"{value:g}", "a standard deviation > 0")
+    return declared
+
+
+def _covariance(columns: Mapping[str, Array], declared: Mapping[str, float], kind: Measurement) -> Array:
+    """Return (N or 1, k, k): a row's own standard deviations, else the declared ones."""
     sigma = []
     for name, dimension in kind.components.items():
         common = next((key for key, d in kind.noise.items() if d == dimension), "")

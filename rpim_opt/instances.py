@@ -137,10 +137,10 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
     try:
         parameters = model_parameters(robot, base, {"": tool}).identify(table.identify)
         parameters = parameters.scaled(table.scale).toleranced(table.tolerance)
+        tables = [table.identification] + ([table.validation] if table.validation else [])
+        data = [read_csv(folder / file, robot, table.noise, measurement) for file in tables]
     except InputError as error:
         raise error.within(path) from None
-    tables = [table.identification] + ([table.validation] if table.validation else [])
-    data = [read_csv(folder / file, robot, table.noise, measurement) for file in tables]
     labels = {label for part in data for label in part.label}
     for label in table.exclude:
         if label not in labels:

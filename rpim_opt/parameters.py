@@ -128,9 +128,8 @@ class Parameters:
         for name, group, dimension in zip(self.names, groups, self.dimensions, strict=True):
             stems.setdefault(group, set()).add(dimension)
             stems.setdefault(name, set()).add(dimension)
-        patterns = [key for key in table if re.search(r"[*?\[]", key)]
-        for key in patterns:
-            stem = split_unit(key)[0]
+        patterns = {split_unit(key)[0] for key in table if re.search(r"[*?\[]", key)}
+        for stem in patterns:
             dims = {d for n, d in zip(self.names, self.dimensions, strict=True) if fnmatchcase(n, stem)}
             stems.setdefault(stem, set()).update(dims)
         try:
