@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rpim_opt.exceptions import RpimError
+from rpim_opt.exceptions import NoSolutionFound, RpimError
 
 if TYPE_CHECKING:
     from rpim_opt.calibration import Calibration
@@ -141,8 +141,6 @@ def _progress() -> Iterator[Callable[[str], None]]:
 
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
-    from rpim_opt.exceptions import NoSolutionFound
-
     try:
         app()
     except NoSolutionFound as error:

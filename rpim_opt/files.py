@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rpim_opt.exceptions import InputError, choices
-from rpim_opt.units import UNITS, accepted_units, split_unit
+from rpim_opt.units import UNITS, accepted_units, number, split_unit
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
@@ -32,7 +32,7 @@ class Table(BaseModel):
     A field annotated ``Length`` or ``Angle`` (or listing both) is given under its name plus a unit.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     @classmethod
     def _dimensions(cls) -> dict[str, tuple[str, ...]]:
@@ -47,9 +47,9 @@ class Table(BaseModel):
     def _accepted(cls) -> list[str]:
         quantity = cls._dimensions()
         names = []
-        for name, field in cls.model_fields.items():
+        for name in cls.model_fields:
             dims = quantity.get(name)
-            names += [f"{name}_{u}" for d in dims for u in accepted_units(d)] if dims else [field.alias or name]
+            names += [f"{name}_{u}" for d in dims for u in accepted_units(d)] if dims else [name]
         return names
 
     @model_validator(mode="before")
@@ -58,7 +58,7 @@ class Table(BaseModel):
         if not isinstance(table, dict):
             return table
         quantity, si = cls._dimensions(), {}
-        plain = {field.alias or name for name, field in cls.model_fields.items() if name not in quantity}
+        plain = set(cls.model_fields) - set(quantity)
         for key, value in table.items():
             stem, unit = split_unit(key)
             if key in plain:
@@ -78,9 +78,10 @@ class Table(BaseModel):
 def _scaled(key: str, value: Any, si: float) -> Any:
     if isinstance(value, list):
         return [_scaled(key, v, si) for v in value]
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) == float("inf") or value != value:
-        raise Misfit(key, repr(value), "a finite number")
-    return float(value) * si
+    try:
+        return number(value, key) * si
+    except InputError as error:
+        raise Misfit(key, error.found, error.accepted) from None
 
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -21,10 +21,11 @@ ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 
 TIGHT = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 FEASIBLE = 1e-9
+"""By how much a solution may miss its constraints, relative to its largest entry."""
 
 
 def squared_norm(value: Any) -> float:
-    r"""Return \|value\|^2 of an array."""
+    """Return |value|^2 of an array."""
     return float(np.sum(np.square(value)))
 
 
@@ -108,7 +109,7 @@ class ConvexProgram:
         NoSolutionFound
             When the solver does not end with "optimal", or its point misses the constraints.
         """
-        _check_weight(weight)
+        weight = self._weight(weight)
         z = self._posed.solve(self, weight)
         return Estimate(z, weight, *self.value(z))
 
@@ -119,14 +120,19 @@ class ConvexProgram:
         meets the constraints it is the solution, and only elsewhere a program is solved.
         """
         estimates = []
-        for weight in weights:
-            _check_weight(weight)
+        for weight in map(self._weight, weights):
             z = self._formula(weight) if self._posed.quadratic else None
             if z is not None and (self.closed_form or self.violation(z) <= 0):
-                estimates.append(Estimate(z, float(weight), *self.value(z)))
+                estimates.append(Estimate(z, weight, *self.value(z)))
             else:
-                estimates.append(self.solve(float(weight)))
+                estimates.append(self.solve(weight))
         return estimates
+
+    def _weight(self, weight: float) -> float:
+        """Return the weight, checked; zero where there is no penalty for it to multiply."""
+        if not (np.isfinite(weight) and weight >= 0):
+            raise InputError("weight", f"{weight}", "a finite number, zero or more")
+        return 0.0 if self.formulation.penalty is None else float(weight)
 
     def _formula(self, weight: float) -> Array:
         beta, s, Vt = self.model.svd
@@ -135,17 +141,17 @@ class ConvexProgram:
 
 
 class _Posed:
-    r"""The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
+    """The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
 
     With a squared loss and a squared (or no) penalty, both terms are one squared norm: in the singular
-    basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = \|u\|^2 + const.
+    basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = |u|^2 + const.
     Posed in u the program is perfectly conditioned at every weight, where posed in z an interior-point
     solver calls answers "optimal" that have no correct digit.
     """
 
     def __init__(self, formulation: Formulation, model: LinearModel):
         m, n = model.A.shape
-        self.formulation, self.n = formulation, n
+        self.n = n
         self.probe = cp.Variable(n)
         self.checks = [c(self.probe, model.parameters) for c in formulation.constraints]
         self.quadratic = formulation.loss is cp.sum_squares and formulation.penalty in (None, cp.sum_squares)
@@ -206,11 +212,6 @@ class _Posed:
         else:
             R = model.triangle if self.reduced else np.column_stack([model.A, model.b])
             self.A.value, self.b.value, self.weight.value = R[:, : self.n], R[:, self.n], weight
-
-
-def _check_weight(weight: float) -> None:
-    if not (np.isfinite(weight) and weight >= 0):
-        raise InputError("weight", f"{weight}", "a finite number, zero or more")
 
 
 def within_tolerance(z: Any, parameters: Parameters) -> cp.Constraint:

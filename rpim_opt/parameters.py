@@ -42,7 +42,7 @@ class Parameters:
         ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz``
         and those of the measurement; with several reflectors ``tool_A_x, ...``.
     dimensions
-        ``length``, ``angle``, ``ratio``, ``compliance`` or ``number``.
+        ``length``, ``angle``, ``ratio`` or ``compliance``.
     nominal
         (P,) where the deviations count from [SI].
     scale

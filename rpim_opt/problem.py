@@ -51,7 +51,7 @@ class LinearModel:
 
     @cached_property
     def triangle(self) -> Array:
-        r"""Upper triangle R (n+1, n+1) of [A b] = QR: \|A z - b\| = \|R [z; -1]\| for every z."""
+        """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
         n = self.A.shape[1]
         R = np.linalg.qr(np.column_stack([self.A, self.b]), mode="r")
         return np.vstack([R, np.zeros((n + 1 - len(R), n + 1))])
@@ -135,8 +135,12 @@ class CalibrationProblem:
         functions = _functions(
             self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(), self.measurement
         )
-        rows = np.hstack([self.data.q @ self.robot.joint_map.T, self.data.y])
-        return call_rows(functions[what], [x, p.nominal], rows)
+        return call_rows(functions[what], [x, p.nominal], self._rows)
+
+    @cached_property
+    def _rows(self) -> Array:
+        """Joint values of the model and measured values, side by side."""
+        return np.hstack([self.data.q @ self.robot.joint_map.T, self.data.y])
 
 
 @lru_cache(maxsize=64)

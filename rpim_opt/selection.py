@@ -56,7 +56,7 @@ def weight_grid(program: ConvexProgram, count: int = 200) -> Array:
 
 
 def l_curve(program: ConvexProgram) -> Selection:
-    r"""Choose the corner of the L-curve: the largest curvature of (ln \|A z - b\|, ln \|z\|).
+    """Choose the corner of the L-curve: the largest curvature of (ln |A z - b|, ln |z|).
 
     With a closed form the derivatives are analytic (Hansen 1998, Rank-Deficient and Discrete Ill-Posed
     Problems, sec. 4.6; sign such that the corner of an L is positive) and the maximum is refined between
@@ -94,7 +94,7 @@ def l_curve(program: ConvexProgram) -> Selection:
 
 
 def _curvature(program: ConvexProgram, weights: Array) -> Array:
-    r"""Curvature of t = ln weight -> (u, v) = (ln rho, ln eta) / 2 with rho = \|Az - b\|^2, eta = \|z\|^2.
+    """Curvature of t = ln weight -> (u, v) = (ln rho, ln eta) / 2 with rho = |Az - b|^2, eta = |z|^2.
 
     With z_i = s_i beta_i / (s_i^2 + w): eta' = d eta / dt = -2 w sum z_i^2 / (s_i^2 + w), and rho' = -w eta'.
     """

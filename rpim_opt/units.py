@@ -35,7 +35,6 @@ DISPLAY = {
     "torque": "Nm",
     "ratio": "ppm",
     "compliance": "mrad_per_Nm",
-    "number": "1",
 }
 """The unit in which a dimension is shown and written."""
 
@@ -48,7 +47,7 @@ def accepted_units(dimension: str) -> list[str]:
 def display(dimension: str) -> tuple[str, float]:
     """Return the unit for showing a dimension and its size in SI."""
     name = DISPLAY[dimension]
-    return name, UNITS[name].si if name in UNITS else 1.0
+    return name, UNITS[name].si
 
 
 def split_unit(name: str) -> tuple[str, Unit | None]:

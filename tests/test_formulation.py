@@ -75,6 +75,15 @@ def test_unseen_directions_stay_nominal_at_weight_zero() -> None:
     assert np.abs(z - np.linalg.pinv(A) @ m.b).max() < 1e-8
 
 
+@pytest.mark.parametrize("constraints", [(), (ro.within_tolerance,)])
+def test_without_a_penalty_a_weight_changes_nothing(constraints: tuple) -> None:
+    program = ro.Formulation("no penalty", constraints=constraints).compile(model())
+    unweighted = program.solve(0.0)
+    for estimate in (program.solve(10.0), *program.path([10.0])):
+        assert np.abs(estimate.z - unweighted.z).max() < 1e-9
+        assert estimate.weight == 0
+
+
 def test_one_program_serves_other_data_of_the_same_shape() -> None:
     program = ro.bounded.compile(model(0))
     assert np.array_equal(program.on(model(1)).solve(0.1).z, ro.bounded.compile(model(1)).solve(0.1).z)
