@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rpim_opt.calibration import Calibration as Calibration
     from rpim_opt.calibration import calibrate as calibrate
     from rpim_opt.dataset import Dataset as Dataset
-    from rpim_opt.dataset import read_csv as read_csv
+    from rpim_opt.dataset import read_data as read_data
     from rpim_opt.exceptions import InputError as InputError
     from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
     from rpim_opt.exceptions import RpimError as RpimError
@@ -39,7 +39,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "calibration": ("Calibration", "calibrate"),
-    "dataset": ("Dataset", "read_csv"),
+    "dataset": ("Dataset", "read_data"),
     "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
     "formulation": ("Formulation", "bounded", "least_squares", "tikhonov", "within_tolerance"),
     "instances": ("Instance", "load"),

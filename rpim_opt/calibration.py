@@ -12,6 +12,7 @@ import numpy as np
 from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError
 from rpim_opt.formulation import FEASIBLE, ConvexProgram, Formulation, tikhonov
+from rpim_opt.frames import first_guess
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.selection import Selection, Selector
@@ -67,8 +68,22 @@ class Calibration:
         return (self.problem.on(data) if data else self.problem).errors(self.x)
 
     def nominal_errors(self, data: Dataset | None = None) -> Array:
-        """Return the position error of every row before calibration, (N,) [m]."""
-        return (self.problem.on(data) if data else self.problem).errors(np.zeros_like(self.x))
+        """Return the position error of every row before calibration, (N,) [m].
+
+        The robot is as its drawing says. Frames (base, reflectors, anchors, ...) that the calibration identifies
+        are fitted to the identification data first: before that they say nothing about the robot.
+        """
+        problem, x = self._nominal
+        return (problem.on(data) if data else problem).errors(x)
+
+    @cached_property
+    def _nominal(self) -> tuple[CalibrationProblem, Array]:
+        """The problem that identifies frames alone, and its solution under the prior that the scales state."""
+        frames = self.problem.parameters.of_frames & self.problem.parameters.identified
+        if not frames.any():
+            return self.problem, np.zeros_like(self.x)
+        problem = self.problem.identifying(frames)
+        return problem, calibrate(problem, tikhonov, 1.0).x
 
     @property
     def robot(self) -> Robot:
@@ -178,8 +193,9 @@ def calibrate(
         A number, or a selector, which sees identification data only. It is asked anew until the steps
         become small; then the weight stays.
     start
-        (n,) deviations [SI] to begin with; nominal by default. The answer does not depend on it,
-        as long as the loop converges: the deviations count from nominal all the same.
+        (n,) deviations [SI] to begin with; by default nominal, or where registration finds the frames if the
+        stated base contradicts the data (`frames.first_guess`). The answer does not depend on it, as long as
+        the loop converges: the deviations count from nominal all the same.
     max_iterations, tolerance
         When to stop. A calibration that did not converge says so in ``converged`` and ``message``.
     progress
@@ -193,7 +209,8 @@ def calibrate(
         When a convex program fails.
     """
     scale = problem.parameters.free.scale
-    begin = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float)
+    guess = first_guess(problem) if start is None else np.asarray(start, dtype=float)
+    begin = np.zeros(len(scale)) if guess is None else guess
     if begin.shape != scale.shape or not np.isfinite(begin).all():
         raise InputError("start", f"shape {begin.shape}", f"{len(scale)} deviations, finite, one a parameter")
     z = begin / scale

@@ -2,32 +2,73 @@
 
 from __future__ import annotations
 
-import csv
-import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.exceptions import InputError, choices
-from rpim_opt.measurement import Measurement, position
+from rpim_opt.measurement import LaserTracker, Measurement, position
 from rpim_opt.robot import Array, Robot
-from rpim_opt.units import accepted_units, quantities, split_unit
+from rpim_opt.tables import Columns, numbers, read_columns, texts
+from rpim_opt.units import quantities, split_unit, with_unit
+
+TRACKER = {
+    "range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
+    "x": ("length",), "y": ("length",), "z": ("length",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Dataset:
-    """Rows of measurements.
+class Block:
+    """Rows of a dataset that one function evaluates: one measurement model, the same reflectors and fixture.
 
     Parameters
     ----------
+    measurement
+        What the instrument sees.
     q
-        (N, dof) joint values of the controller [rad or m].
+        (N, p, dof) joint values of the controller [rad or m] at the p points of a row.
     y
         (N, c) measured values [SI], in the order of the measurement's columns.
     covariance
         (N, k, k) of the residual's components [SI], or (1, k, k) when it is the same for all rows.
+    row
+        (N,) which row of the dataset each one is.
+    markers
+        The reflector of each point; ``""`` for the only one.
+    fixture
+        Which anchor, plane or sphere; ``""`` for the only one.
+    torque
+        (N, p, dof) joint torques of the controller's joints [Nm], or None.
+    """
+
+    measurement: Measurement
+    q: Array
+    y: Array
+    covariance: Array
+    row: np.ndarray
+    markers: tuple[str, ...] = ("",)
+    fixture: str = ""
+    torque: Array | None = None
+
+    def take(self, index: np.ndarray, row: np.ndarray) -> Block:
+        """Return the entries at ``index``, which become the rows ``row``."""
+        covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
+        torque = None if self.torque is None else self.torque[index]
+        return replace(self, q=self.q[index], y=self.y[index], covariance=covariance, row=row, torque=torque)
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Rows of measurements, of one kind or several.
+
+    Parameters
+    ----------
+    blocks
+        The rows, grouped by what evaluates them.
     label
         N row labels, unique.
     configuration
@@ -35,54 +76,132 @@ class Dataset:
         in cross-validation.
     """
 
-    q: Array
-    y: Array
-    covariance: Array
+    blocks: tuple[Block, ...]
     label: tuple[str, ...]
     configuration: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.q)
+        return len(self.label)
 
-    def take(self, index: np.ndarray | list[int]) -> Dataset:
-        """Return the rows at ``index``."""
+    @property
+    def q(self) -> Array:
+        """Joint values of the controller at every row's first point, (N, dof) [rad or m]."""
+        q = np.empty((len(self), self.blocks[0].q.shape[2]))
+        for block in self.blocks:
+            q[block.row] = block.q[:, 0]
+        return q
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
+        """Return the rows at ``index``, in that order; a row may be taken more than once."""
         index = np.asarray(index, dtype=int)
-        covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
-        labels = tuple(self.label[i] for i in index)
-        return Dataset(self.q[index], self.y[index], covariance, labels, self.configuration[index])
+        owner, place = np.empty(len(self), dtype=int), np.empty(len(self), dtype=int)
+        for i, block in enumerate(self.blocks):
+            owner[block.row], place[block.row] = i, np.arange(len(block.row))
+        blocks = []
+        for i, block in enumerate(self.blocks):
+            row = np.flatnonzero(owner[index] == i)
+            if len(row):
+                blocks.append(block.take(place[index[row]], row))
+        return Dataset(tuple(blocks), tuple(self.label[i] for i in index), self.configuration[index])
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""
         return self.take([i for i, label in enumerate(self.label) if label not in labels])
 
+    def configurations(self, count: int, seed: int) -> Dataset:
+        """Return the rows of ``count`` configurations drawn at random."""
+        known = np.unique(self.configuration)
+        if not 0 < count <= len(known):
+            raise InputError("count", f"{count}", f"1 to {len(known)} configurations")
+        drawn = np.random.default_rng(seed).choice(known, count, replace=False)
+        return self.take(np.flatnonzero(np.isin(self.configuration, drawn)))
+
     @classmethod
-    def of(cls, q: Array, y: Array, sigma: float, label: tuple[str, ...] = ()) -> Dataset:
-        """Return a dataset from arrays, with one standard deviation [SI] for all components of y."""
-        q, y = np.atleast_2d(np.asarray(q, float)), np.atleast_2d(np.asarray(y, float))
-        if len(q) != len(y) or not np.isfinite(q).all() or not np.isfinite(y).all():
-            raise InputError("q and y", f"shapes {q.shape} and {y.shape}", "finite numbers, one row a measurement")
-        if not sigma > 0:
-            raise InputError("sigma", f"{sigma}", "a number greater than zero")
-        labels = label or tuple(str(i + 1) for i in range(len(q)))
-        return cls(q, y, sigma**2 * np.eye(y.shape[1])[None], labels, np.arange(len(q)))
+    def of(
+        cls, q: Array, y: Array, sigma: float | Array, label: tuple[str, ...] = (), measurement: Measurement = position
+    ) -> Dataset:
+        """Return a dataset from arrays.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m]; (N, p, dof) where a row involves p points.
+        y
+            (N, c) measured values [SI].
+        sigma
+            One standard deviation [SI] for all components of the residual, or their covariance, (k, k) or (N, k, k).
+        label
+            N row labels; numbers from 1 by default.
+        measurement
+            What the instrument sees.
+        """
+        q, y = np.asarray(q, float), np.asarray(y, float)
+        q = q[:, None] if q.ndim == 2 else q
+        shapes = f"shapes {q.shape} and {y.shape}"
+        fits = (
+            q.ndim == 3 and q.shape[:2] == (len(y), measurement.points) and y.shape[1:] == (len(measurement.columns),)
+        )
+        if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
+            accepted = (
+                f"finite numbers, {measurement.points} x dof joint and {len(measurement.columns)} measured values"
+            )
+            raise InputError("q and y", shapes, accepted + " a row")
+        k, N = len(measurement.components), len(q)
+        covariance = np.array(sigma, dtype=float) if np.ndim(sigma) else np.square(sigma) * np.eye(k)
+        covariance = covariance[None] if covariance.ndim == 2 else covariance
+        if covariance.shape[1:] != (k, k) or len(covariance) not in (1, N) or (np.ndim(sigma) == 0 and not sigma > 0):
+            raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
+        labels, rows = label or tuple(str(i + 1) for i in range(N)), np.arange(N)
+        block = Block(measurement, q, y, covariance, rows, ("",) * measurement.points)
+        return cls((block,), labels, rows)
+
+    @classmethod
+    def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
+        """Return several datasets as one; where labels occur twice, the part's name precedes all of them.
+
+        Rows of different parts belong to the same configuration when their joint values are equal.
+        """
+        labels = [label for part in parts for label in part.label]
+        if len(set(labels)) < len(labels):
+            labels = [f"{name}:{label}" for name, part in zip(names, parts, strict=True) for label in part.label]
+        blocks, configuration, rows, count = [], [], 0, 0
+        for part in parts:
+            blocks += [replace(block, row=block.row + rows) for block in part.blocks]
+            configuration.append(part.configuration + count)
+            rows += len(part)
+            count += int(part.configuration.max()) + 1
+        whole = cls(tuple(blocks), tuple(labels), np.concatenate(configuration))
+        stop = np.unique(whole.q, axis=0, return_inverse=True)[1]
+        first = np.full(rows, rows)
+        np.minimum.at(first, stop, whole.configuration)
+        joined = np.full(count, count)
+        np.minimum.at(joined, whole.configuration, first[stop])
+        return replace(whole, configuration=joined[whole.configuration])
 
 
-def read_csv(
-    path: str | Path, robot: Robot, noise: Mapping[str, float], measurement: Measurement = position
+def read_data(
+    source: Any, robot: Robot, noise: Mapping[str, Any] | None = None, measurement: Measurement = position
 ) -> Dataset:
-    """Return the measurements of a CSV file.
+    """Return the measurements of a table.
 
-    The header names every column with its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional:
-    ``label``, ``configuration``, ``sigma_mm`` (standard deviation of a row), ``sigma_x_mm`` (of one axis).
+    Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
+
+    - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default);
+    - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere);
+    - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
+      (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
+    - ``tau1_Nm``, ... (joint torques);
+    - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``.
 
     Parameters
     ----------
-    path
-        The file, UTF-8.
+    source
+        A path (``.csv``, ``.parquet``, ``.xlsx``), or a pandas or polars data frame.
     robot
         Its joints' number and types decide the joint columns.
     noise
-        Standard deviations where no column states them: ``{"position_mm": 0.03}`` or ``{"x_mm": 0.03, ...}``.
+        Standard deviations where no column states them: ``{"position_mm": 0.03}``, ``{"x_mm": 0.03, ...}``, and
+        ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker (`LaserTracker`), added to them.
     measurement
         Decides the columns of measured values.
 
@@ -91,114 +210,200 @@ def read_csv(
     InputError
         Naming the file, the row or column, what was found and what is accepted.
     """
-    path = Path(path)
-    declared = _declared(noise, measurement)  # outside: a mistake there is not the table's
+    declared = _declared(noise or {}, measurement)  # outside: a mistake there is not the table's
     try:
-        return _dataset(_table(path), robot, declared, measurement)
+        return _dataset(read_columns(source), robot, declared, measurement)
     except InputError as error:
-        raise error.within(path) from None
+        raise error.within(source if isinstance(source, str | Path) else None) from None
 
 
-def _table(path: Path) -> dict[str, list[str]]:
-    """Return the columns of a CSV file as text."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [row for row in csv.reader(stream, strict=True) if any(cell.strip() for cell in row)]
-    except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob("*.csv")) if path.parent.is_dir() else []
-        raise InputError("the file", "nothing", choices(path.name, near), path) from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError("the file", str(error), "a readable UTF-8 CSV file", path) from None
-    if not lines:
-        raise InputError("the table", "an empty file", "a header and at least one row")
-    header = [name.strip() for name in lines[0]]
-    for name in header:
-        if header.count(name) > 1:
-            raise InputError("the header", f"column '{name}' twice", "every column once")
-    if len(lines) == 1:
-        raise InputError("the table", "a header and no rows", "at least one row")
-    for number, row in enumerate(lines[1:], start=1):
-        if len(row) != len(header):
-            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{len(header)} cells as in the header")
-    return {name: [row[i].strip() for row in lines[1:]] for i, name in enumerate(header)}
-
-
-def _dataset(table: dict[str, list[str]], robot: Robot, declared: Mapping[str, float], kind: Measurement) -> Dataset:
+def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Measurement) -> Dataset:
     N = len(next(iter(table.values())))
-    label = tuple(table.get("label") or (str(i + 1) for i in range(N)))
+    label = _labels(table, N)
+    columns = _numeric(table, robot, kind, label)
+
+    def several(names: Sequence[str]) -> Array:
+        return np.column_stack([columns[name, ""] for name in names]) if names else np.empty((N, 0))
+
+    dof = range(1, robot.dof + 1)
+    prefixes = ["", "to_"][: kind.points]
+    q = [several([f"q{i}" for i in dof])]
+    if kind.points == 2:
+        q.append(several([f"to_q{i}" for i in dof]) if ("to_q1", "") in columns else q[0])
+    torque = None
+    if ("tau1", "") in columns:
+        torque = np.stack([several([f"{p if (p + 'tau1', '') in columns else ''}tau{i}" for i in dof])
+                           for p in prefixes], axis=1)  # fmt: skip
+    y = several(_form(columns, kind)[0])
+    try:
+        y = kind.prepare(_form(columns, kind)[1](y))
+    except InputError as error:
+        raise InputError(f"row {label[int(error.where)]}", error.found, error.accepted) from None
+    covariance = _covariance(columns, declared, kind, y, label)
+    names = [texts(table.get(p + "marker", table.get("marker", [""] * N)), p + "marker") for p in prefixes]
+    fixture = texts(table.get("fixture", [""] * N), "fixture")
+    if kind.points == 2:
+        still = [i for i in range(N) if names[0][i] == names[1][i] and np.array_equal(q[0][i], q[1][i])]
+        if still:
+            found = "twice the same reflector in the same configuration"
+            raise InputError(f"row {label[still[0]]}", found, "to_marker or to_q1, ... of another point")
+    if "configuration" in table:
+        configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    else:
+        configuration = np.unique(np.hstack(q), axis=0, return_inverse=True)[1]
+    whole = Block(kind, np.stack(q, axis=1), y, covariance, np.arange(N), torque=torque)
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, key in enumerate(zip(*names, fixture, strict=True)):
+        groups.setdefault(key, []).append(i)
+    blocks = []
+    for (*markers, place), rows in groups.items():
+        index = np.array(rows)
+        blocks.append(replace(whole.take(index, index), markers=tuple(markers), fixture=place))
+    return Dataset(tuple(blocks), label, configuration)
+
+
+def _labels(table: Columns, N: int) -> tuple[str, ...]:
+    label = texts(table["label"], "label") if "label" in table else tuple(str(i + 1) for i in range(N))
     seen: set[str] = set()
     for i, name in enumerate(label):
         if not name or name in seen:
             raise InputError(f"row {i + 1}, column label", f"'{name}'", "a label that no other row has")
         seen.add(name)
+    for column in ("marker", "to_marker", "fixture", "configuration"):
+        for i, name in enumerate(texts(table.get(column, ()), column)):
+            if not name:
+                raise InputError(f"row {label[i]}, column {column}", "''", "a name")
+    return label
+
+
+def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, ...]) -> dict[tuple[str, str], Array]:
+    """Return the numeric columns [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    sigmas = {f"sigma_{name}": dimension for name, dimension in kind.components.items()}
-    optional = sigmas if len(set(kind.components.values())) > 1 else {"sigma": "length", **sigmas}
-    known = {**joints, **kind.columns, **optional}
-    columns: dict[str, Array] = {}
+    torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
+    required = {**joints, **kind.columns}
+    known: dict[str, list[str]] = {stem: [dimension] for stem, dimension in {**required, **torques}.items()}
+    for form, _ in kind.forms:
+        known.update({stem: [dimension] for stem, dimension in form.items()})
+    if kind.points == 2:
+        known.update({f"to_{stem}": [dimension] for stem, dimension in {**joints, **torques}.items()})
+    dims = list(kind.components.values())
+    for spread in ("sigma", "u95"):
+        known[spread] = sorted(set(dims))
+        known.update({f"{spread}_{name}": [dimension] for name, dimension in kind.components.items()})
+    for i, (a, da) in enumerate(kind.components.items()):
+        for b, db in list(kind.components.items())[i:]:
+            known[f"cov_{a}_{b}"] = [f"{da}2" if da == db else f"{da} {db}"]
+    plain = ["label", "configuration", "marker", "fixture", *(["to_marker"] if kind.points == 2 else [])]
+    columns: dict[tuple[str, str], Array] = {}
     for name, cells in table.items():
-        stem, unit = split_unit(name)
-        if name in ("label", "configuration"):
+        if name in plain:
             continue
+        stem, unit = split_unit(name)
+        dimension = unit.dimension if unit else ""
         if stem not in known:
-            accepted = [f"{s}_{accepted_units(d)[0]}" for s, d in known.items()]
-            raise InputError("the header", f"column '{name}'", choices(name, ["label", "configuration", *accepted]))
-        accepted = ", ".join(f"{stem}_{u}" for u in accepted_units(known[stem]))
-        if unit is None or unit.dimension != known[stem]:
+            accepted = [n for s, ds in known.items() for d in ds for n in with_unit(s, d, 1) if "cov_" not in s]
+            raise InputError("the header", f"column '{name}'", choices(name, [*plain, *accepted]))
+        if dimension not in known[stem]:
+            accepted = ", ".join(n for d in known[stem] for n in with_unit(stem, d))
             raise InputError("the header", f"column '{name}' without a unit that fits", accepted)
-        if stem in columns:
+        if (stem, dimension) in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
-        columns[stem] = unit.si * np.array([_number(cell, row, name) for cell, row in zip(cells, label, strict=True)])
-    for stem, dimension in {**joints, **kind.columns}.items():
-        if stem not in columns:
-            accepted = " or ".join(f"{stem}_{u}" for u in accepted_units(dimension))
+        values = (unit.si if unit else 1.0) * numbers(cells, label, name)
+        columns[stem, dimension] = values
+        if len(known[stem]) == 1:
+            columns[stem, ""] = values
+        if stem.startswith(("sigma", "u95")) and not (values > 0).all():
+            row = label[int(np.argmin(values > 0))]
+            raise InputError(f"row {row}, column {name}", f"{values.min():g}", "an uncertainty greater than zero")
+    groups = [list(torques)]
+    if kind.points == 2:
+        groups += [[f"to_{s}" for s in group] for group in (joints, torques)]
+    optional = [group for group in groups if any((stem, "") in columns for stem in group)]
+    form = {stem: known[stem][0] for stem in _form(columns, kind)[0]}
+    for stem in [*joints, *form, *(stem for group in optional for stem in group)]:
+        if (stem, "") not in columns:
+            accepted = " or ".join(with_unit(stem, known[stem][0]))
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
-    covariance = _covariance(columns, declared, kind)
-    for column in sigmas | {"sigma": ""}:
-        wrong = np.flatnonzero(columns.get(column, np.ones(N)) <= 0)
-        if len(wrong):
-            raise InputError(f"row {label[wrong[0]]}, column {column}", "zero or less", "a standard deviation > 0")
-    configuration = (
-        np.unique(table["configuration"], return_inverse=True)[1] if "configuration" in table else np.arange(N)
-    )
-    q = np.column_stack([columns[name] for name in joints])
-    return Dataset(q, np.column_stack([columns[name] for name in kind.columns]), covariance, label, configuration)
+    return columns
 
 
-def _number(cell: str, row: str, column: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"row {row}, column {column}", f"'{cell}'", "a finite number")
-    return value
+def _form(columns: Mapping[tuple[str, str], Array], kind: Measurement) -> tuple[list[str], Any]:
+    """Return the columns that state the measured values, and the function from them to y."""
+    for form, convert in kind.forms:
+        if all((stem, "") in columns for stem in form):
+            return list(form), convert
+    return list(kind.columns), lambda y: y
 
 
-def _declared(noise: Mapping[str, float], kind: Measurement) -> dict[str, float]:
-    """Return the standard deviations [SI] that hold where a table states none."""
+def _declared(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
+    """Return what holds where a table states no uncertainty: standard deviations [SI], perhaps a ``tracker``."""
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
-    declared = {stem: value for (stem, _), value in quantities(noise, accepted, "table noise").items()}
-    for stem, value in declared.items():
+    declared: dict[str, Any] = {}
+    tracker = noise.get("tracker")
+    if tracker is not None:
+        if not isinstance(tracker, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
+            raise InputError("table noise, key tracker", repr(tracker)[:60], "a table, for positions and poses")
+        given = quantities(tracker, TRACKER, "table noise.tracker")
+        terms = {"range_ppm" if d == "ratio" else stem: value for (stem, d), value in given.items()}
+        if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
+            raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
+        declared["tracker"] = LaserTracker(**terms)
+    plain = {key: value for key, value in noise.items() if key != "tracker"}
+    for (stem, _), value in quantities(plain, accepted, "table noise").items():
         if not value > 0:
             raise InputError(f"table noise, key {stem}", f"{value:g}", "a standard deviation > 0")
+        declared[stem] = value
     return declared
 
 
-def _covariance(columns: Mapping[str, Array], declared: Mapping[str, float], kind: Measurement) -> Array:
-    """Return (N or 1, k, k): a row's own standard deviations, else the declared ones."""
-    sigma = []
-    for name, dimension in kind.components.items():
+def _covariance(
+    columns: Mapping[tuple[str, str], Array],
+    declared: Mapping[str, Any],
+    kind: Measurement,
+    y: Array,
+    label: Sequence[str],
+) -> Array:
+    """Return (N or 1, k, k): what a row states of itself, else the declared deviations and the tracker's."""
+    names, k = list(kind.components), len(kind.components)
+    tracker: LaserTracker | None = declared.get("tracker")
+    instrument = np.zeros((1, k, k))
+    if tracker is not None:
+        at = [list(kind.columns).index(c) for c in "xyz"]
+        instrument = np.zeros((len(y), k, k))
+        instrument[:, :3, :3] = tracker.covariance(y[:, at])
+    spread, own = [], []
+    for i, (name, dimension) in enumerate(kind.components.items()):
         common = next((key for key, d in kind.noise.items() if d == dimension), "")
-        choice = [
-            columns.get(f"sigma_{name}"),
-            columns.get("sigma"),
-            declared.get(name),
-            declared.get(common),
-        ]
-        value = next((v for v in choice if v is not None), None)
-        if value is None:
-            raise InputError("table noise", f"no standard deviation for '{name}'", f"{common}_mm or sigma_{name}_mm")
-        sigma.append(np.atleast_1d(value))
-    spread = np.stack(np.broadcast_arrays(*sigma), axis=1)
-    return spread[:, :, None] ** 2 * np.eye(spread.shape[1])
+        stated = [columns.get((f"sigma_{name}", "")), columns.get(("sigma", dimension)),
+                  _half(columns.get((f"u95_{name}", ""))), _half(columns.get(("u95", dimension)))]  # fmt: skip
+        value = next((v for v in stated if v is not None), None)
+        own.append(value is not None)
+        value = value if value is not None else declared.get(name, declared.get(common))
+        if value is None and not instrument[:, i, i].any() and (f"cov_{name}_{name}", "") not in columns:
+            accepted = (
+                f"{with_unit(common, dimension, 2)[-1]}, or a column {with_unit(f'sigma_{name}', dimension, 2)[-1]}"
+            )
+            raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
+        spread.append(np.atleast_1d(0.0 if value is None else value))
+    deviation = np.stack(np.broadcast_arrays(*spread), axis=1)
+    covariance = deviation[:, :, None] ** 2 * np.eye(k)
+    shared = np.outer(~np.array(own), ~np.array(own))
+    covariance = covariance + instrument * shared
+    stated_cov = {(a, b): columns[f"cov_{a}_{b}", ""] for a in names for b in names if (f"cov_{a}_{b}", "") in columns}
+    if stated_cov:
+        covariance = np.broadcast_to(covariance, (len(y), k, k)).copy()
+        for (a, b), values in stated_cov.items():
+            i, j = names.index(a), names.index(b)
+            covariance[:, i, j] = covariance[:, j, i] = values
+    unit = np.sqrt(np.einsum("nii->ni", covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        smallest = np.linalg.eigvalsh(np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :])))[:, 0]
+    if not (smallest > 1e-9).all():
+        row = label[int(np.argmin(smallest > 1e-9))]
+        raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")
+    return covariance
+
+
+def _half(values: Array | None) -> Array | None:
+    """Return standard deviations from expanded uncertainties, coverage factor 2."""
+    return None if values is None else values / 2

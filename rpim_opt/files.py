@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rpim_opt.exceptions import InputError, choices
-from rpim_opt.units import UNITS, accepted_units, number, split_unit
+from rpim_opt.units import UNITS, number, quantities
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
@@ -43,45 +43,31 @@ class Table(BaseModel):
             if any(m in known for m in field.metadata)
         }
 
-    @classmethod
-    def _accepted(cls) -> list[str]:
-        quantity = cls._dimensions()
-        names = []
-        for name in cls.model_fields:
-            dims = quantity.get(name)
-            names += [f"{name}_{u}" for d in dims for u in accepted_units(d)] if dims else [name]
-        return names
-
     @model_validator(mode="before")
     @classmethod
     def _to_si(cls, table: Any) -> Any:
         if not isinstance(table, dict):
             return table
-        quantity, si = cls._dimensions(), {}
-        plain = set(cls.model_fields) - set(quantity)
-        for key, value in table.items():
-            stem, unit = split_unit(key)
-            if key in plain:
-                si[key] = value
-                continue
-            if stem not in quantity:
-                raise Misfit("", f"unknown key '{key}'", choices(key, cls._accepted()))
-            if unit is None or unit.dimension not in quantity[stem]:
-                names = [f"{stem}_{u}" for d in quantity[stem] for u in accepted_units(d)]
-                raise Misfit(key, "no unit that fits", ", ".join(names))
-            if stem in si:
-                raise Misfit(key, "the same quantity twice", "one of them")
-            si[stem] = _scaled(key, value, unit.si)
-        return si
+        dimensions = cls._dimensions()
+        plain = [name for name in cls.model_fields if name not in dimensions]
+        others = {key: value for key, value in table.items() if key not in plain}
+        try:
+            si = quantities(others, dimensions, convert=_scaled, also=plain)
+        except InputError as error:
+            key = error.where.removeprefix("key ") if error.where.startswith("key ") else ""
+            raise Misfit(key, error.found, error.accepted) from None
+        stems = [stem for stem, _ in si]
+        for stem in stems:
+            if stems.count(stem) > 1:
+                raise Misfit(stem, "the same quantity twice", "one of them")
+        kept = {key: value for key, value in table.items() if key not in others}
+        return kept | {stem: value for (stem, _), value in si.items()}
 
 
-def _scaled(key: str, value: Any, si: float) -> Any:
+def _scaled(value: Any, where: str, si: float) -> Any:
     if isinstance(value, list):
-        return [_scaled(key, v, si) for v in value]
-    try:
-        return number(value, key) * si
-    except InputError as error:
-        raise Misfit(key, error.found, error.accepted) from None
+        return [_scaled(v, where, si) for v in value]
+    return number(value, where) * si
 
 
 Model = TypeVar("Model", bound=BaseModel)

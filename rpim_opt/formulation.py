@@ -82,6 +82,11 @@ class ConvexProgram:
         return ConvexProgram(self.formulation, model, self._posed)
 
     @property
+    def quadratic(self) -> bool:
+        """Whether loss and penalty are squared norms."""
+        return self._posed.quadratic and self.formulation.penalty is not None
+
+    @property
     def closed_form(self) -> bool:
         """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares)."""
         return self._posed.quadratic and not self.formulation.constraints

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
-from rpim_opt.dataset import Dataset, read_csv
+from rpim_opt.dataset import Dataset, read_data
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import Angle, Length, Table, read_toml, validate
 from rpim_opt.formulation import FORMULATIONS, Formulation
+from rpim_opt.frames import starting_parameters
 from rpim_opt.kinematics import FRAME
-from rpim_opt.measurement import MEASUREMENTS
-from rpim_opt.parameters import model_parameters
+from rpim_opt.measurement import MEASUREMENTS, Measurement, of_fixture
+from rpim_opt.observability import near_parallel
+from rpim_opt.parameters import Parameters
 from rpim_opt.problem import CalibrationProblem
-from rpim_opt.robot import read_robot
+from rpim_opt.robot import Robot, read_robot
 from rpim_opt.selection import SELECTORS, Selector
+from rpim_opt.tables import robodk_columns
+from rpim_opt.units import quantities, split_unit
 
 HERE = Path(__file__).resolve().parent
 ROLES = ("identification", "validation")
@@ -43,6 +48,8 @@ class Instance:
         validation) and method, to show beside ours.
     reference
         Figures that a run must reproduce, by name: (value, tolerance).
+    simulation
+        How the tables were simulated; empty for real measurements.
     """
 
     title: str
@@ -53,6 +60,7 @@ class Instance:
     weight: float | Selector
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    simulation: Mapping[str, Any] = field(default_factory=dict)
 
 
 class _FrameTable(Table):
@@ -64,24 +72,35 @@ class _FrameTable(Table):
     rz: Angle = 0.0
 
 
+class _Observation(Table):
+    measurement: str = "position"
+    layout: Literal["named", "robodk"] = "named"
+    identification: str
+    validation: str | None = None
+    noise: dict[str, Any] = Field(default_factory=dict)
+
+
 class _ProblemTable(Table):
     title: str
     source: str = ""
     robot: str = "robot.toml"
     measurement: str = "position"
-    identification: str
+    layout: Literal["named", "robodk"] = "named"
+    identification: str | None = None
     validation: str | None = None
+    observation: list[_Observation] = Field(default_factory=list)
     exclude: dict[str, str] = Field(default_factory=dict)
-    identify: list[str] = Field(min_length=1)
+    identify: list[str] | Literal["auto"]
     formulation: str = "tikhonov"
-    selector: str = "l_curve"
-    noise: dict[str, float | int] = Field(default_factory=dict)
+    selector: str = "reml"
+    noise: dict[str, Any] = Field(default_factory=dict)
     scale: dict[str, float | int] = Field(default_factory=dict)
     tolerance: dict[str, float | int] = Field(default_factory=dict)
-    base: _FrameTable = _FrameTable()
-    tool: _FrameTable = _FrameTable()
+    base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
+    tool: dict[str, Any] = Field(default_factory=dict)
     published: dict[str, dict[str, float]] = Field(default_factory=dict)
     reference: dict[str, list[float]] = Field(default_factory=dict)
+    simulation: dict[str, Any] = Field(default_factory=dict)
     variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
 
@@ -105,7 +124,7 @@ def find(name: str | Path) -> Path:
     )
 
 
-def load(name: str | Path, variant: str | None = None) -> Instance:
+def load(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Instance:
     """Return a problem from its folder, or from the name of one that comes with the package.
 
     Parameters
@@ -114,6 +133,8 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
         A folder with ``problem.toml`` (its format: README, "Your own robot"), or ``"paper_arm"``.
     variant
         One of the file's ``[variant.NAME]`` tables, laid over the other keys.
+    measurements
+        Measurement models of your own that the file may name.
 
     Raises
     ------
@@ -123,32 +144,68 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
     folder = find(name)
     path = folder / "problem.toml"
     content = read_toml(path)
-    validate(_ProblemTable, content, path)
+    kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
+    fixtures = {p.partition("_")[0] for kind in kinds.values() for p in kind.parameters}
+    _split(content, fixtures, path)
     if variant is not None:
         variants = content.get("variant", {})
         if variant not in variants:
             raise InputError("variant", f"'{variant}'", choices(variant, variants), path)
         content = _overlay({k: v for k, v in content.items() if k != "variant"}, variants[variant])
-    table = validate(_ProblemTable, content, path)
+    table, placed = _split(content, fixtures, path)
     formulation = lookup(FORMULATIONS, table.formulation, "formulation", path)
-    measurement = lookup(MEASUREMENTS, table.measurement, "measurement", path)
-    robot = read_robot(folder / table.robot)
-    base, tool = ([getattr(f, c) for c in FRAME] for f in (table.base, table.tool))
-    try:
-        parameters = model_parameters(robot, base, {"": tool}).identify(table.identify)
-        parameters = parameters.scaled(table.scale).toleranced(table.tolerance)
-        tables = [table.identification] + ([table.validation] if table.validation else [])
-        data = [read_csv(folder / file, robot, table.noise, measurement) for file in tables]
-    except InputError as error:
-        raise error.within(path) from None
-    labels = {label for part in data for label in part.label}
+    robot = read_robot(find_robot(table.robot, folder))
+    observations = list(table.observation)
+    if table.identification is not None:
+        first = {f: getattr(table, f) for f in ("measurement", "layout", "identification", "validation")}
+        observations.insert(0, _Observation.model_construct(**first, noise={}))
+    if not observations:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
+    known = {"x", "y", "z", "rx", "ry", "rz"}
+    several = bool(table.tool) and not any(split_unit(key)[0] in known for key in table.tool)
+    tools = {m: _frame(t, f"tool.{m}", path) for m, t in table.tool.items()} if several else {}
+    tools = tools or {"": _frame(table.tool, "tool", path)}
+    tcps = {m: [1e3 * v for v in frame[:3]] for m, frame in tools.items() if table.tool}
+    sets: dict[str, list[Dataset]] = {role: [] for role in ROLES}
+    names: dict[str, list[str]] = {role: [] for role in ROLES}
+    for each in observations:
+        kind = lookup(kinds, each.measurement, "measurement", path)
+        for role in ROLES:
+            file = getattr(each, role)
+            if file is None:
+                continue
+            try:
+                source: Any = folder / file
+                if each.layout == "robodk":
+                    source = robodk_columns(source, robot.joint_dimensions, tcps)
+                sets[role].append(read_data(source, robot, each.noise or table.noise, kind))
+            except InputError as error:
+                in_table = each.layout == "robodk" and error.where.startswith(("row", "the "))
+                raise error.within(folder / file if in_table else path) from None
+            names[role].append(Path(file).stem)
+    if any(each.layout == "robodk" for each in observations):
+        tools = {m: tools.get(m, (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0)) for m, tcp in tcps.items()}
+    data = {role: Dataset.together(parts, names[role]) for role, parts in sets.items() if parts}
+    labels = {label for part in data.values() for label in part.label}
     for label in table.exclude:
         if label not in labels:
             raise InputError("key exclude", f"label '{label}'", "a label of the data", path)
-    data = [part.without(table.exclude) for part in data]
-    for file, part in zip(tables, data, strict=True):
-        if not len(part):
-            raise InputError("the table", "no row that is not excluded", "at least one", folder / file)
+    files = {role: [getattr(o, role) for o in observations if getattr(o, role)] for role in ROLES}
+    for role, part in data.items():
+        data[role] = part.without(table.exclude)
+        if not len(data[role]):
+            raise InputError("the table", "no row that is not excluded", "at least one", folder / files[role][0])
+    base = None if isinstance(table.base, str) else _frame(table.base, "base", path)
+    try:
+        own = _own(placed, data["identification"])
+        parameters = starting_parameters(robot, data["identification"], base, tools, own)
+        parameters = parameters.scaled(table.scale, path).toleranced(table.tolerance, path)
+        chosen = _proposed(robot, parameters, data["identification"]) if table.identify == "auto" else table.identify
+        problem = CalibrationProblem(robot, parameters.identify(chosen), data["identification"])
+        if "validation" in data:
+            problem.on(data["validation"])
+    except InputError as error:
+        raise error.within(path) from None
     for key in table.published:
         if not (folder / key).is_file():
             raise InputError("table published", f"'{key}'", "the name of a table in this folder", path)
@@ -158,13 +215,84 @@ def load(name: str | Path, variant: str | None = None) -> Instance:
     return Instance(
         title=table.title,
         source=table.source,
-        problem=CalibrationProblem(robot, parameters, data[0], measurement),
-        validation=data[1] if len(data) > 1 else None,
+        problem=problem,
+        validation=data.get("validation"),
         formulation=formulation,
         weight=parse_weight(table.selector, path),
-        published={role: table.published.get(file, {}) for role, file in zip(ROLES, tables, strict=False)},
+        published={role: table.published.get(files[role][0], {}) for role in ROLES if files[role]},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
+        simulation=table.simulation,
     )
+
+
+def _split(content: dict[str, Any], fixtures: set[str], path: Path) -> tuple[_ProblemTable, dict[str, Any]]:
+    """Return the checked table, and apart from it those that place a measurement's anchor, plane, ..."""
+    placed = {key: value for key, value in content.items() if key in fixtures and isinstance(value, dict)}
+    return validate(_ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
+
+
+def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
+    if not isinstance(table, dict):
+        raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
+    try:
+        place = validate(_FrameTable, table, path)
+    except InputError as error:
+        where = f"key {where}" + error.where.removeprefix("key").replace(" the top level", "").replace(" ", ".", 1)
+        raise InputError(where, error.found, error.accepted, path) from None
+    return tuple(getattr(place, c) for c in FRAME)
+
+
+def _own(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:
+    """Return the stated values [SI] of the measurements' own parameters: ``[anchor] x_mm``, ``[anchor.A] x_mm``."""
+    own: dict[str, float] = {}
+    used: dict[str, dict[str, dict[str, str]]] = {}
+    for block in data.blocks:
+        for name, dimension in block.measurement.parameters.items():
+            table, _, rest = name.partition("_")
+            used.setdefault(table, {}).setdefault(block.fixture, {})[rest] = dimension
+    for table, content in placed.items():
+        if table not in used:
+            raise InputError(f"table {table}", "a place for no measurement here", choices(table, used))
+        for fixture, known in used[table].items():
+            part = content.get(fixture) if fixture else content
+            if part is None:
+                continue
+            where = f"table {table}.{fixture}" if fixture else f"table {table}"
+            if not isinstance(part, dict):
+                raise InputError(where, repr(part)[:60], "a table")
+            given = quantities(part, {rest: (d,) for rest, d in known.items()}, where)
+            own |= {of_fixture(f"{table}_{rest}", fixture): value for (rest, _), value in given.items()}
+        unknown = [key for key, value in content.items() if isinstance(value, dict) and key not in used[table]]
+        if unknown:
+            raise InputError(f"table {table}", f"'{unknown[0]}'", choices(unknown[0], used[table]))
+    return own
+
+
+def _proposed(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
+    """Return what ``identify = "auto"`` means: geometry, Hayati's beta where it is needed, and what places things."""
+    kinds = {block.measurement.name for block in data.blocks}
+    absolute = kinds & {"position", "pose"}
+    frames = [n for n in parameters.names if re.match(r"tool_|anchor_|length_|plane_|sphere_", n)]
+    if "pose" not in kinds:
+        frames = [n for n in frames if not (n.startswith("tool_") and n[-2:] in ("rx", "ry", "rz"))]
+    base = [n for n in parameters.names if n.startswith("base_")] if absolute else []
+    geometry = [n for n in parameters.names if re.fullmatch(r"(alpha|a|d|theta)\d+", n)]
+    return [*geometry, *near_parallel(robot), *base, *frames]
+
+
+def robots() -> list[str]:
+    """Return the names of the ready robots."""
+    return sorted(p.stem for p in (HERE / "robots").glob("*.toml"))
+
+
+def find_robot(name: str, folder: Path | None = None) -> Path:
+    """Return the file of a robot: one in ``folder``, or a ready robot by name."""
+    if folder is not None and name.endswith(".toml"):
+        return folder / name
+    if name in robots():
+        return HERE / "robots" / f"{name}.toml"
+    accepted = "a file .toml, or a ready robot: " + choices(name, robots())
+    raise InputError("key robot", f"'{name}'", accepted, folder / "problem.toml" if folder else None)
 
 
 def parse_weight(text: str, file: object = None) -> float | Selector:

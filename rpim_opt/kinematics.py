@@ -16,6 +16,8 @@ from rpim_opt.robot import MDH, Array, Robot
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
 
+FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
+
 JOINT_EXTRAS = {"ratio": "ratio", "ecc_cos": "angle", "ecc_sin": "angle", "compliance": "compliance"}
 """Parameters of a joint beyond its MDH row, with their dimensions; all are zero in a nominal robot."""
 
@@ -61,6 +63,15 @@ def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
     return rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx)
 
 
+def roll_pitch_yaw(R: Array) -> Array:
+    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx; at a pitch of 90 degrees, where roll is arbitrary, roll 0."""
+    horizontal = np.hypot(R[0, 0], R[1, 0])
+    pitch = np.arctan2(-R[2, 0], horizontal)
+    if horizontal < 1e-12:
+        return np.array([0.0, pitch, np.arctan2(-R[0, 1], R[1, 1])])
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+
+
 def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> ca.SX:
     """Return a frame displaced from its nominal place.
 
@@ -74,6 +85,11 @@ def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> 
     """
     origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
     return translation(*origin) @ rotation_rpy(*deviation[3:]) @ rotation_rpy(*nominal[3:])
+
+
+def numeric_frame(place: Sequence[float] | Array) -> Array:
+    """Return the transform (4, 4) of a frame's six numbers."""
+    return ca.DM(frame([float(v) for v in place])).full()
 
 
 def chain(

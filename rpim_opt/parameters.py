@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.exceptions import InputError, choices
-from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, rotation_rpy
+from rpim_opt.kinematics import FRAME_DIMENSION, JOINT_EXTRAS, roll_pitch_yaw, rotation_rpy
 from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.units import quantities, split_unit
 
@@ -28,8 +28,8 @@ DEFAULT_SCALE = {
 }
 """Expected size of deviations by (group, dimension), in SI, where a problem states none."""
 
+_ON_THE_ROBOT = re.compile(rf"({'|'.join((*MDH, *JOINT_EXTRAS))})\d+")
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
-FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,11 @@ class Parameters:
     def free(self) -> Parameters:
         """Return the identified parameters alone, in the order of a calibration's unknowns."""
         return self.take(np.flatnonzero(self.identified))
+
+    @property
+    def of_frames(self) -> np.ndarray:
+        """(P,) which parameters place something (base, reflectors, anchors, ...) and are not the robot's own."""
+        return np.array([not _ON_THE_ROBOT.fullmatch(name) for name in self.names])
 
     def identify(self, patterns: Iterable[str]) -> Parameters:
         """Return the same table with just the parameters identified that match one of the patterns.
@@ -154,14 +159,13 @@ def group_of(name: str, dimension: str) -> str:
     """
     if name.startswith(("tool_", "tool.")):
         return "tool"
-    on_the_robot = re.fullmatch(rf"({'|'.join((*MDH, *JOINT_EXTRAS))})\d+", name)
-    return dimension if on_the_robot else "base"
+    return dimension if _ON_THE_ROBOT.fullmatch(name) else "base"
 
 
 def model_parameters(
     robot: Robot,
-    base: Sequence[float] = (0.0,) * 6,
-    tools: Mapping[str, Sequence[float]] | None = None,
+    base: Sequence[float] | Array = (0.0,) * 6,
+    tools: Mapping[str, Sequence[float] | Array] | None = None,
     own: Mapping[str, tuple[str, float]] | None = None,
 ) -> Parameters:
     """Return every parameter of a model, none of them identified yet.
@@ -183,11 +187,11 @@ def model_parameters(
     for i, kind in enumerate(robot.joint_types, start=1):
         extras = JOINT_EXTRAS if kind == "revolute" else {"ratio": "ratio"}
         entries += [(f"{extra}{i}", dimension, 0.0) for extra, dimension in extras.items()]
-    places = {"base_": base}
+    places: dict[str, Sequence[float] | Array] = {"base_": base}
     for marker, tool in (tools or {"": (0.0,) * 6}).items():
         places[f"tool_{marker}_" if marker else "tool_"] = tool
     for prefix, place in places.items():
-        entries += [(prefix + c, FRAME_DIMENSION[c], v) for c, v in zip(FRAME, place, strict=True)]
+        entries += [(prefix + c, FRAME_DIMENSION[c], v) for c, v in zip(FRAME_DIMENSION, place, strict=True)]
     entries += [(name, dimension, value) for name, (dimension, value) in (own or {}).items()]
     names, dimensions, nominal = zip(*entries, strict=True)
     scale = [DEFAULT_SCALE.get((group_of(n, d), d), 1.0) for n, d, _ in entries]
@@ -199,15 +203,6 @@ def model_parameters(
         np.full(len(names), np.inf),
         np.zeros(len(names), dtype=bool),
     )
-
-
-def roll_pitch_yaw(R: Array) -> Array:
-    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx; at a pitch of 90 degrees, where roll is arbitrary, roll 0."""
-    horizontal = np.hypot(R[0, 0], R[1, 0])
-    pitch = np.arctan2(-R[2, 0], horizontal)
-    if horizontal < 1e-12:
-        return np.array([0.0, pitch, np.arctan2(-R[0, 1], R[1, 1])])
-    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
 def _summary(names: Sequence[str], pattern: str) -> str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
-from rpim_opt.dataset import Dataset
-from rpim_opt.exceptions import InputError
+from rpim_opt.dataset import Block, Dataset
+from rpim_opt.exceptions import InputError, choices
 from rpim_opt.kinematics import FRAME, call_rows, chain, frame
-from rpim_opt.measurement import Measurement, position
+from rpim_opt.measurement import Measurement, of_fixture
 from rpim_opt.parameters import Parameters
 from rpim_opt.robot import Array, Robot
 
@@ -71,7 +71,8 @@ class LinearModel:
 class CalibrationProblem:
     """What was measured on which robot, and which parameters are to explain it.
 
-    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal.
+    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
+    in the order of the data's blocks.
 
     Parameters
     ----------
@@ -80,81 +81,136 @@ class CalibrationProblem:
     parameters
         All parameters of the model, some of them identified.
     data
-        The measurements.
-    measurement
-        What the instrument sees.
+        The measurements, of one kind or several.
     """
 
     robot: Robot
     parameters: Parameters
     data: Dataset
-    measurement: Measurement = position
 
     def __post_init__(self) -> None:
-        if not self.parameters.identified.any():
+        p = self.parameters
+        if not p.identified.any():
             raise InputError("key identify", "no parameter", "at least one")
-        if self.data.q.shape[1] != self.robot.dof:
-            raise InputError("q", f"{self.data.q.shape[1]} columns", f"{self.robot.dof}, one a joint")
+        for block in self.data.blocks:
+            if block.q.shape[2] != self.robot.dof:
+                raise InputError("q", f"{block.q.shape[2]} columns", f"{self.robot.dof}, one a joint")
+            for marker in block.markers:
+                if _tool(marker) + "x" not in p.names:
+                    known = sorted({n.split("_")[1] for n in p.names if n.startswith("tool_") and n.count("_") == 2})
+                    raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
+            for name in block.measurement.parameters:
+                if of_fixture(name, block.fixture) not in p.names:
+                    where = f"measurement {block.measurement.name}"
+                    raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
+        compliant = [n for n, used in zip(p.names, p.identified, strict=True) if used and n.startswith("compliance")]
+        if compliant and not any(block.torque is not None for block in self.data.blocks):
+            raise InputError(
+                "key identify", f"'{compliant[0]}' without joint torques", "columns tau1_Nm, ... in the data"
+            )
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements."""
-        return CalibrationProblem(self.robot, self.parameters, data, self.measurement)
+        return CalibrationProblem(self.robot, self.parameters, data)
+
+    def identifying(self, identified: np.ndarray) -> CalibrationProblem:
+        """Return the same problem with other parameters identified, (P,) true or false."""
+        return CalibrationProblem(self.robot, replace(self.parameters, identified=identified), self.data)
 
     def residual(self, x: Array) -> Array:
         """Return measured minus modelled, (m,) [SI]."""
-        return self._evaluate("residual", x)[0].ravel()
+        return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
 
-    def errors(self, x: Array) -> Array:
-        """Return the norm of every row's residual, (N,) [m]: for positions the position error."""
-        return np.sqrt(np.sum(self._evaluate("residual", x)[0][:, 0] ** 2, axis=1))
+    def modelled(self, x: Array) -> list[Array]:
+        """Return what the instrument would read, block by block, (N, c) [SI]."""
+        return [self._evaluate(block, "modelled", x)[0][:, 0] for block in self.data.blocks]
+
+    def errors(self, x: Array, dimension: str = "length") -> Array:
+        """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
+
+        With ``dimension="angle"`` that of the angles [rad], for poses the orientation error; NaN for rows
+        without such components.
+        """
+        errors = np.full(len(self.data), np.nan)
+        for block in self.data.blocks:
+            of = [i for i, d in enumerate(block.measurement.components.values()) if d == dimension]
+            if of:
+                residual = self._evaluate(block, "residual", x)[0][:, 0, of]
+                errors[block.row] = np.sqrt(np.sum(residual**2, axis=1))
+        return errors
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values, -d residual / dx, (m, n) [SI]."""
-        return self._evaluate("jacobian", x)[1].reshape(-1, len(x))
+        parts = [self._evaluate(block, "jacobian", x)[1] for block in self.data.blocks]
+        return np.concatenate([part.reshape(-1, len(x)) for part in parts])
 
     def linearize(self, x: Array) -> LinearModel:
         """Return the whitened, scaled linear model around the deviations x (n,) [SI]."""
-        residual, jacobian = self._evaluate("jacobian", x)
         scale = self.parameters.free.scale
-        r = self._whitening @ residual.transpose(0, 2, 1)
-        A = (self._whitening @ jacobian).reshape(-1, len(x)) * scale
-        group = np.repeat(self.data.configuration, residual.shape[2])
-        return LinearModel(A, r.ravel() + A @ (x / scale), group, self.parameters.free)
+        A, r, group = [], [], []
+        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
+            residual, jacobian = self._evaluate(block, "jacobian", x)
+            r.append((whitening @ residual.transpose(0, 2, 1)).ravel())
+            A.append((whitening @ jacobian).reshape(-1, len(x)) * scale)
+            group.append(np.repeat(self.data.configuration[block.row], residual.shape[2]))
+        stacked = np.concatenate(A)
+        b = np.concatenate(r) + stacked @ (x / scale)
+        return LinearModel(stacked, b, np.concatenate(group), self.parameters.free)
 
     @cached_property
-    def _whitening(self) -> Array:
-        """L^-1 with covariance = L L'."""
+    def _whitening(self) -> list[Array]:
+        """L^-1 with covariance = L L', for every block."""
         try:
-            return np.asarray(np.linalg.inv(np.linalg.cholesky(self.data.covariance)), dtype=float)
+            factors = [np.linalg.cholesky(block.covariance) for block in self.data.blocks]
+            return [np.asarray(np.linalg.inv(L), dtype=float) for L in factors]
         except np.linalg.LinAlgError:
             raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
-    def _evaluate(self, what: str, x: Array) -> list[Array]:
+    def _evaluate(self, block: Block, what: str, x: Array) -> list[Array]:
         p = self.parameters
         absent = (p.nominal == 0) & ~p.identified
         functions = _functions(
-            self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(), self.measurement
-        )
-        return call_rows(functions[what], [x, p.nominal], self._rows)
+            self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
+            block.measurement, block.markers, block.fixture, block.torque is not None,
+        )  # fmt: skip
+        return call_rows(functions[what], [x, p.nominal], self._rows[id(block)])
 
     @cached_property
-    def _rows(self) -> Array:
-        """Joint values of the model and measured values, side by side."""
-        return np.hstack([self.data.q @ self.robot.joint_map.T, self.data.y])
+    def _rows(self) -> dict[int, Array]:
+        """For every block: joint values of the model, torques, and measured values, side by side."""
+        rows, M = {}, self.robot.joint_map
+        for block in self.data.blocks:
+            N = len(block.row)
+            parts = [(block.q @ M.T).reshape(N, -1)]
+            if block.torque is not None:
+                parts.append((block.torque @ np.linalg.inv(M)).reshape(N, -1))  # virtual work: tau_model = M^-T tau
+            rows[id(block)] = np.hstack([*parts, block.y])
+        return rows
 
 
-@lru_cache(maxsize=64)
+def _tool(marker: str) -> str:
+    """Return the prefix of a reflector's parameters."""
+    return f"tool_{marker}_" if marker else "tool_"
+
+
+@lru_cache(maxsize=256)
 def _functions(
     joint_types: tuple[str, ...],
     names: tuple[str, ...],
     identified: bytes,
     absent: bytes,
     measurement: Measurement,
+    markers: tuple[str, ...],
+    fixture: str,
+    torques: bool,
 ) -> dict[str, ca.Function]:
     """Build residual and Jacobian of one row; one structure is built once and serves every problem of it."""
-    dof, free = len(joint_types), np.frombuffer(identified, dtype=bool)
+    dof, points, free = len(joint_types), len(markers), np.frombuffer(identified, dtype=bool)
     x, nominal = ca.SX.sym("x", int(free.sum())), ca.SX.sym("nominal", len(names))
-    row = ca.SX.sym("row", dof + len(measurement.columns))
+    q = ca.SX.sym("q", dof * points)
+    tau = ca.SX.sym("tau", dof * points if torques else 0)
+    y = ca.SX.sym("y", len(measurement.columns))
+    row = ca.vertcat(q, tau, y)
     zero = dict(zip(names, np.frombuffer(absent, dtype=bool), strict=True))
     start = {name: ca.SX(0) if zero[name] else nominal[i] for i, name in enumerate(names)}
     deviation = dict.fromkeys(names, ca.SX(0))
@@ -166,12 +222,24 @@ def _functions(
     def value(name: str) -> ca.SX:
         return start[name] + deviation[name] if name in start else ca.SX(0)
 
-    flange = chain(joint_types, ca.vertsplit(row[:dof]), (0,) * dof, value)
-    T = place("base_") @ flange @ place("tool_")
-    own = {name: value(name) for name in measurement.parameters}
-    residual = ca.densify(measurement.residual(row[dof:], T, **own))
+    def reflector(point: int, marker: str) -> ca.SX:
+        at = slice(point * dof, (point + 1) * dof)
+        torque = ca.vertsplit(tau[at]) if torques else (0,) * dof
+        return place("base_") @ chain(joint_types, ca.vertsplit(q[at]), torque, value) @ place(_tool(marker))
+
+    transforms = [reflector(point, marker) for point, marker in enumerate(markers)]
+    own: dict[str, ca.SX] = {name: place(of_fixture(name + "_", fixture)) for name in measurement.frames}
+    for name in measurement.parameters:
+        if not name.startswith(tuple(f"{prefix}_" for prefix in measurement.frames)):
+            own[name] = value(of_fixture(name, fixture))
+    modelled = ca.densify(measurement.model(*transforms, **own))
+    residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
+    if residual.numel() != len(measurement.components):
+        found = f"{residual.numel()} components of the residual"
+        raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
     transposed = ca.densify(-ca.jacobian(residual, x).T)
     return {
         "residual": ca.Function("residual", [x, nominal, row], [residual]),
         "jacobian": ca.Function("jacobian", [x, nominal, row], [residual, transposed]),
+        "modelled": ca.Function("modelled", [x, nominal, row], [modelled]),
     }

@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from rpim_opt.exceptions import InputError
 from rpim_opt.formulation import ConvexProgram
+from rpim_opt.problem import RANK_TOLERANCE
 from rpim_opt.robot import Array
 
 
@@ -126,6 +127,72 @@ def _menger(points: Array) -> Array:
     return np.concatenate([[0.0], inner, [0.0]])
 
 
+def reml(program: ConvexProgram) -> Selection:
+    """Choose the most likely weight: restricted maximum likelihood, with the noise level profiled out.
+
+    The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters and sigma^2 as
+    unknown, so that declared noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
+    anchors) are fixed effects: the m equations are projected off their columns, because how far a tripod stands
+    says nothing about a gear. Minimizes, with g_i = w / (s_i^2 + w) (Patterson and Thompson 1971, Biometrika
+    58:545; Wahba 1985, Annals of Statistics 13:1378)::
+
+        m ln(sum beta_i^2 g_i + |r_perp|^2) - sum ln g_i
+
+    Constraints are left out of the likelihood. With few data a second maximum may lie at infinite weight, where
+    everything is noise: it counts only if there is no other, and then the weight is 1, declared noise and scales
+    at their word. A choice at the lower edge means that the data want no penalty.
+
+    Raises
+    ------
+    InputError
+        For another loss than the sum of squares or another penalty than the squared norm.
+    """
+    if not program.quadratic:
+        accepted = "squared loss and squared penalty; l_curve serves any other"
+        raise InputError("selector reml", f"formulation '{program.formulation.name}'", accepted)
+    weights = weight_grid(program)
+    likelihood = _restricted_likelihood(program)
+    score = likelihood(weights)
+    valley = np.flatnonzero((score[:-1] <= np.append(np.inf, score[:-2])) & (score[:-1] < score[1:]))
+    best = int(valley[np.argmin(score[valley])]) if len(valley) else len(weights) - 1
+    if best == 0:
+        note = "the likelihood is largest at the lower edge: the data want no penalty"
+        return Selection(float(weights[0]), "reml", weights, score, interior=False, note=note)
+    if best == len(weights) - 1:
+        note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
+        return Selection(1.0, "reml", weights, score, interior=False, note=note)
+    fine = minimize_scalar(
+        lambda t: likelihood(np.exp([t]))[0],
+        bounds=(np.log(weights[best - 1]), np.log(weights[best + 1])),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    note = "largest restricted likelihood"
+    return Selection(float(np.exp(fine.x)), "reml", weights, score, interior=True, note=note)
+
+
+def _restricted_likelihood(program: ConvexProgram) -> Callable[[Array], Array]:
+    """Return the function from weights (K,) to -2 ln(restricted likelihood), up to a constant."""
+    model, tiny = program.model, np.finfo(float).tiny
+    frames, R = model.parameters.of_frames, model.triangle
+    if frames.all():
+        frames = np.zeros_like(frames)
+    U, s, _ = np.linalg.svd(R[:, :-1][:, frames], full_matrices=False)
+    U = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+    R = R - U @ (U.T @ R)
+    m, b = len(model.b) - U.shape[1], R[:, -1]
+    U, s, _ = np.linalg.svd(R[:, :-1][:, ~frames], full_matrices=False)
+    seen = s > RANK_TOLERANCE * s.max(initial=tiny)
+    beta2, s2 = (U[:, seen].T @ b) ** 2, s[seen] ** 2
+    perp = max(float(b @ b - beta2.sum()), 0.0)
+
+    def score(weights: Array) -> Array:
+        g = weights[:, None] / (s2 + weights[:, None])
+        return m * np.log(np.maximum(g @ beta2 + perp, tiny)) - np.sum(np.log(g), axis=1)
+
+    return score
+
+
 def two_step(program: ConvexProgram) -> Selection:
     """Choose by the paper's two steps after a coarse L-curve (section III B and Figs. 7 to 10).
 
@@ -162,4 +229,4 @@ def held_out_error(program: ConvexProgram, weights: Array) -> Array:
     return np.sqrt(total / len(model.b))
 
 
-SELECTORS: dict[str, Selector] = {"l_curve": l_curve, "two_step": two_step}
+SELECTORS: dict[str, Selector] = {"l_curve": l_curve, "reml": reml, "two_step": two_step}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from rpim_opt.exceptions import InputError, choices
@@ -20,8 +20,16 @@ UNITS = {
     "m": Unit("length", 1.0),
     "mm": Unit("length", 1e-3),
     "um": Unit("length", 1e-6),
+    "m2": Unit("length2", 1.0),
+    "mm2": Unit("length2", 1e-6),
+    "um2": Unit("length2", 1e-12),
     "rad": Unit("angle", 1.0),
     "mrad": Unit("angle", 1e-3),
+    "urad": Unit("angle", 1e-6),
+    "rad2": Unit("angle2", 1.0),
+    "mrad2": Unit("angle2", 1e-6),
+    "m_rad": Unit("length angle", 1.0),
+    "mm_mrad": Unit("length angle", 1e-6),
     "deg": Unit("angle", math.pi / 180),
     "Nm": Unit("torque", 1.0),
     "ppm": Unit("ratio", 1e-6),
@@ -66,6 +74,11 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     return name, None
 
 
+def with_unit(stem: str, dimension: str, count: int = 9) -> list[str]:
+    """Return the names that a quantity may have at the border: ``d_m, d_mm, d_um``; itself where it has no unit."""
+    return [f"{stem}_{unit}" for unit in accepted_units(dimension)[:count]] or [stem]
+
+
 def number(value: Any, where: str) -> float:
     """Return a finite number, or say what stands in its place."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -74,8 +87,12 @@ def number(value: Any, where: str) -> float:
 
 
 def quantities(
-    table: Mapping[str, Any], dimensions: Mapping[str, tuple[str, ...]], where: str
-) -> dict[tuple[str, str], float]:
+    table: Mapping[str, Any],
+    dimensions: Mapping[str, tuple[str, ...]],
+    where: str = "",
+    convert: Callable[[Any, str, float], Any] = lambda value, key, si: number(value, key) * si,
+    also: Iterable[str] = (),
+) -> dict[tuple[str, str], Any]:
     """Read a table of quantities whose keys carry units.
 
     Parameters
@@ -86,6 +103,10 @@ def quantities(
         The accepted stems with their dimensions, ``{"x": ("length",), "rx": ("angle",)}``.
     where
         What to call the table in an error.
+    convert
+        From a value, its key and the unit's size to SI; a finite number by default.
+    also
+        Keys to list as accepted beside these.
 
     Returns
     -------
@@ -96,16 +117,20 @@ def quantities(
     InputError
         For an unknown key, a missing or wrong unit, a value that is no finite number.
     """
+
+    def place(key: str) -> str:
+        return f"{where}, key {key}" if where else f"key {key}"
+
     result = {}
     for key, value in table.items():
         stem, unit = split_unit(key)
         if stem not in dimensions:
-            names = [f"{s}_{u}" for s, ds in dimensions.items() for d in ds for u in accepted_units(d)[:3]]
-            raise InputError(where, f"unknown key '{key}'", choices(key, names))
+            names = [name for s, ds in dimensions.items() for d in ds for name in with_unit(s, d, 3)]
+            raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
         if unit is None or unit.dimension not in dimensions[stem]:
-            names = [f"{stem}_{u}" for d in dimensions[stem] for u in accepted_units(d)]
-            raise InputError(f"{where}, key {key}", "no unit that fits", ", ".join(names))
+            names = [name for d in dimensions[stem] for name in with_unit(stem, d)]
+            raise InputError(place(key), "no unit that fits", ", ".join(names))
         if (stem, unit.dimension) in result:
-            raise InputError(f"{where}, key {key}", "the same quantity twice", "one of them")
-        result[stem, unit.dimension] = number(value, f"{where}, key {key}") * unit.si
+            raise InputError(place(key), "the same quantity twice", "one of them")
+        result[stem, unit.dimension] = convert(value, place(key), unit.si)
     return result

@@ -117,10 +117,10 @@ def test_weights_of_the_data_act() -> None:
     """A row trusted a thousand times less hardly moves the answer when it is wrong."""
     problem, _ = simulated(noise=5e-5)
     data = problem.data
-    y, covariance = data.y.copy(), np.tile(data.covariance, (len(data), 1, 1))
+    y, covariance = data.blocks[0].y.copy(), np.tile(data.blocks[0].covariance, (len(data), 1, 1))
     y[4] += 0.01
     covariance[4] *= 1e6
-    blunder = ro.Dataset(data.q, y, covariance, data.label, data.configuration)
+    blunder = ro.Dataset.of(data.q, y, covariance)
     without = ro.calibrate(problem.on(data.without({data.label[4]})), ro.tikhonov, 1.0)
     weighted = ro.calibrate(problem.on(blunder), ro.tikhonov, 1.0)
     assert np.abs((weighted.x - without.x) / problem.parameters.free.scale).max() < 1e-2
@@ -131,7 +131,7 @@ def test_identified_robot_predicts_what_the_calibration_does() -> None:
     result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
     data = instance.problem.data
     position = ro.forward_kinematics(result.robot, data.q)[:, :3, 3]
-    assert np.abs(np.linalg.norm(position - data.y, axis=1) - result.errors()).max() < 1e-12
+    assert np.abs(np.linalg.norm(position - data.blocks[0].y, axis=1) - result.errors()).max() < 1e-12
 
 
 def test_covariance_is_the_spread_of_repeated_calibrations() -> None:
@@ -139,7 +139,7 @@ def test_covariance_is_the_spread_of_repeated_calibrations() -> None:
     for seed in range(200):
         problem, truth = simulated(identify, configurations=15)
         rng = np.random.default_rng(seed)
-        y = problem.data.y + 5e-5 * rng.normal(size=problem.data.y.shape)
+        y = problem.data.blocks[0].y + 5e-5 * rng.normal(size=(len(problem.data), 3))
         repeated = problem.on(ro.Dataset.of(problem.data.q, y, 5e-5))
         result = ro.calibrate(repeated, ro.tikhonov, 1e-9)
         x.append((result.x - truth) / np.sqrt(np.diag(result.covariance)))

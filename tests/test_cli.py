@@ -105,7 +105,7 @@ BAD = {
         TOML,
         'identification = "identification.csv"',
         "",
-        ["problem.toml", "key identification", "required"],
+        ["problem.toml", "key identification", "found nothing"],
     ),
     "no TOML": (TOML, "[noise]", "[noise", ["problem.toml", "TOML"]),
     "unknown pattern": (TOML, '"alpha?"', '"alfa?"', ["problem.toml", "'alfa?'", "alpha1..6", "base_x"]),

@@ -17,31 +17,31 @@ NOISE = {"position_mm": 0.03}
 def read(tmp_path: Path, text: str, noise: dict[str, float] | None = None) -> ro.Dataset:
     path = tmp_path / "data.csv"
     path.write_text(text, encoding="utf-8")
-    return ro.read_csv(path, ARM2, NOISE if noise is None else noise)
+    return ro.read_data(path, ARM2, NOISE if noise is None else noise)
 
 
 def test_units_of_the_header_are_converted(tmp_path: Path) -> None:
     mixed = read(tmp_path, "q1_mrad,q2_mm,x_m,y_mm,z_um\n500,20,1,2,3\n")
     assert mixed.q[0] == pytest.approx([0.5, 0.02])
-    assert mixed.y[0] == pytest.approx([1.0, 2e-3, 3e-6])
+    assert mixed.blocks[0].y[0] == pytest.approx([1.0, 2e-3, 3e-6])
     assert mixed.label == ("1",)
-    assert mixed.covariance[0] == pytest.approx(9e-10 * np.eye(3))
+    assert mixed.blocks[0].covariance[0] == pytest.approx(9e-10 * np.eye(3))
 
 
 def test_a_row_may_state_its_own_standard_deviations(tmp_path: Path) -> None:
     head = "label,q1_deg,q2_mm,x_mm,y_mm,z_mm"
     row = read(tmp_path, f"{head},sigma_mm\na,0,0,0,0,0,0.1\nb,0,0,0,0,0,0.2\n")
-    assert row.covariance == pytest.approx(np.array([1e-8, 4e-8])[:, None, None] * np.eye(3))
+    assert row.blocks[0].covariance == pytest.approx(np.array([1e-8, 4e-8])[:, None, None] * np.eye(3))
     axis = read(tmp_path, f"{head},sigma_z_mm\na,0,0,0,0,0,0.1\n")
-    assert np.sqrt(np.diag(axis.covariance[0])) == pytest.approx([3e-5, 3e-5, 1e-4])
+    assert np.sqrt(np.diag(axis.blocks[0].covariance[0])) == pytest.approx([3e-5, 3e-5, 1e-4])
     declared = read(tmp_path, f"{head}\na,0,0,0,0,0\n", {"x_mm": 1, "y_mm": 2, "z_mm": 3})
-    assert np.sqrt(np.diag(declared.covariance[0])) == pytest.approx([1e-3, 2e-3, 3e-3])
+    assert np.sqrt(np.diag(declared.blocks[0].covariance[0])) == pytest.approx([1e-3, 2e-3, 3e-3])
 
 
 def test_standard_deviations_are_asked_for_and_positive(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="no standard deviation for 'x', accepted: position_mm"):
         read(tmp_path, "q1_deg,q2_mm,x_mm,y_mm,z_mm\n0,0,0,0,0\n", {})
-    with pytest.raises(ro.InputError, match="row b, column sigma: found zero or less"):
+    with pytest.raises(ro.InputError, match="row b, column sigma_mm: found 0, accepted: an uncertainty"):
         read(tmp_path, "label,q1_deg,q2_mm,x_mm,y_mm,z_mm,sigma_mm\na,0,0,0,0,0,1\nb,0,0,0,0,0,0\n")
 
 

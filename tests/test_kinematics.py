@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.parameters import roll_pitch_yaw
+from rpim_opt.kinematics import roll_pitch_yaw
 from tests.simulate import ALL, ARM, simulated
 
 TABLE_2 = np.array(  # the paper's Table 2, positions [mm]; y of point 2 is misprinted (-86.189)

@@ -1,0 +1,156 @@
+"""What the data can tell: singular values, redundant and base parameters, observability indices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import qr
+
+from rpim_opt.problem import CalibrationProblem
+from rpim_opt.robot import Array, Robot
+
+FAINT = 1e-2
+"""Coefficients of a combination below this part of its largest are left out when it is named."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """How well a set of configurations shows the identified parameters.
+
+    Parameters
+    ----------
+    names
+        The n identified parameters.
+    singular_values
+        (n,) of the whitened Jacobian in units of the scales: how many standard deviations of the noise a
+        deviation of one scale along that direction moves the data. Zeros are unseen directions.
+    rank
+        Number of directions that the data see.
+    configurations
+        Number of configurations.
+    unseen
+        Parameters that no measurement depends on.
+    redundant
+        Combinations, name to coefficient in units of the scales, along which the parameters may change
+        without changing any measurement; the largest coefficient is 1.
+    base
+        Base parameters: what the data determine, each as name to coefficient. The first name has
+        coefficient 1 and stands for the sum with the redundant ones (QR with column pivoting).
+    condition
+        Largest over smallest singular value that is not zero.
+    raw_condition
+        |U| |U^-1| of the Jacobian in millimetres and radians, neither whitened nor scaled (paper, Eq. 24);
+        infinite or above 1e15 where it is singular.
+    """
+
+    names: tuple[str, ...]
+    singular_values: Array
+    rank: int
+    configurations: int
+    unseen: tuple[str, ...]
+    redundant: tuple[dict[str, float], ...]
+    base: tuple[dict[str, float], ...]
+    condition: float
+    raw_condition: float
+
+    @property
+    def indices(self) -> dict[str, float]:
+        """Observability indices O1 to O5 on the directions that the data see, larger is better.
+
+        With singular values s_1 >= ... >= s_r and N configurations (Sun and Hollerbach 2008, ICRA)::
+
+            O1 = (s_1 ... s_r)^(1/r) / sqrt(N)    O2 = s_r / s_1    O3 = s_r    O4 = s_r^2 / s_1    O5 = 1 / sum 1/s_i
+        """
+        s = self.singular_values[: self.rank]
+        return {
+            "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(self.configurations)),
+            "O2": float(s[-1] / s[0]),
+            "O3": float(s[-1]),
+            "O4": float(s[-1] ** 2 / s[0]),
+            "O5": float(1 / np.sum(1 / s)),
+        }
+
+
+def observability(problem: CalibrationProblem, x: Array | None = None) -> Observability:
+    """Return how well the data of a problem show its identified parameters.
+
+    Parameters
+    ----------
+    problem
+        Measured values do not matter, configurations, scales and covariance do.
+    x
+        (n,) deviations [SI] to linearize at; nominal by default, where redundancies are exact.
+    """
+    x = np.zeros(len(problem.parameters.free)) if x is None else x
+    model, free = problem.linearize(x), problem.parameters.free
+    _, s, _ = model.svd
+    A, rank, names = model.A, model.rank, free.names
+    length = np.linalg.norm(A, axis=0)
+    blind = length <= 1e-10 * length.max()
+    U = problem.jacobian(x)
+    U = U * np.where(np.array(free.dimensions) == "length", 1.0, 1e3)  # mm per mm, mm per rad
+    raw = np.linalg.svd(U, compute_uv=False)
+    return Observability(
+        names=names,
+        singular_values=s,
+        rank=rank,
+        configurations=len(np.unique(model.group)),
+        unseen=tuple(n for n, b in zip(names, blind, strict=True) if b),
+        redundant=_redundant(A[:, ~blind], rank, [n for n, b in zip(names, blind, strict=True) if not b]),
+        base=_base(A, rank, names),
+        condition=float(s[0] / s[rank - 1]),
+        raw_condition=float(raw[0] / raw[-1]) if len(raw) >= len(names) and raw[-1] > 0 else float("inf"),
+    )
+
+
+def _pivoted(A: Array, rank: int) -> tuple[np.ndarray, Array]:
+    """Return the pivots and W (rank, n - rank): column pivot[rank + j] = sum_i W_ij column pivot[i]."""
+    factors: Any = qr(A, mode="r", pivoting=True)
+    R, pivot = factors
+    W = np.linalg.solve(R[:rank, :rank], R[:rank, rank:]) if A.shape[1] > rank else np.zeros((rank, 0))
+    return pivot, np.where(np.abs(W) > 1e-6, W, 0.0)
+
+
+def _redundant(A: Array, rank: int, names: list[str]) -> tuple[dict[str, float], ...]:
+    """Sparse basis of the null space: one dependent column each, with the columns it depends on."""
+    pivot, W = _pivoted(A, rank)
+    combinations = []
+    for j in range(W.shape[1]):
+        null = {names[pivot[rank + j]]: 1.0} | {names[pivot[i]]: -W[i, j] for i in range(rank) if W[i, j]}
+        largest = max(null.values(), key=abs)
+        combinations.append({n: float(v / largest) for n, v in null.items() if abs(v) > FAINT * abs(largest)})
+    return tuple(combinations)
+
+
+def _base(A: Array, rank: int, names: tuple[str, ...]) -> tuple[dict[str, float], ...]:
+    pivot, W = _pivoted(A, rank)
+    order = np.argsort(pivot[:rank])
+    return tuple(
+        {names[pivot[i]]: 1.0} | {names[pivot[rank + j]]: float(W[i, j]) for j in np.flatnonzero(W[i])} for i in order
+    )
+
+
+def combination(terms: dict[str, float]) -> str:
+    """Return a combination as text, ``d2 + 0.5 d3``."""
+    text = ""
+    for name, value in terms.items():
+        size = "" if abs(abs(value) - 1) < 5e-4 else f"{abs(value):.3g} "
+        sign = ("" if value > 0 else "-") if not text else (" + " if value > 0 else " - ")
+        text += f"{sign}{size}{name}"
+    return text
+
+
+def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
+    """Return Hayati's parameters that a robot needs: ``beta{i}`` where the axes of joints i and i+1 are near parallel.
+
+    Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
+    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
+    from parallel an axis pair still counts.
+    """
+    return tuple(
+        f"beta{i}"
+        for i in range(1, robot.dof)
+        if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
+    )
