@@ -33,7 +33,9 @@ def _commands() -> None:
 def calibrate(
     problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
     variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
-    select: Annotated[str | None, typer.Option(help="How to choose the weight: l_curve, two_step, a number.")] = None,
+    select: Annotated[
+        str | None, typer.Option(help="How to choose the weight: reml, l_curve, two_step, a number.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, write result.json.
@@ -65,6 +67,52 @@ def calibrate(
         raise typer.Exit(1)
 
 
+@app.command()
+def inspect(
+    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
+    variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
+) -> None:
+    """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
+    with _progress() as say:
+        from rpim_opt.inspection import inspect
+        from rpim_opt.instances import load
+
+        say("reading the problem")
+        instance = load(problem, variant)
+        say("inspecting")
+        found = inspect(instance.problem)
+    print(f"{instance.title}\n{instance.source}\n")  # noqa: T201
+    print(found)  # noqa: T201
+
+
+@app.command()
+def simulate(
+    problem: Annotated[str, typer.Argument(help="A problem folder with a [simulation] table.")],
+    seed: Annotated[int | None, typer.Option(help="Instead of the file's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the tables; the problem's own by default.")] = None,
+) -> None:
+    """Make the tables of a simulated problem and the truth they come from."""
+    from rpim_opt.simulation import write_simulation
+
+    try:
+        for path in write_simulation(problem, seed, out):
+            print(f"Written: {path}")  # noqa: T201
+    except OSError as error:
+        raise RpimError(f"{out or problem}: cannot be written: {error}.") from None
+
+
+@app.command()
+def robots() -> None:
+    """List the ready robots that a problem file may name."""
+    from rpim_opt.instances import find_robot
+    from rpim_opt.instances import robots as names
+    from rpim_opt.robot import read_robot
+    from rpim_opt.text import table
+
+    ready = {name: read_robot(find_robot(name)) for name in names()}
+    print(table(["robot", "name", "joints"], [[k, r.name, str(r.dof)] for k, r in ready.items()]))  # noqa: T201
+
+
 def describe(instance: Instance, result: Calibration) -> str:
     """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
     from rpim_opt.text import table
@@ -72,16 +120,20 @@ def describe(instance: Instance, result: Calibration) -> str:
     errors = []
     for name, data in _data(instance).items():
         published = instance.published.get(name, {})
-        for method, each in (("nominal", result.nominal_errors(data)), ("identified", result.errors(data))):
-            stats = _statistics(each)
-            figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
-            errors.append([f"{name}, {method}", str(stats["count"]), *figures])
+        for kind, rows in _kinds(data).items():
+            which = f"{name}, {kind}" if len(_kinds(instance.problem.data)) > 1 else name
+            for method, each in (("nominal", result.nominal_errors(data)), ("identified", result.errors(data))):
+                stats = _statistics(each[rows])
+                figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
+                errors.append([f"{which}, {method}", str(stats["count"]), *figures])
         errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
+    fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     model = result.program.model
     lines = [
         result.parameter_table(),
         "",
-        table(["position error [mm]", "rows", "mean", "RMS", "max"], errors),
+        table(["error [mm]", "rows", "mean", "RMS", "max"], errors),
+        *(["Nominal: the drawing's robot, frames fitted."] if fitted.any() else []),
         "",
         result.weight_sentence(),
         f"{len(model.b)} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
@@ -107,12 +159,28 @@ def result_json(instance: Instance, result: Calibration) -> dict[str, Any]:
         "iterations": len(result.history),
         "flagged": [],
         "parameters": result.parameter_rows(),
+        "rows": {name: _rows(result, part) for name, part in data.items()},
     }
 
 
 def _data(instance: Instance) -> dict[str, Dataset]:
     sets = {"identification": instance.problem.data}
     return {**sets, "validation": instance.validation} if instance.validation else sets
+
+
+def _kinds(data: Dataset) -> dict[str, list[int]]:
+    """Return the rows of every kind of measurement."""
+    kinds: dict[str, list[int]] = {}
+    for block in data.blocks:
+        kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
+    return kinds
+
+
+def _rows(result: Calibration, data: Dataset) -> list[dict[str, Any]]:
+    """Return label, nominal and identified error of every row."""
+    before, after = 1e3 * result.nominal_errors(data), 1e3 * result.errors(data)
+    rows = zip(data.label, before, after, strict=True)
+    return [{"label": label, "nominal_mm": float(b), "identified_mm": float(a)} for label, b, a in rows]
 
 
 def _statistics(errors: Any) -> dict[str, float | int]:

@@ -39,9 +39,14 @@ class NoSolutionFound(RpimError):
         )
 
 
-def choices(found: str, known: Iterable[str]) -> str:
-    """List what is known, what resembles ``found`` first."""
+def choices(found: str, known: Iterable[str], many: int = 24) -> str:
+    """List what is known; of more than ``many`` what resembles ``found``, and how many others there are."""
     names = list(known)
     close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
-    listed = ", ".join(names) if names else "nothing"
-    return f"{listed} (did you mean {' or '.join(close)}?)" if close else listed
+    shown = names
+    if len(names) > many:
+        shown = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
+        shown = [name for name in names if name in shown]
+    listed = ", ".join(shown) if names else "nothing"
+    more = f" and {len(names) - len(shown)} others" if len(shown) < len(names) else ""
+    return f"{listed}{more} (did you mean {' or '.join(close)}?)" if close else listed + more

@@ -119,12 +119,16 @@ def _where(loc: tuple[int | str, ...]) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text so that ``path`` holds either the whole new text or what it held before."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            json.dump(content, stream, indent=2, allow_nan=False)
-            stream.write("\n")
+            stream.write(text)
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
     except BaseException:

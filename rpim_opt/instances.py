@@ -141,67 +141,43 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
     InputError
         Naming the file, the row or key, what was found and what is accepted.
     """
-    folder = find(name)
-    path = folder / "problem.toml"
-    content = read_toml(path)
-    kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
-    fixtures = {p.partition("_")[0] for kind in kinds.values() for p in kind.parameters}
-    _split(content, fixtures, path)
-    if variant is not None:
-        variants = content.get("variant", {})
-        if variant not in variants:
-            raise InputError("variant", f"'{variant}'", choices(variant, variants), path)
-        content = _overlay({k: v for k, v in content.items() if k != "variant"}, variants[variant])
-    table, placed = _split(content, fixtures, path)
-    formulation = lookup(FORMULATIONS, table.formulation, "formulation", path)
-    robot = read_robot(find_robot(table.robot, folder))
-    observations = list(table.observation)
-    if table.identification is not None:
-        first = {f: getattr(table, f) for f in ("measurement", "layout", "identification", "validation")}
-        observations.insert(0, _Observation.model_construct(**first, noise={}))
-    if not observations:
-        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
-    known = {"x", "y", "z", "rx", "ry", "rz"}
-    several = bool(table.tool) and not any(split_unit(key)[0] in known for key in table.tool)
-    tools = {m: _frame(t, f"tool.{m}", path) for m, t in table.tool.items()} if several else {}
-    tools = tools or {"": _frame(table.tool, "tool", path)}
-    tcps = {m: [1e3 * v for v in frame[:3]] for m, frame in tools.items() if table.tool}
+    stated = read_problem(name, variant, measurements)
+    table, path, robot, folder = stated.table, stated.path, stated.robot, stated.path.parent
     sets: dict[str, list[Dataset]] = {role: [] for role in ROLES}
     names: dict[str, list[str]] = {role: [] for role in ROLES}
-    for each in observations:
-        kind = lookup(kinds, each.measurement, "measurement", path)
+    files: dict[str, list[str]] = {role: [] for role in ROLES}
+    tcps = {m: [1e3 * v for v in frame[:3]] for m, frame in stated.tools.items() if table.tool}
+    for each in stated.observations:
+        kind = stated.kinds[each.measurement]
         for role in ROLES:
             file = getattr(each, role)
             if file is None:
                 continue
+            robodk = each.layout == "robodk"
             try:
-                source: Any = folder / file
-                if each.layout == "robodk":
-                    source = robodk_columns(source, robot.joint_dimensions, tcps)
+                source: Any = robodk_columns(folder / file, robot.joint_dimensions, tcps) if robodk else folder / file
                 sets[role].append(read_data(source, robot, each.noise or table.noise, kind))
             except InputError as error:
-                in_table = each.layout == "robodk" and error.where.startswith(("row", "the "))
-                raise error.within(folder / file if in_table else path) from None
+                raise error.within(folder / file if robodk and error.where.startswith("row") else path) from None
             names[role].append(Path(file).stem)
-    if any(each.layout == "robodk" for each in observations):
+            files[role].append(file)
+    tools = dict(stated.tools)
+    if any(each.layout == "robodk" for each in stated.observations):
         tools = {m: tools.get(m, (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0)) for m, tcp in tcps.items()}
     data = {role: Dataset.together(parts, names[role]) for role, parts in sets.items() if parts}
     labels = {label for part in data.values() for label in part.label}
     for label in table.exclude:
         if label not in labels:
             raise InputError("key exclude", f"label '{label}'", "a label of the data", path)
-    files = {role: [getattr(o, role) for o in observations if getattr(o, role)] for role in ROLES}
     for role, part in data.items():
         data[role] = part.without(table.exclude)
         if not len(data[role]):
             raise InputError("the table", "no row that is not excluded", "at least one", folder / files[role][0])
-    base = None if isinstance(table.base, str) else _frame(table.base, "base", path)
     try:
-        own = _own(placed, data["identification"])
-        parameters = starting_parameters(robot, data["identification"], base, tools, own)
-        parameters = parameters.scaled(table.scale, path).toleranced(table.tolerance, path)
-        chosen = _proposed(robot, parameters, data["identification"]) if table.identify == "auto" else table.identify
-        problem = CalibrationProblem(robot, parameters.identify(chosen), data["identification"])
+        own = place_fixtures(stated.placed, data["identification"])
+        parameters = starting_parameters(robot, data["identification"], stated.base, tools, own)
+        parameters = stated.chosen(parameters, data["identification"])
+        problem = CalibrationProblem(robot, parameters, data["identification"])
         if "validation" in data:
             problem.on(data["validation"])
     except InputError as error:
@@ -217,11 +193,69 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         source=table.source,
         problem=problem,
         validation=data.get("validation"),
-        formulation=formulation,
+        formulation=lookup(FORMULATIONS, table.formulation, "formulation", path),
         weight=parse_weight(table.selector, path),
         published={role: table.published.get(files[role][0], {}) for role in ROLES if files[role]},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         simulation=table.simulation,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What a problem file states, checked, before any table is read."""
+
+    path: Path
+    table: _ProblemTable
+    placed: Mapping[str, Any]
+    robot: Robot
+    kinds: Mapping[str, Measurement]
+    observations: tuple[_Observation, ...]
+    tools: Mapping[str, tuple[float, ...]]
+    base: tuple[float, ...] | None
+
+    def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
+        """Return the parameters with the file's scales and tolerances, and those identified that it names."""
+        table = self.table
+        parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
+        patterns = _proposed(self.robot, parameters, data) if table.identify == "auto" else table.identify
+        return parameters.identify(patterns)
+
+
+def read_problem(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Stated:
+    """Return what a problem file states; arguments and errors as for `load`."""
+    path = find(name) / "problem.toml"
+    content = read_toml(path)
+    kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
+    fixtures = {p.partition("_")[0] for kind in kinds.values() for p in kind.parameters}
+    table, placed = _split(content, fixtures, path)
+    if variant is not None:
+        variants = content.get("variant", {})
+        if variant not in variants:
+            raise InputError("variant", f"'{variant}'", choices(variant, variants), path)
+        content = _overlay({k: v for k, v in content.items() if k != "variant"}, variants[variant])
+        table, placed = _split(content, fixtures, path)
+    observations = list(table.observation)
+    if table.identification is not None:
+        first = {f: getattr(table, f) for f in ("measurement", "layout", "identification", "validation")}
+        observations.insert(0, _Observation.model_construct(**first, noise={}))
+    if not observations:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
+    for each in observations:
+        lookup(kinds, each.measurement, "measurement", path)
+    lookup(FORMULATIONS, table.formulation, "formulation", path)
+    parse_weight(table.selector, path)
+    several = bool(table.tool) and not any(split_unit(key)[0] in FRAME for key in table.tool)
+    tools = {m: _frame(t, f"tool.{m}", path) for m, t in table.tool.items()} if several else {}
+    return Stated(
+        path=path,
+        table=table,
+        placed=placed,
+        robot=read_robot(find_robot(table.robot, path.parent)),
+        kinds=kinds,
+        observations=tuple(observations),
+        tools=tools or {"": _frame(table.tool, "tool", path)},
+        base=None if isinstance(table.base, str) else _frame(table.base, "base", path),
     )
 
 
@@ -242,7 +276,7 @@ def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
     return tuple(getattr(place, c) for c in FRAME)
 
 
-def _own(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:
+def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:
     """Return the stated values [SI] of the measurements' own parameters: ``[anchor] x_mm``, ``[anchor.A] x_mm``."""
     own: dict[str, float] = {}
     used: dict[str, dict[str, dict[str, str]]] = {}

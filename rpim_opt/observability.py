@@ -12,7 +12,7 @@ from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
 
 FAINT = 1e-2
-"""Coefficients of a combination below this part of its largest are left out when it is named."""
+"""Coefficients of a combination (in millimetres and milliradians) below this part of its largest are left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,11 @@ class Observability:
     unseen
         Parameters that no measurement depends on.
     redundant
-        Combinations, name to coefficient in units of the scales, along which the parameters may change
-        without changing any measurement; the largest coefficient is 1.
+        Combinations, name to coefficient [mm, mrad], along which the parameters may change without changing any
+        measurement; the largest coefficient is 1.
     base
-        Base parameters: what the data determine, each as name to coefficient. The first name has
-        coefficient 1 and stands for the sum with the redundant ones (QR with column pivoting).
+        Base parameters: what the data determine, each a sum, name to coefficient [mm, mrad]. The first name has
+        coefficient 1; the redundant parameters add to it (QR with column pivoting).
     condition
         Largest over smallest singular value that is not zero.
     raw_condition
@@ -98,8 +98,8 @@ def observability(problem: CalibrationProblem, x: Array | None = None) -> Observ
         rank=rank,
         configurations=len(np.unique(model.group)),
         unseen=tuple(n for n, b in zip(names, blind, strict=True) if b),
-        redundant=_redundant(A[:, ~blind], rank, [n for n, b in zip(names, blind, strict=True) if not b]),
-        base=_base(A, rank, names),
+        redundant=_redundant(A, rank, names, free.scale, blind),
+        base=_base(A, rank, names, free.scale),
         condition=float(s[0] / s[rank - 1]),
         raw_condition=float(raw[0] / raw[-1]) if len(raw) >= len(names) and raw[-1] > 0 else float("inf"),
     )
@@ -113,23 +113,31 @@ def _pivoted(A: Array, rank: int) -> tuple[np.ndarray, Array]:
     return pivot, np.where(np.abs(W) > 1e-6, W, 0.0)
 
 
-def _redundant(A: Array, rank: int, names: list[str]) -> tuple[dict[str, float], ...]:
+def _redundant(
+    A: Array, rank: int, names: tuple[str, ...], scale: Array, blind: np.ndarray
+) -> tuple[dict[str, float], ...]:
     """Sparse basis of the null space: one dependent column each, with the columns it depends on."""
     pivot, W = _pivoted(A, rank)
     combinations = []
     for j in range(W.shape[1]):
-        null = {names[pivot[rank + j]]: 1.0} | {names[pivot[i]]: -W[i, j] for i in range(rank) if W[i, j]}
+        if blind[pivot[rank + j]]:
+            continue
+        null = {pivot[rank + j]: 1.0} | {pivot[i]: -W[i, j] for i in range(rank)}
+        null = {k: v * scale[k] for k, v in null.items() if v}
         largest = max(null.values(), key=abs)
-        combinations.append({n: float(v / largest) for n, v in null.items() if abs(v) > FAINT * abs(largest)})
+        kept = {k: v / largest for k, v in null.items() if abs(v) > FAINT * abs(largest)}
+        combinations.append({names[k]: float(kept[k]) for k in sorted(kept)})
     return tuple(combinations)
 
 
-def _base(A: Array, rank: int, names: tuple[str, ...]) -> tuple[dict[str, float], ...]:
+def _base(A: Array, rank: int, names: tuple[str, ...], scale: Array) -> tuple[dict[str, float], ...]:
     pivot, W = _pivoted(A, rank)
-    order = np.argsort(pivot[:rank])
-    return tuple(
-        {names[pivot[i]]: 1.0} | {names[pivot[rank + j]]: float(W[i, j]) for j in np.flatnonzero(W[i])} for i in order
-    )
+    sums = []
+    for i in np.argsort(pivot[:rank]):
+        own, others = pivot[i], pivot[rank:]
+        kept = {k: W[i, j] * scale[own] / scale[k] for j, k in enumerate(others) if W[i, j]}
+        sums.append({names[own]: 1.0} | {names[k]: float(v) for k, v in kept.items() if abs(v) > FAINT})
+    return tuple(sums)
 
 
 def combination(terms: dict[str, float]) -> str:

@@ -33,12 +33,16 @@ class LinearModel:
         (m,) number of the configuration that an equation belongs to.
     parameters
         The n identified parameters.
+    constrained
+        Whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would meet them, so
+        that how well they are met does not tell the noise.
     """
 
     A: Array
     b: Array
     group: np.ndarray
     parameters: Parameters
+    constrained: bool = False
 
     @cached_property
     def svd(self) -> tuple[Array, Array, Array]:
@@ -64,7 +68,7 @@ class LinearModel:
     def without(self, group: int) -> LinearModel:
         """Return the model that has not seen one configuration: its rows are zero, the shape stays."""
         keep = self.group != group
-        return LinearModel(self.A * keep[:, None], self.b * keep, self.group, self.parameters)
+        return replace(self, A=self.A * keep[:, None], b=self.b * keep)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +159,8 @@ class CalibrationProblem:
             group.append(np.repeat(self.data.configuration[block.row], residual.shape[2]))
         stacked = np.concatenate(A)
         b = np.concatenate(r) + stacked @ (x / scale)
-        return LinearModel(stacked, b, np.concatenate(group), self.parameters.free)
+        constrained = any(not block.measurement.columns for block in self.data.blocks)
+        return LinearModel(stacked, b, np.concatenate(group), self.parameters.free, constrained)
 
     @cached_property
     def _whitening(self) -> list[Array]:

@@ -138,9 +138,10 @@ def reml(program: ConvexProgram) -> Selection:
 
         m ln(sum beta_i^2 g_i + |r_perp|^2) - sum ln g_i
 
-    Constraints are left out of the likelihood. With few data a second maximum may lie at infinite weight, where
-    everything is noise: it counts only if there is no other, and then the weight is 1, declared noise and scales
-    at their word. A choice at the lower edge means that the data want no penalty.
+    Points on a plane or sphere are met by a robot shrunk to nothing, so that their fit tells no noise level: the
+    weight is 1, declared noise and scales at their word. With few data a second maximum may lie at infinite
+    weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
+    at the lower edge means that the data want no penalty. Constraints are left out of the likelihood.
 
     Raises
     ------
@@ -151,6 +152,9 @@ def reml(program: ConvexProgram) -> Selection:
         accepted = "squared loss and squared penalty; l_curve serves any other"
         raise InputError("selector reml", f"formulation '{program.formulation.name}'", accepted)
     weights = weight_grid(program)
+    if program.model.constrained:
+        note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
+        return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
     likelihood = _restricted_likelihood(program)
     score = likelihood(weights)
     valley = np.flatnonzero((score[:-1] <= np.append(np.inf, score[:-2])) & (score[:-1] < score[1:]))

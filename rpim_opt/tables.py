@@ -40,7 +40,7 @@ def read_columns(source: Any) -> Columns:
             raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(kinds), path)
         if not path.is_file():
             near = sorted(p.name for k in kinds for p in path.parent.glob(f"*{k}")) if path.parent.is_dir() else []
-            raise InputError("the file", "nothing", choices(path.name, near), path)
+            raise InputError("the file", "nothing", choices(path.name, near) if near else "a table there", path)
         columns = kinds[path.suffix.lower()](path)
     else:
         names = list(getattr(source, "column_names", getattr(source, "columns", source)))

@@ -30,7 +30,9 @@ ORDER = {
     "selection": set(),
     "text": {"rich"},
     "calibration": set(),
+    "inspection": set(),
     "instances": {"pydantic"},
+    "simulation": {"pydantic"},
     "cli": {"typer", "rich"},
 }
 
