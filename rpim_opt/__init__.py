@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rpim_opt.robot import read_robot as read_robot
     from rpim_opt.selection import Selection as Selection
     from rpim_opt.selection import l_curve as l_curve
+    from rpim_opt.selection import reml as reml
     from rpim_opt.selection import two_step as two_step
 
 __version__ = "0.1.0"
@@ -48,7 +49,7 @@ _HOME = {
     "parameters": ("Parameters", "model_parameters"),
     "problem": ("CalibrationProblem", "LinearModel"),
     "robot": ("Robot", "read_robot"),
-    "selection": ("Selection", "l_curve", "two_step"),
+    "selection": ("Selection", "l_curve", "reml", "two_step"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE_OF)

@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError
 from rpim_opt.formulation import FEASIBLE, ConvexProgram, Formulation, tikhonov
-from rpim_opt.frames import first_guess
+from rpim_opt.frames import relocated
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.selection import Selection, Selector
@@ -193,9 +193,9 @@ def calibrate(
         A number, or a selector, which sees identification data only. It is asked anew until the steps
         become small; then the weight stays.
     start
-        (n,) deviations [SI] to begin with; by default nominal, or where registration finds the frames if the
-        stated base contradicts the data (`frames.first_guess`). The answer does not depend on it, as long as
-        the loop converges: the deviations count from nominal all the same.
+        (n,) deviations [SI] to begin with; nominal by default, and then frames that are stated metres or half a
+        turn from where the data put them count from there (`frames.relocated`). The answer does not depend on
+        a given start, as long as the loop converges: the deviations count from nominal all the same.
     max_iterations, tolerance
         When to stop. A calibration that did not converge says so in ``converged`` and ``message``.
     progress
@@ -208,9 +208,10 @@ def calibrate(
     NoSolutionFound
         When a convex program fails.
     """
+    elsewhere = relocated(problem) if start is None else None
+    problem = elsewhere or problem
     scale = problem.parameters.free.scale
-    guess = first_guess(problem) if start is None else np.asarray(start, dtype=float)
-    begin = np.zeros(len(scale)) if guess is None else guess
+    begin = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float)
     if begin.shape != scale.shape or not np.isfinite(begin).all():
         raise InputError("start", f"shape {begin.shape}", f"{len(scale)} deviations, finite, one a parameter")
     z = begin / scale
@@ -248,6 +249,8 @@ def calibrate(
             converged, message = True, f"Converged after {len(history)} passes."
             break
         settled = settled or length <= SETTLED * room or len(history) >= max_iterations // 2
+    if elsewhere:
+        message += " Frames were stated far from where the data put them; their deviations count from there."
     return Calibration(problem, formulation, scale * z, lam, selection, converged, message, tuple(history), program)
 
 

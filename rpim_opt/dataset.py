@@ -314,7 +314,8 @@ def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, 
             columns[stem, ""] = values
         if stem.startswith(("sigma", "u95")) and not (values > 0).all():
             row = label[int(np.argmin(values > 0))]
-            raise InputError(f"row {row}, column {name}", f"{values.min():g}", "an uncertainty greater than zero")
+            found = f"{values.min() / (unit.si if unit else 1.0):g}"
+            raise InputError(f"row {row}, column {name}", found, "an uncertainty greater than zero")
     groups = [list(torques)]
     if kind.points == 2:
         groups += [[f"to_{s}" for s in group] for group in (joints, torques)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,9 +19,9 @@ from rpim_opt.robot import Array, Robot
 Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
 MISPLACED = 3.0
-"""A base that registration finds further than this many scales from where it is stated starts from there."""
+"""How many scales a frame may be from where it is stated before the statement counts as a mistake."""
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
-"""What a nominal robot and a roughly measured reflector may be wrong by [m], to weigh one against the other."""
+"""What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
 
 
 def register(source: Array, target: Array, weights: Array | None = None) -> Array:
@@ -221,8 +222,11 @@ def starting_parameters(
     """
     tools = tools or {"": (0.0,) * 6}
     place: Place = (0.0,) * 6 if base is None else base
-    for marker in sorted({m for block in data.blocks for m in block.markers} - set(tools)):
-        raise InputError("column marker", f"'{marker}'", "a reflector with a table [tool.NAME]: " + ", ".join(tools))
+    for block in data.blocks:
+        for marker in set(block.markers) - set(tools):
+            where = f"row {data.label[block.row[0]]}, column marker"
+            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
     places: dict[str, Place] = dict(tools)
     if base is None:
         place, located = locate(robot, data, tools)
@@ -243,33 +247,36 @@ def starting_parameters(
     return model_parameters(robot, place, tools, entries)
 
 
-def first_guess(problem: CalibrationProblem) -> Array | None:
-    """Return deviations (n,) [SI] to begin with, where the stated base contradicts the data; else None.
+def relocated(problem: CalibrationProblem) -> CalibrationProblem | None:
+    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that.
 
-    That is so when registration on the nominal robot finds an identified base more than three scales from
-    where it is stated: metres away, or half a turn.
+    Compared is what `locate` finds on the nominal robot with identified frames. A frame that is more than three
+    scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
+    it was found. None when every frame is near enough, or the data do not tell.
     """
     p = problem.parameters
     index = {name: i for i, name in enumerate(p.names)}
-    base = [index[f"base_{c}"] for c in FRAME]
-    if not p.identified[base].all():
-        return None
-    tools = {b.markers[0]: [p.nominal[index[_prefix(b) + c]] for c in FRAME] for b in problem.data.blocks}
-    try:
-        found, places = locate(problem.robot, problem.data, tools)
-    except InputError:
-        return None
-    x = np.zeros(len(p))
-    x[base] = _deviation(found, p.nominal[base])
-    if (np.abs(x[base]) <= MISPLACED * p.scale[base]).all():
+    at = {"base_": [index[f"base_{c}"] for c in FRAME]}
+    if not p.identified[at["base_"]].all():
         return None
     for block in problem.data.blocks:
-        tool = [index[_prefix(block) + c] for c in FRAME]
-        moved = _deviation(places[block.markers[0]], p.nominal[tool])
-        x[tool[:3]] = moved[:3]
-        if p.identified[tool[3:]].all():
-            x[tool[3:]] = moved[3:]
-    return x[p.identified]
+        at[_prefix(block)] = [index[_prefix(block) + c] for c in FRAME]
+    tools = {b.markers[0]: p.nominal[at[_prefix(b)]] for b in problem.data.blocks}
+    try:
+        base, places = locate(problem.robot, problem.data, tools)
+    except InputError:
+        return None
+    found = {"base_": base} | {_prefix(b): places[b.markers[0]] for b in problem.data.blocks}
+    nominal, moved = p.nominal.copy(), False
+    for prefix, place in found.items():
+        k = np.array(at[prefix])
+        free = p.identified[k]
+        if not (free[:3].all() and (free[3:].all() or not free[3:].any())):
+            continue
+        far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
+        if (far & free).any():
+            nominal[k[free]], moved = place[free], True
+    return replace(problem, parameters=replace(p, nominal=nominal)) if moved else None
 
 
 def _prefix(block: Block) -> str:

@@ -86,3 +86,50 @@ def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:
 def test_a_selector_needs_a_penalty() -> None:
     with pytest.raises(ro.InputError, match="without penalty"):
         ro.l_curve(ro.least_squares.compile(model()))
+
+
+def test_reml_is_the_restricted_likelihood_of_the_normal_model() -> None:
+    problem, _ = simulated(noise=5e-5)
+    program = ro.tikhonov.compile(problem.linearize(np.zeros(len(problem.parameters.free))))
+    model, frames = program.model, program.model.parameters.of_frames
+    F, A, b, m = model.A[:, frames], model.A[:, ~frames], model.b, len(model.b)
+
+    def minus_two_log_likelihood(weight: float) -> float:
+        # Harville 1974: ln|V| + ln|F' V^-1 F| + (m - f) ln(b' P b), with V = A A' / weight + 1
+        V = A @ A.T / weight + np.eye(m)
+        inverse = np.linalg.inv(V)
+        G = F.T @ inverse @ F
+        P = inverse - inverse @ F @ np.linalg.solve(G, F.T @ inverse)
+        return np.linalg.slogdet(V)[1] + np.linalg.slogdet(G)[1] + (m - F.shape[1]) * np.log(b @ P @ b)
+
+    chosen = ro.reml(program)
+    assert chosen.interior
+    tried = chosen.weights[[60, 90, 120, 150]]
+    want = np.array([minus_two_log_likelihood(w) for w in tried])
+    got = np.array([chosen.score[list(chosen.weights).index(w)] for w in tried])
+    assert got - got[0] == pytest.approx(want - want[0], rel=1e-6, abs=1e-5)
+    around = [minus_two_log_likelihood(chosen.weight * f) for f in (0.97, 1.0, 1.03)]
+    assert around[1] == min(around)
+
+
+def test_reml_finds_the_ratio_of_noise_and_deviations() -> None:
+    logs = []
+    for seed in range(30):
+        problem, _ = simulated(noise=5e-4, sigma=5e-5, seed=seed)  # ten times the declared noise
+        program = ro.tikhonov.compile(problem.linearize(np.zeros(len(problem.parameters.free))))
+        logs.append(np.log10(ro.reml(program).weight))
+    # deviations are of the size of the scales: the weight is the noise's variance over the declared, 100
+    assert np.mean(logs) == pytest.approx(2.0, abs=0.15)
+
+
+def test_reml_says_what_it_cannot_choose() -> None:
+    import cvxpy as cp
+
+    problem, _ = simulated(noise=5e-5)
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    with pytest.raises(ro.InputError, match="selector reml: found formulation 'robust', accepted: squared loss"):
+        ro.reml(ro.Formulation("robust", loss=cp.norm1, penalty=cp.sum_squares).compile(model))
+    sphere = ro.load("sphere").problem
+    chosen = ro.reml(ro.tikhonov.compile(sphere.linearize(np.zeros(len(sphere.parameters.free)))))
+    assert (chosen.weight, chosen.interior) == (1.0, False)
+    assert "taken at their word" in chosen.note

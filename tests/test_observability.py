@@ -1,0 +1,95 @@
+"""What the data can tell, against singular values and null spaces computed otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.instances import find_robot, robots
+from rpim_opt.observability import combination, near_parallel, observability
+from tests.simulate import simulated
+
+
+def test_indices_are_those_of_the_singular_values() -> None:
+    problem, _ = simulated(("a[234]", "theta[234]", "d5"), configurations=15)
+    o = observability(problem)
+    s = np.linalg.svd(problem.linearize(np.zeros(7)).A, compute_uv=False)
+    assert o.singular_values == pytest.approx(s, rel=1e-9)
+    assert o.rank == 7
+    want = [np.prod(s) ** (1 / 7) / np.sqrt(15), s[-1] / s[0], s[-1], s[-1] ** 2 / s[0], 1 / np.sum(1 / s)]
+    assert list(o.indices.values()) == pytest.approx(want, rel=1e-9)
+    assert o.condition == pytest.approx(s[0] / s[-1])
+    assert o.redundant == o.unseen == ()
+
+
+def test_a_redundant_combination_changes_nothing_and_base_parameters_say_everything() -> None:
+    problem, _ = simulated()
+    o, free = observability(problem), problem.parameters.free
+    assert o.rank + len(o.redundant) + len(o.unseen) == len(free)
+    J = problem.jacobian(np.zeros(len(free)))
+    for terms in o.redundant:
+        x = np.array([terms.get(name, 0.0) for name in free.names])
+        # what is left out is below a hundredth of the largest coefficient
+        assert np.abs(J @ x).max() < 0.02 * max(np.abs(J[:, i] * x[i]).max() for i in range(len(x)))
+    assert len(o.base) == o.rank
+    together = np.array([[terms.get(name, 0.0) for name in free.names] for terms in o.base])
+    columns = [free.names.index(next(iter(terms))) for terms in o.base]
+    assert np.abs(J[:, columns] @ together - J).max() < 0.02 * np.abs(J).max()
+
+
+def test_names_of_the_redundant_parameters() -> None:
+    named = {combination(terms) for terms in observability(ro.load("position").problem).redundant}
+    assert "d6 - tool_z" in named
+    assert {"d2 - d3", "-d2 + d3"} & named
+    assert combination({"a": 1.0, "b": -0.5, "c": 0.25}) == "a - 0.5 b + 0.25 c"
+
+
+def test_what_no_measurement_sees_is_named() -> None:
+    problem, _ = simulated(("a[23]", "tool_r?"))
+    o = observability(problem)
+    assert set(o.unseen) == {"tool_rx", "tool_ry", "tool_rz"}
+
+
+def test_the_papers_condition_number_is_that_of_a_singular_matrix() -> None:
+    o = observability(ro.load("paper_arm").problem)
+    # the paper prints 1.157e21 (Eq. 24): rounding, of a matrix with 20 independent columns of 26
+    assert o.rank == 20
+    assert o.raw_condition > 1e15
+    assert o.condition < 1e4
+
+
+def test_hayatis_parameter_is_proposed_where_axes_are_parallel() -> None:
+    assert near_parallel(ro.read_robot(find_robot("ur5e"))) == ("beta2", "beta3")
+    assert near_parallel(ro.read_robot(find_robot("irb120"))) == ("beta2",)
+    assert near_parallel(ro.read_robot(find_robot("iiwa14"))) == ()
+    scara = ro.load("scara").problem.robot
+    assert near_parallel(scara) == ("beta1",)
+
+
+@pytest.mark.parametrize("name", robots())
+def test_ready_robots_state_source_limits_and_a_reachable_flange(name: str) -> None:
+    robot = ro.read_robot(find_robot(name))
+    assert robot.source
+    assert np.isfinite(robot.limits).all()
+    assert robot.dof in (6, 7)
+    q = np.random.default_rng(1).uniform(*robot.limits.T, (200, robot.dof))
+    reach = np.linalg.norm(ro.forward_kinematics(robot, q)[:, :3, 3], axis=1).max()
+    assert 0.4 < reach < 3.0
+
+
+def test_fanucs_third_joint_counts_from_the_horizontal() -> None:
+    robot = ro.read_robot(find_robot("lrmate200id"))
+    q = np.zeros((2, 6))
+    q[1, 1] = 0.4
+    R = ro.forward_kinematics(robot, q)[:, :3, :3]
+    assert np.abs(R[0] - R[1]).max() < 1e-12  # the second joint alone keeps the forearm's direction
+
+
+def test_kukas_first_joint_turns_clockwise_seen_from_above() -> None:
+    robot = ro.read_robot(find_robot("kr6_r900"))
+    q = np.zeros((2, 6))
+    q[1, 0] = 0.1
+    p = ro.forward_kinematics(robot, q)[:, :3, 3]
+    assert p[0] == pytest.approx([0.98, 0, 0.435], abs=1e-12)
+    assert p[1, 1] < 0
