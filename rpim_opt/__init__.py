@@ -21,10 +21,20 @@ if TYPE_CHECKING:
     from rpim_opt.formulation import least_squares as least_squares
     from rpim_opt.formulation import tikhonov as tikhonov
     from rpim_opt.formulation import within_tolerance as within_tolerance
+    from rpim_opt.frames import hand_eye as hand_eye
+    from rpim_opt.frames import register as register
+    from rpim_opt.frames import starting_parameters as starting_parameters
+    from rpim_opt.frames import tool_from_distances as tool_from_distances
+    from rpim_opt.inspection import Inspection as Inspection
+    from rpim_opt.inspection import inspect as inspect
     from rpim_opt.instances import Instance as Instance
     from rpim_opt.instances import load as load
+    from rpim_opt.instances import robots as robots
     from rpim_opt.kinematics import forward_kinematics as forward_kinematics
+    from rpim_opt.measurement import LaserTracker as LaserTracker
     from rpim_opt.measurement import Measurement as Measurement
+    from rpim_opt.observability import Observability as Observability
+    from rpim_opt.observability import observe as observe
     from rpim_opt.parameters import Parameters as Parameters
     from rpim_opt.parameters import model_parameters as model_parameters
     from rpim_opt.problem import CalibrationProblem as CalibrationProblem
@@ -43,10 +53,13 @@ _HOME = {
     "dataset": ("Dataset", "read_data"),
     "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
     "formulation": ("Formulation", "bounded", "least_squares", "tikhonov", "within_tolerance"),
-    "instances": ("Instance", "load"),
+    "inspection": ("Inspection", "inspect"),
+    "instances": ("Instance", "load", "robots"),
     "kinematics": ("forward_kinematics",),
-    "measurement": ("Measurement",),
+    "measurement": ("LaserTracker", "Measurement"),
+    "observability": ("Observability", "observe"),
     "parameters": ("Parameters", "model_parameters"),
+    "frames": ("hand_eye", "register", "starting_parameters", "tool_from_distances"),
     "problem": ("CalibrationProblem", "LinearModel"),
     "robot": ("Robot", "read_robot"),
     "selection": ("Selection", "l_curve", "reml", "two_step"),

@@ -63,9 +63,12 @@ class Calibration:
     history: tuple[Iteration, ...]
     program: ConvexProgram
 
-    def errors(self, data: Dataset | None = None) -> Array:
-        """Return the position error of every row, (N,) [m]; of the identification data by default."""
-        return (self.problem.on(data) if data else self.problem).errors(self.x)
+    def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
+        """Return the position error of every row, (N,) [m]; of the identification data by default.
+
+        With ``dimension="angle"`` the orientation error [rad], NaN for rows that are no poses.
+        """
+        return (self.problem.on(data) if data else self.problem).errors(self.x, dimension)
 
     def nominal_errors(self, data: Dataset | None = None) -> Array:
         """Return the position error of every row before calibration, (N,) [m].

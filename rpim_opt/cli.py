@@ -115,6 +115,8 @@ def robots() -> None:
 
 def describe(instance: Instance, result: Calibration) -> str:
     """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
+    import numpy as np
+
     from rpim_opt.text import table
 
     errors = []
@@ -128,11 +130,21 @@ def describe(instance: Instance, result: Calibration) -> str:
                 errors.append([f"{which}, {method}", str(stats["count"]), *figures])
         errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
+    angles = [
+        [
+            name,
+            str(int(np.isfinite(each).sum())),
+            *(f"{1e3 * f(each[np.isfinite(each)]):.4f}" for f in (np.mean, _rms, np.max)),
+        ]
+        for name, data in _data(instance).items()
+        if np.isfinite(each := result.errors(data, "angle")).any()
+    ]
     model = result.program.model
     lines = [
         result.parameter_table(),
         "",
         table(["error [mm]", "rows", "mean", "RMS", "max"], errors),
+        *([table(["orientation error [mrad]", "rows", "mean", "RMS", "max"], angles)] if angles else []),
         *(["Nominal: the drawing's robot, frames fitted."] if fitted.any() else []),
         "",
         result.weight_sentence(),
@@ -185,8 +197,11 @@ def _rows(result: Calibration, data: Dataset) -> list[dict[str, Any]]:
 
 def _statistics(errors: Any) -> dict[str, float | int]:
     mm = 1e3 * errors
-    rms = float((mm**2).mean() ** 0.5)
-    return {"mean_mm": float(mm.mean()), "rms_mm": rms, "max_mm": float(mm.max()), "count": len(mm)}
+    return {"mean_mm": float(mm.mean()), "rms_mm": _rms(mm), "max_mm": float(mm.max()), "count": len(mm)}
+
+
+def _rms(values: Any) -> float:
+    return float((values**2).mean() ** 0.5)
 
 
 @contextmanager

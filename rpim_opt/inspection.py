@@ -13,7 +13,7 @@ from rpim_opt.exceptions import InputError
 from rpim_opt.formulation import tikhonov
 from rpim_opt.frames import locate
 from rpim_opt.kinematics import FRAME
-from rpim_opt.observability import Observability, combination, near_parallel, observability
+from rpim_opt.observability import Observability, combination, near_parallel, observe
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array
@@ -147,7 +147,7 @@ def inspect(problem: CalibrationProblem) -> Inspection:
         repeatability=repeatability,
         warnings=(*_ranges(problem), *_copies(data), *_other_readings(problem)),
         proposals=tuple(proposals),
-        observability=observability(problem),
+        observability=observe(problem),
     )
 
 

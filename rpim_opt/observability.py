@@ -73,7 +73,7 @@ class Observability:
         }
 
 
-def observability(problem: CalibrationProblem, x: Array | None = None) -> Observability:
+def observe(problem: CalibrationProblem, x: Array | None = None) -> Observability:
     """Return how well the data of a problem show its identified parameters.
 
     Parameters

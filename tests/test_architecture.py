@@ -8,6 +8,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -82,6 +83,8 @@ def test_public_names_exist_and_are_documented() -> None:
     import rpim_opt as ro
 
     for name in ro.__all__:
-        assert getattr(ro, name).__doc__, name
+        value = getattr(ro, name)
+        assert value.__doc__, name
+        assert not isinstance(value, ModuleType), f"the module {name} hides what it is named after"
     with pytest.raises(AttributeError, match="no attribute 'callibrate'"):
         ro.callibrate  # noqa: B018

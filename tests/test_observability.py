@@ -7,13 +7,13 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.instances import find_robot, robots
-from rpim_opt.observability import combination, near_parallel, observability
+from rpim_opt.observability import combination, near_parallel, observe
 from tests.simulate import simulated
 
 
 def test_indices_are_those_of_the_singular_values() -> None:
     problem, _ = simulated(("a[234]", "theta[234]", "d5"), configurations=15)
-    o = observability(problem)
+    o = observe(problem)
     s = np.linalg.svd(problem.linearize(np.zeros(7)).A, compute_uv=False)
     assert o.singular_values == pytest.approx(s, rel=1e-9)
     assert o.rank == 7
@@ -25,7 +25,7 @@ def test_indices_are_those_of_the_singular_values() -> None:
 
 def test_a_redundant_combination_changes_nothing_and_base_parameters_say_everything() -> None:
     problem, _ = simulated()
-    o, free = observability(problem), problem.parameters.free
+    o, free = observe(problem), problem.parameters.free
     assert o.rank + len(o.redundant) + len(o.unseen) == len(free)
     J = problem.jacobian(np.zeros(len(free)))
     for terms in o.redundant:
@@ -39,7 +39,7 @@ def test_a_redundant_combination_changes_nothing_and_base_parameters_say_everyth
 
 
 def test_names_of_the_redundant_parameters() -> None:
-    named = {combination(terms) for terms in observability(ro.load("position").problem).redundant}
+    named = {combination(terms) for terms in observe(ro.load("position").problem).redundant}
     assert "d6 - tool_z" in named
     assert {"d2 - d3", "-d2 + d3"} & named
     assert combination({"a": 1.0, "b": -0.5, "c": 0.25}) == "a - 0.5 b + 0.25 c"
@@ -47,12 +47,12 @@ def test_names_of_the_redundant_parameters() -> None:
 
 def test_what_no_measurement_sees_is_named() -> None:
     problem, _ = simulated(("a[23]", "tool_r?"))
-    o = observability(problem)
+    o = observe(problem)
     assert set(o.unseen) == {"tool_rx", "tool_ry", "tool_rz"}
 
 
 def test_the_papers_condition_number_is_that_of_a_singular_matrix() -> None:
-    o = observability(ro.load("paper_arm").problem)
+    o = observe(ro.load("paper_arm").problem)
     # the paper prints 1.157e21 (Eq. 24): rounding, of a matrix with 20 independent columns of 26
     assert o.rank == 20
     assert o.raw_condition > 1e15

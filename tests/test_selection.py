@@ -8,6 +8,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.selection import _curvature, _menger, held_out_error, weight_grid
+from tests.simulate import simulated
 from tests.test_formulation import model
 
 
