@@ -85,8 +85,8 @@ class Calibration:
         frames = self.problem.parameters.of_frames & self.problem.parameters.identified
         if not frames.any():
             return self.problem, np.zeros_like(self.x)
-        problem = self.problem.identifying(frames)
-        return problem, calibrate(problem, tikhonov, 1.0).x
+        fitted = calibrate(self.problem.identifying(frames), tikhonov, 1.0)
+        return fitted.problem, fitted.x
 
     @property
     def robot(self) -> Robot:
