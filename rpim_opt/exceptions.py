@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 
 class RpimError(Exception):
@@ -28,15 +28,39 @@ class InputError(RpimError):
         return self if self.file else InputError(self.where, self.found, self.accepted, file)
 
 
-class NoSolutionFound(RpimError):
-    """A convex program was not solved; ``program``, ``weight`` and ``status`` are the evidence."""
+class Conflict(NamedTuple):
+    """What contradicts what: by how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
 
-    def __init__(self, program: Any, weight: float, status: str):
-        self.program, self.weight, self.status = program, weight, status
-        super().__init__(
-            f"Formulation '{program.formulation.name}' at weight {weight:.3g}: the solver ended with "
-            f"'{status}'; check that constraints and data can hold together, or change the weight."
-        )
+    Each of the two alone makes the program feasible, with the least sum; empty where it cannot.
+    """
+
+    parameters: dict[str, float]
+    configurations: dict[Any, float]
+
+
+class NoSolutionFound(RpimError):
+    """A convex program was not solved; ``program``, ``weight``, ``status`` and ``conflict`` are the evidence."""
+
+    def __init__(self, program: Any, weight: float, status: str, conflict: Conflict | None = None):
+        self.program, self.weight, self.status, self.conflict = program, weight, status, conflict
+        text = f"Formulation '{program.formulation.name}' at weight {weight:.3g}: the solver ended with '{status}'; "
+        given = conflict or Conflict({}, {})
+        bounds = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in given.parameters.items())
+        rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in given.configurations.items())
+        if bounds and rows:
+            text += f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}."
+        elif bounds or rows:
+            text += f"loosening {bounds or rows} would do."
+        else:
+            text += "check that constraints and data can hold together, or change the weight."
+        super().__init__(text)
+
+    def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
+        """Return the same error with names for the configurations' numbers."""
+        if not self.conflict:
+            return self
+        rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
+        return NoSolutionFound(self.program, self.weight, self.status, self.conflict._replace(configurations=rows))
 
 
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:

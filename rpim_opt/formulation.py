@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from scipy.sparse import csr_array
 
-from rpim_opt.exceptions import InputError, NoSolutionFound
+from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound, choices
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
 from rpim_opt.robot import Array
 
 Term = Callable[[Any], Any]
+Constraint = Callable[[Any, Parameters], Any]
 ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 """Losses that see only the length of the residual: [A b] may be replaced by its triangular factor."""
 
 TIGHT = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
 FEASIBLE = 1e-9
 """By how much a solution may miss its constraints, relative to its largest entry."""
+STATIONARY = 1e-7
+"""Largest gradient of a box-constrained solution off its bounds, relative to that of the data at nominal."""
 
 
 def squared_norm(value: Any) -> float:
@@ -46,13 +53,28 @@ class Formulation:
     penalty
         Convex function of z (n,), or None.
     constraints
-        Functions of z and of the identified `Parameters`, each returning a CVXPY constraint.
+        Functions of z and of the identified `Parameters`, each returning a CVXPY constraint or several.
+    loss_over
+        ``"equation"``, or ``"configuration"``: the loss then gets the whitened norm of each configuration (N,), and
+        has to be nondecreasing.
+    penalty_over
+        A function of the identified `Parameters` that returns matrices D_k: the penalty then gets the norms
+        |D_k z| (K,), and has to be nondecreasing. `by_link`, `by_kind`, `differences`.
+    largest
+        Largest whitened norm that a configuration may keep; infinite by default.
     """
 
     name: str
     loss: Term = cp.sum_squares
     penalty: Term | None = None
-    constraints: tuple[Callable[[Any, Parameters], cp.Constraint], ...] = ()
+    constraints: tuple[Constraint, ...] = ()
+    loss_over: str = "equation"
+    penalty_over: Callable[[Parameters], Sequence[Array]] | None = None
+    largest: float = float("inf")
+
+    def __post_init__(self) -> None:
+        if self.loss_over not in ("equation", "configuration"):
+            raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
 
     def compile(self, model: LinearModel) -> ConvexProgram:
         """Pose the program in CVXPY; `ConvexProgram.on` reuses it for other data of the same shape."""
@@ -61,12 +83,17 @@ class Formulation:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """One solution: z (n,) at a weight, with the two values that the L-curve plots."""
+    """One solution: z (n,) at a weight, with the two values that the L-curve plots.
+
+    ``duals`` are the multipliers of the formulation's constraints, one array each: by how much the objective would
+    fall if the constraint were loosened by one unit of the scales.
+    """
 
     z: Array
     weight: float
     loss: float
     penalty: float
+    duals: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +103,11 @@ class ConvexProgram:
     formulation: Formulation
     model: LinearModel
     _posed: _Posed
+    _trust: dict[str, _Posed] = field(default_factory=dict)
 
     def on(self, model: LinearModel) -> ConvexProgram:
         """Return the program for another model of the same shape, without posing it anew."""
-        return ConvexProgram(self.formulation, model, self._posed)
+        return ConvexProgram(self.formulation, model, self._posed, self._trust)
 
     @property
     def quadratic(self) -> bool:
@@ -89,34 +117,66 @@ class ConvexProgram:
     @property
     def closed_form(self) -> bool:
         """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares)."""
-        return self._posed.quadratic and not self.formulation.constraints
+        return self._posed.quadratic and not self._posed.constrained
 
     def value(self, z: Array) -> tuple[float, float]:
         """Return loss(A z - b) and penalty(z)."""
         loss, penalty = self.formulation.loss, self.formulation.penalty
         r = self.model.A @ z - self.model.b
+        if self.formulation.loss_over == "configuration":
+            r = self.norms(z)
         fit = squared_norm(r) if loss is cp.sum_squares else float(loss(cp.Constant(r)).value)
         if penalty is None:
             return fit, 0.0
-        return fit, squared_norm(z) if penalty is cp.sum_squares else float(penalty(cp.Constant(z)).value)
+        over = self._posed.penalized(z)
+        return fit, squared_norm(over) if penalty is cp.sum_squares else float(penalty(cp.Constant(over)).value)
+
+    def norms(self, z: Array) -> Array:
+        """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
+        squares = (self.model.A @ z - self.model.b) ** 2
+        return np.sqrt(np.bincount(np.unique(self.model.group, return_inverse=True)[1], squares))
 
     def violation(self, z: Array) -> float:
         """Return by how much z misses the constraints, in units of the scales."""
-        return self._posed.violation(z)
+        excess = float(np.max(self.norms(z))) - self.formulation.largest if self._posed.limited else 0.0
+        return max(self._posed.violation(z), excess, 0.0)
 
-    def solve(self, weight: float = 0.0) -> Estimate:
+    def solve(self, weight: float = 0.0, centre: Array | None = None, radius: float = np.inf) -> Estimate:
         """Return the solution at a weight, from Clarabel.
 
         Weight zero is the limit of small weights: directions that the data do not see stay nominal.
 
+        Parameters
+        ----------
+        weight
+            Of the penalty, zero or more.
+        centre, radius
+            A trust region: the solution is sought in |z - centre| <= radius, each component.
+
         Raises
         ------
         NoSolutionFound
-            When the solver does not end with "optimal", or its point misses the constraints.
+            When the solver does not end with "optimal", or its point misses the constraints; ``conflict`` names
+            what contradicts what when the program is infeasible.
         """
         weight = self._weight(weight)
-        z = self._posed.solve(self, weight)
-        return Estimate(z, weight, *self.value(z))
+        posed, box = self._posed, self._posed.box
+        if centre is not None and np.isfinite(radius):
+            posed = self._trust.setdefault("posed", _Posed(self.formulation, self.model, trusted=True))
+            posed.centred(centre, radius)
+            if box is not None:
+                box = np.maximum(box[0], centre - radius), np.minimum(box[1], centre + radius)
+        polish = posed.quadratic and posed.constrained and box is not None and bool((box[0] <= box[1]).all())
+        try:
+            z, duals = posed.solve(self, weight)
+        except NoSolutionFound:
+            if not polish:
+                raise
+            z, duals = self._formula(weight), ()  # an interior point may fail where an active set does not
+        if polish and box is not None:
+            z, held = self._polished(np.clip(z, *box), weight, *box)
+            duals = (held,)
+        return Estimate(z, weight, *self.value(z), duals)
 
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
         """Return the solutions at many weights.
@@ -133,6 +193,35 @@ class ConvexProgram:
                 estimates.append(self.solve(weight))
         return estimates
 
+    def reweighted(self, z: Array) -> LinearModel:
+        """Return the linear model whose squared loss touches the loss at z: rows scaled by sqrt(loss'(v) / 2 v).
+
+        That is the model of the estimator that iteratively reweighted least squares ends with, where degrees of
+        freedom, likelihoods and covariances are those of a linear estimator.
+
+        Raises
+        ------
+        InputError
+            For a loss without such a model: one whose slope is not defined, or that rests on few equations (minimax).
+        """
+        if self.formulation.loss is cp.sum_squares:
+            return self.model
+        over = self.formulation.loss_over == "configuration"
+        v = self.norms(z) if over else self.model.A @ z - self.model.b
+        probe = cp.Variable(len(v))
+        probe.value = np.where(np.abs(v) > 1e-9, v, 1e-9)
+        slope = self.formulation.loss(probe).grad[probe]
+        if slope is None:
+            raise InputError(f"formulation '{self.formulation.name}'", "a loss without slope", "another selector")
+        weight = np.abs(np.asarray(slope.todense()).ravel()) / (2 * np.maximum(np.abs(v), 1e-6))
+        if np.count_nonzero(weight) <= max(1, 0.1 * len(weight)):
+            found = "a loss that rests on a few equations"
+            raise InputError(
+                f"formulation '{self.formulation.name}'", found, "another selector: l_curve, k_fold, or a number"
+            )
+        rows = weight[np.unique(self.model.group, return_inverse=True)[1]] if over else weight
+        return self.model.scaled(np.sqrt(rows))
+
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
         if not (np.isfinite(weight) and weight >= 0):
@@ -144,6 +233,42 @@ class ConvexProgram:
         gain = np.divide(s, s**2 + weight, out=np.zeros_like(s), where=s > 0)
         return Vt.T @ (gain * beta)
 
+    def _polished(self, z: Array, weight: float, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Return the exact minimum in a box, from a point near it, and by how much each bound holds it back.
+
+        A monotone active-set method (Stark and Parker 1995, Computational Statistics 10:129) on the triangular
+        factor; ends where the gradient has the right sign at every bound and vanishes off them.
+        """
+        R, n = self.model.triangle, len(z)
+        A = np.vstack([R[:, :n], np.sqrt(weight) * np.eye(n)])
+        b = np.concatenate([R[:, n], np.zeros(n)])
+        size = np.linalg.norm(A, axis=0) * max(float(np.linalg.norm(b)), 1e-300)
+        free = (z > lower) & (z < upper)
+        for _ in range(10 * n + 10):
+            r = b - A @ z
+            step = np.zeros(n)
+            step[free] = np.linalg.lstsq(A[:, free], r, rcond=1e-15)[0] if free.any() else 0.0
+            to_bound = np.where(step > 0, upper - z, np.where(step < 0, lower - z, np.inf))
+            share = np.divide(to_bound, step, out=np.full(n, np.inf), where=step != 0)
+            k = int(np.argmin(share))
+            z = np.clip(z + min(1.0, float(share[k])) * step, lower, upper)
+            if share[k] < 1:
+                z[k] = upper[k] if step[k] > 0 else lower[k]
+                free[k] = False
+                continue
+            slope = A.T @ (b - A @ z)  # minus half the gradient
+            held = ~free & (lower < upper)
+            inward = np.where(z <= lower, slope, -slope)
+            wrong = np.where(held, inward / size, -np.inf)
+            k = int(np.argmax(wrong))
+            if wrong[k] <= 1e-14:
+                off = float(np.max(np.abs(slope[free]) / size[free], initial=0.0))
+                if off > STATIONARY:
+                    raise NoSolutionFound(self, weight, f"active set: gradient {off:.1e} off the bounds")
+                return z, 2 * np.where(held, -inward, 0.0)
+            free[k] = True
+        raise NoSolutionFound(self, weight, "active set: no end")
+
 
 class _Posed:
     """The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
@@ -154,18 +279,27 @@ class _Posed:
     solver calls answers "optimal" that have no correct digit.
     """
 
-    def __init__(self, formulation: Formulation, model: LinearModel):
+    def __init__(self, formulation: Formulation, model: LinearModel, trusted: bool = False):
         m, n = model.A.shape
-        self.n = n
-        self.probe = cp.Variable(n)
-        self.checks = [c(self.probe, model.parameters) for c in formulation.constraints]
-        self.quadratic = formulation.loss is cp.sum_squares and formulation.penalty in (None, cp.sum_squares)
-        self.reduced = formulation.loss in ROTATION_INVARIANT
+        self.n, self.formulation, self.parameters = n, formulation, model.parameters
+        self.limited = np.isfinite(formulation.largest)
+        self.constrained = bool(formulation.constraints) or self.limited or trusted
+        whole = formulation.loss_over == "equation"
+        plain = formulation.penalty_over is None
+        self.quadratic = (
+            formulation.loss is cp.sum_squares
+            and (formulation.penalty is None or (formulation.penalty is cp.sum_squares and plain))
+            and not self.limited
+        )
+        self.reduced = formulation.loss in ROTATION_INVARIANT and whole and not self.limited
+        over = formulation.penalty_over
+        self.differences = [np.asarray(D, dtype=float) for D in over(model.parameters)] if over else None
         rows = n + 1 if self.reduced else m
         if self.quadratic:
             u = cp.Variable(n)
             self.basis, self.centre = cp.Parameter((n, n)), cp.Parameter(n)
             self.z, objective = self.basis @ u + self.centre, cp.sum_squares(u)
+            self.constraints = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
         else:
             self.z = cp.Variable(n)
             self.A, self.b, self.weight = (
@@ -173,19 +307,51 @@ class _Posed:
                 cp.Parameter(rows),
                 cp.Parameter(nonneg=True),
             )
-            objective = formulation.loss(self.A @ self.z - self.b)
+            r = self.A @ self.z - self.b
+            norms = None if whole and not self.limited else _norms(r, model.group)
+            objective = formulation.loss(r if whole else norms)
             if formulation.penalty is not None:
-                objective = objective + self.weight * formulation.penalty(self.z)
-        constraints = [c(self.z, model.parameters) for c in formulation.constraints]
-        self.problem = cp.Problem(cp.Minimize(objective), constraints)
+                over = self.z if plain else cp.hstack([cp.norm(D @ self.z) for D in self.differences or ()])
+                objective = objective + self.weight * formulation.penalty(over)
+            self.constraints = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
+            if norms is not None and self.limited:
+                self.constraints.append([norms <= formulation.largest])
+        every = [constraint for group in self.constraints for constraint in group]
+        if trusted:
+            self.middle, self.radius = cp.Parameter(n), cp.Parameter(nonneg=True)
+            every.append(cp.abs(self.z - self.middle) <= self.radius)
+        self.problem = cp.Problem(cp.Minimize(objective), every)
         if not self.problem.is_dcp():
             raise InputError(f"formulation '{formulation.name}'", "a program that is not convex", "CVXPY's DCP rules")
 
-    def violation(self, z: Array) -> float:
-        self.probe.value = z
-        return max((float(np.max(c.violation())) for c in self.checks), default=0.0)
+    @cached_property
+    def _checks(self) -> tuple[cp.Variable, list[Any]]:
+        probe = cp.Variable(self.n)
+        return probe, [k for c in self.formulation.constraints for k in _listed(c(probe, self.parameters))]
 
-    def solve(self, program: ConvexProgram, weight: float) -> Array:
+    @cached_property
+    def box(self) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (n,) where every constraint is a `Box`."""
+        if not all(isinstance(c, Box) for c in self.formulation.constraints):
+            return None
+        limits = [c.limits(self.parameters) for c in self.formulation.constraints if isinstance(c, Box)]
+        lower = np.max([low for low, _ in limits] + [np.full(self.n, -np.inf)], axis=0)
+        upper = np.min([high for _, high in limits] + [np.full(self.n, np.inf)], axis=0)
+        return lower, upper
+
+    def penalized(self, z: Array) -> np.ndarray:
+        """Return what the penalty gets: z, or the norms of its groups."""
+        return z if self.differences is None else np.array([float(np.linalg.norm(D @ z)) for D in self.differences])
+
+    def violation(self, z: Array) -> float:
+        probe, checks = self._checks
+        probe.value = z
+        return max((float(np.max(c.violation())) for c in checks), default=0.0)
+
+    def centred(self, centre: Array, radius: float) -> None:
+        self.middle.value, self.radius.value = centre, radius
+
+    def solve(self, program: ConvexProgram, weight: float) -> tuple[Array, tuple[Array, ...]]:
         self._set(program.model, weight)
         status = ""
         for settings in (TIGHT, {}):
@@ -196,18 +362,22 @@ class _Posed:
                 status = self.problem.status
             except cp.SolverError as error:
                 status = str(error)
+            if status == cp.INFEASIBLE:
+                break
             if status == cp.OPTIMAL and self.z.value is not None:
                 z = np.array(self.z.value)
-                if self.violation(z) > FEASIBLE * max(1.0, float(np.max(np.abs(z)))):
+                if program.violation(z) > max(FEASIBLE, 1e-8 * self.limited) * max(1.0, float(np.max(np.abs(z)))):
                     status = "optimal, but outside the constraints"
                     continue
-                return z
-        raise NoSolutionFound(program, weight, status)
+                duals = [np.concatenate([np.ravel(c.dual_value) for c in group]) for group in self.constraints if group]
+                return z, tuple(duals)
+        conflict = _conflict(program) if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE) else None
+        raise NoSolutionFound(program, weight, status, conflict)
 
     def _set(self, model: LinearModel, weight: float) -> None:
         if self.quadratic:
             beta, s, Vt = model.svd
-            if self.checks and not s.all():
+            if self.constrained and not s.all():
                 # a nominal value for unseen directions may not meet the constraints: let them move, at a price
                 weight = max(weight, 1e-16 * s[0] ** 2)
             D = np.sqrt(s**2 + weight)
@@ -219,17 +389,217 @@ class _Posed:
             self.A.value, self.b.value, self.weight.value = R[:, : self.n], R[:, self.n], weight
 
 
-def within_tolerance(z: Any, parameters: Parameters) -> cp.Constraint:
-    """Constrain |x_i| <= tolerance_i, in the dimensionless z = x / scale."""
+def _listed(constraints: Any) -> list[Any]:
+    return list(constraints) if isinstance(constraints, list | tuple) else [constraints]
+
+
+def _norms(r: Any, group: np.ndarray) -> Any:
+    """Norms of a residual (m,) by group, in the order of the groups' numbers; shorter groups are filled with zeros."""
+    _, which, count = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(which, kind="stable")
+    place = np.empty(len(group), dtype=int)
+    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
+    shape = (len(count), int(count.max()))
+    pick = csr_array(
+        (np.ones(len(group)), (which * shape[1] + place, np.arange(len(group)))), (shape[0] * shape[1], len(group))
+    )
+    return cp.norm(cp.reshape(pick @ r, shape, order="C"), 2, axis=1)
+
+
+def _conflict(program: ConvexProgram) -> Conflict:
+    """Find the least loosening of the box, and apart from it of the configurations' bound, that would be enough."""
+    formulation, parameters = program.formulation, program.model.parameters
+    n, groups = program.model.A.shape[1], np.unique(program.model.group)
+    boxes = [c.limits(parameters) for c in formulation.constraints if isinstance(c, Box)]
+    others = [c for c in formulation.constraints if not isinstance(c, Box)]
+
+    def least(loosen_box: bool) -> Array:
+        z, slack = cp.Variable(n), cp.Variable(n if loosen_box else len(groups), nonneg=True)
+        room, extra = (slack, 0.0) if loosen_box else (0.0, slack)
+        hard = [k for c in others for k in _listed(c(z, parameters))]
+        for lower, upper in boxes:
+            low, high = np.where(np.isfinite(lower), lower, -1e6), np.where(np.isfinite(upper), upper, 1e6)
+            hard += [z <= high + room, z >= low - room]
+        if np.isfinite(formulation.largest):
+            hard.append(
+                _norms(program.model.A @ z - program.model.b, program.model.group) <= formulation.largest + extra
+            )
+        cp.Problem(cp.Minimize(cp.sum(slack)), hard).solve(solver=cp.CLARABEL)
+        return np.zeros(slack.size) if slack.value is None else np.asarray(slack.value)
+
+    box, rows = least(True) * parameters.scale, least(False)
+    return Conflict(
+        {parameters.names[i]: float(box[i]) for i in np.flatnonzero(box > 1e-6 * parameters.scale)},
+        {int(groups[i]): float(rows[i]) for i in np.flatnonzero(rows > 1e-6)},
+    )
+
+
+# --- constraints -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Box:
+    """A constraint lower <= z <= upper, whose solutions are polished to rounding by an active set.
+
+    Parameters
+    ----------
+    name
+        What reports call it.
+    limits
+        From the identified `Parameters` to lower and upper bounds (n,) of z, infinite where there is none.
+    """
+
+    name: str
+    limits: Callable[[Parameters], tuple[Array, Array]]
+
+    def __call__(self, z: Any, parameters: Parameters) -> list[Any]:
+        """Return the CVXPY constraints."""
+        lower, upper = self.limits(parameters)
+        fixed = np.flatnonzero(lower == upper)
+        low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
+        high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
+        parts = [
+            (fixed, lambda k: z[k] == lower[k]),
+            (low, lambda k: z[k] >= lower[k]),
+            (high, lambda k: z[k] <= upper[k]),
+        ]
+        return [make(k) for k, make in parts if len(k)]
+
+
+def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
     bound = parameters.tolerance / parameters.scale
-    limited = np.flatnonzero(np.isfinite(bound))
-    if not len(limited):
+    if not np.isfinite(bound).any():
         raise InputError("table tolerance", "no tolerance for any identified parameter", "length_mm, angle_mrad, ...")
-    return cp.abs(z[limited]) <= bound[limited]
+    return -bound, bound
+
+
+within_tolerance = Box("within tolerance", _tolerances)
+"""|x_i| <= tolerance_i, where a tolerance is stated."""
+
+
+def at_nominal(*patterns: str) -> Box:
+    """Keep the parameters that match a pattern at their nominal values: z_i = 0."""
+
+    def limits(parameters: Parameters) -> tuple[Array, Array]:
+        chosen = _matching(parameters, patterns, "at_nominal")
+        return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
+
+    return Box("at nominal", limits)
+
+
+def signed(sign: int, *patterns: str) -> Box:
+    """Keep the deviations that match a pattern on one side: sign z_i >= 0."""
+
+    def limits(parameters: Parameters) -> tuple[Array, Array]:
+        chosen = _matching(parameters, patterns, "signed")
+        return np.where(chosen & (sign > 0), 0.0, -np.inf), np.where(chosen & (sign < 0), 0.0, np.inf)
+
+    return Box("signed", limits)
+
+
+def equal(*names: str) -> Constraint:
+    """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel."""
+
+    def constraint(z: Any, parameters: Parameters) -> Any:
+        k = [parameters.names.index(n) for n in names if n in parameters.names]
+        if len(k) < len(names) or len(k) < 2:
+            missing = next((n for n in names if n not in parameters.names), names[0] if names else "")
+            raise InputError(
+                "equal", f"'{missing}'", "identified parameters, two or more: " + choices(missing, parameters.names)
+            )
+        scale, nominal = parameters.scale[k], parameters.nominal[k]
+        unit = scale.max()
+        value = cp.multiply(scale / unit, z[k]) + nominal / unit
+        return value[1:] == value[0]
+
+    return constraint
+
+
+def in_ball(radius: float, *patterns: str) -> Constraint:
+    """Keep the deviations that match a pattern in a ball: |z| <= radius, in units of the scales."""
+
+    def constraint(z: Any, parameters: Parameters) -> Any:
+        return cp.norm(z[np.flatnonzero(_matching(parameters, patterns, "in_ball"))]) <= radius
+
+    return constraint
+
+
+def _matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.ndarray:
+    chosen = np.zeros(len(parameters), dtype=bool)
+    for pattern in patterns:
+        hits = np.array([fnmatchcase(name, pattern) for name in parameters.names])
+        if not hits.any():
+            raise InputError(
+                what, f"pattern '{pattern}'", "identified parameters: " + choices(pattern, parameters.names)
+            )
+        chosen |= hits
+    return chosen
+
+
+# --- groups of the penalty ---------------------------------------------------------------------------------
+
+
+def _grouped(parameters: Parameters, key: Callable[[str], str]) -> list[Array]:
+    keys = [key(name) for name in parameters.names]
+    return [np.eye(len(keys))[[i for i, k in enumerate(keys) if k == one]] for one in dict.fromkeys(keys)]
+
+
+def by_link(parameters: Parameters) -> list[Array]:
+    """Group the parameters by link (``alpha3, a3, theta3, d3``) and by frame (``base``, ``tool``)."""
+    return _grouped(
+        parameters, lambda name: re.sub(r"^[a-z_]+?(\d+)$", r"\1", name) if name[-1].isdigit() else name.split("_")[0]
+    )
+
+
+def by_kind(parameters: Parameters) -> list[Array]:
+    """Group the parameters by kind (all ``alpha``, all ``a``, ...)."""
+    return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
+
+
+def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
+    """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
+
+    For parameters of consecutive joints that share a cause: ``differences("ratio?")`` for one wrong scale of all encoders.
+    """
+
+    def rows(parameters: Parameters) -> list[Array]:
+        chosen, eye = _matching(parameters, patterns, "differences"), np.eye(len(parameters))
+        k = np.flatnonzero(chosen)
+        return [eye[[i]] - eye[[j]] for i, j in zip(k[1:], k[:-1], strict=True)] + [
+            eye[[i]] for i in np.flatnonzero(~chosen)
+        ]
+
+    return rows
+
+
+# --- ready formulations ------------------------------------------------------------------------------------
+
+HUBER = 2.0
+"""Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
+
+
+def huber(threshold: float = HUBER) -> Term:
+    """Return Huber's loss: v^2 up to the threshold, 2 threshold v - threshold^2 beyond, summed."""
+    bound: Any = threshold  # CVXPY's annotation says int
+    return lambda v: cp.sum(cp.huber(v, bound))
 
 
 least_squares = Formulation("least squares")
 tikhonov = Formulation("Tikhonov", penalty=cp.sum_squares)
 bounded = Formulation("bounded Tikhonov", penalty=cp.sum_squares, constraints=(within_tolerance,))
+robust = Formulation("Huber", loss=huber(), penalty=cp.sum_squares, loss_over="configuration")
+sum_of_norms = Formulation("sum of norms", loss=cp.sum, penalty=cp.sum_squares, loss_over="configuration")
+minimax = Formulation("minimax", loss=cp.max, penalty=cp.sum_squares, loss_over="configuration")
+lasso = Formulation("lasso", penalty=cp.norm1)
+group_lasso = Formulation("group lasso by link", penalty=cp.sum, penalty_over=by_link)
 
-FORMULATIONS = {"least_squares": least_squares, "tikhonov": tikhonov, "bounded": bounded}
+FORMULATIONS = {
+    "least_squares": least_squares,
+    "tikhonov": tikhonov,
+    "bounded": bounded,
+    "robust": robust,
+    "sum_of_norms": sum_of_norms,
+    "minimax": minimax,
+    "lasso": lasso,
+    "group_lasso": group_lasso,
+}

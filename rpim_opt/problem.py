@@ -67,8 +67,11 @@ class LinearModel:
 
     def without(self, group: int) -> LinearModel:
         """Return the model that has not seen one configuration: its rows are zero, the shape stays."""
-        keep = self.group != group
-        return replace(self, A=self.A * keep[:, None], b=self.b * keep)
+        return self.scaled(self.group != group)
+
+    def scaled(self, rows: Array) -> LinearModel:
+        """Return the model with its equations multiplied by numbers (m,)."""
+        return replace(self, A=self.A * rows[:, None], b=self.b * rows)
 
 
 @dataclass(frozen=True, eq=False)
