@@ -16,9 +16,23 @@ if TYPE_CHECKING:
     from rpim_opt.exceptions import InputError as InputError
     from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
     from rpim_opt.exceptions import RpimError as RpimError
+    from rpim_opt.formulation import Box as Box
     from rpim_opt.formulation import Formulation as Formulation
+    from rpim_opt.formulation import at_nominal as at_nominal
     from rpim_opt.formulation import bounded as bounded
+    from rpim_opt.formulation import by_kind as by_kind
+    from rpim_opt.formulation import by_link as by_link
+    from rpim_opt.formulation import differences as differences
+    from rpim_opt.formulation import equal as equal
+    from rpim_opt.formulation import group_lasso as group_lasso
+    from rpim_opt.formulation import huber as huber
+    from rpim_opt.formulation import in_ball as in_ball
+    from rpim_opt.formulation import lasso as lasso
     from rpim_opt.formulation import least_squares as least_squares
+    from rpim_opt.formulation import minimax as minimax
+    from rpim_opt.formulation import robust as robust
+    from rpim_opt.formulation import signed as signed
+    from rpim_opt.formulation import sum_of_norms as sum_of_norms
     from rpim_opt.formulation import tikhonov as tikhonov
     from rpim_opt.formulation import within_tolerance as within_tolerance
     from rpim_opt.frames import hand_eye as hand_eye
@@ -42,8 +56,16 @@ if TYPE_CHECKING:
     from rpim_opt.robot import Robot as Robot
     from rpim_opt.robot import read_robot as read_robot
     from rpim_opt.selection import Selection as Selection
+    from rpim_opt.selection import corner as corner
+    from rpim_opt.selection import discrepancy as discrepancy
+    from rpim_opt.selection import gcv as gcv
+    from rpim_opt.selection import k_fold as k_fold
     from rpim_opt.selection import l_curve as l_curve
+    from rpim_opt.selection import leave_one_out as leave_one_out
+    from rpim_opt.selection import ncp as ncp
+    from rpim_opt.selection import quasi_optimality as quasi_optimality
     from rpim_opt.selection import reml as reml
+    from rpim_opt.selection import robust_gcv as robust_gcv
     from rpim_opt.selection import two_step as two_step
 
 __version__ = "0.1.0"
@@ -52,7 +74,27 @@ _HOME = {
     "calibration": ("Calibration", "calibrate"),
     "dataset": ("Dataset", "read_data"),
     "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
-    "formulation": ("Formulation", "bounded", "least_squares", "tikhonov", "within_tolerance"),
+    "formulation": (
+        "Formulation",
+        "Box",
+        "at_nominal",
+        "bounded",
+        "by_kind",
+        "by_link",
+        "differences",
+        "equal",
+        "group_lasso",
+        "huber",
+        "in_ball",
+        "lasso",
+        "least_squares",
+        "minimax",
+        "robust",
+        "signed",
+        "sum_of_norms",
+        "tikhonov",
+        "within_tolerance",
+    ),
     "inspection": ("Inspection", "inspect"),
     "instances": ("Instance", "load", "robots"),
     "kinematics": ("forward_kinematics",),
@@ -62,7 +104,20 @@ _HOME = {
     "frames": ("hand_eye", "register", "starting_parameters", "tool_from_distances"),
     "problem": ("CalibrationProblem", "LinearModel"),
     "robot": ("Robot", "read_robot"),
-    "selection": ("Selection", "l_curve", "reml", "two_step"),
+    "selection": (
+        "Selection",
+        "corner",
+        "discrepancy",
+        "gcv",
+        "k_fold",
+        "l_curve",
+        "leave_one_out",
+        "ncp",
+        "quasi_optimality",
+        "reml",
+        "robust_gcv",
+        "two_step",
+    ),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE_OF)

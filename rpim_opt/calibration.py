@@ -5,32 +5,61 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
+import cvxpy as cp
 import numpy as np
+from scipy.stats import chi2
 
 from rpim_opt.dataset import Dataset
-from rpim_opt.exceptions import InputError
-from rpim_opt.formulation import FEASIBLE, ConvexProgram, Formulation, tikhonov
+from rpim_opt.exceptions import InputError, NoSolutionFound
+from rpim_opt.formulation import FEASIBLE, ConvexProgram, Formulation, outlying, tikhonov
 from rpim_opt.frames import relocated
-from rpim_opt.problem import CalibrationProblem
+from rpim_opt.problem import CalibrationProblem, LinearModel
 from rpim_opt.robot import MDH, Array, Robot
-from rpim_opt.selection import Selection, Selector
+from rpim_opt.selection import SELECTORS, Selection, Selector, disagreement
 from rpim_opt.text import table
 from rpim_opt.units import display
 
+MOST_REGIONS, SHRINK = 30, 0.25
+"""How often a trust region may shrink in one pass, and by how much. Full steps that work need none."""
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this part of the solution, then stays."""
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """One pass of the loop: the nonlinear objective after it, the step's length and how often it was halved."""
+    """One pass of the loop: the nonlinear objective after it, the step's length, and the trust region it needed."""
 
     objective: float
     step: float
     weight: float
-    halvings: int
+    radius: float
+
+
+class Flag(NamedTuple):
+    """A row that a calibration distrusts: its residual in sigmas, and its error [mm]."""
+
+    label: str
+    sigmas: float
+    error_mm: float
+
+
+class Held(NamedTuple):
+    """A parameter at its bound [SI], the bound's multiplier, and the gain of loosening it by a tenth."""
+
+    name: str
+    bound: float
+    multiplier: float
+    gain: float
+
+
+class Certificate(NamedTuple):
+    """How well the conditions of a solution are met; see `Calibration.certificate`."""
+
+    gradient: float | None
+    step: float
+    violation: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +137,10 @@ class Calibration:
         left over. It holds for a squared loss, squared penalty and inactive constraints. Directions that
         neither data nor penalty see are infinite.
         """
-        model = self.program.model
+        model = self.linear
         _, s, Vt = model.svd
         total = s**2 + (self.weight if self.formulation.penalty is not None else 0.0)
-        dof = float(np.sum(s[s > 0] ** 2 / total[s > 0]))
-        spare = len(model.b) - dof
+        spare = len(model.b) - self.degrees_of_freedom
         rss = float(np.sum((model.A @ (self.x / model.parameters.scale) - model.b) ** 2))
         variance = rss / spare if spare > 1e-6 else 1.0
         scaled = np.divide(variance, total, out=np.zeros_like(total), where=total > 0)
@@ -120,6 +148,83 @@ class Calibration:
         unseen = np.sum(Vt[total == 0] ** 2, axis=0) > 1e-12
         C[unseen, unseen] = np.inf
         return C * np.outer(model.parameters.scale, model.parameters.scale)
+
+    @cached_property
+    def flagged(self) -> tuple[Flag, ...]:
+        """Rows that the fit distrusts, the worst first.
+
+        Those beyond `formulation.outlying`, with the noise that the other rows show. After a squared loss blunders may
+        hide behind each other: a robust loss finds them.
+        """
+        v, k = self.problem.whitened_errors(self.x)
+        limit, error = outlying(v, k), 1e3 * self.errors()
+        noise = limit / np.sqrt(chi2.ppf(1 - 0.01 / len(v), k))
+        labels = self.problem.data.label
+        return tuple(
+            Flag(labels[i], float(v[i] / noise[i]), float(error[i])) for i in np.argsort(-v) if v[i] > limit[i]
+        )
+
+    def without_flagged(self) -> Calibration:
+        """Return the calibration without the flagged rows, with the same formulation and selector."""
+        data = self.problem.data.without({flag.label for flag in self.flagged})
+        weight = SELECTORS.get(self.selection.name, self.weight) if self.selection else self.weight
+        return calibrate(self.problem.on(data), self.formulation, weight)
+
+    @cached_property
+    def linear(self) -> LinearModel:
+        """The last linearization, of the rows that a robust loss trusts (`ConvexProgram.trusted`)."""
+        return self.program.trusted(self.x / self.problem.parameters.free.scale)
+
+    @cached_property
+    def degrees_of_freedom(self) -> float:
+        """Sum s_i^2 / (s_i^2 + weight), of the trusted rows where the loss is robust."""
+        s = self.linear.svd[1]
+        weight = self.weight if self.formulation.penalty is not None else 0.0
+        return float(np.sum(s[s > 0] ** 2 / (s[s > 0] ** 2 + weight)))
+
+    @cached_property
+    def held(self) -> tuple[Held, ...]:
+        """What the tolerances cost: the parameters that a bound holds back, the costliest first.
+
+        ``gain`` is by how much the root mean square of the whitened residuals would fall if the bound were loosened by
+        a tenth of its size, from the multiplier of the bound. A large gain is an alarm: wrong data, or a drawing
+        that does not describe this robot.
+        """
+        box = self.program._posed.box
+        if box is None or not self.formulation.constraints or not self.program._posed.quadratic:
+            return ()
+        z, parameters = self.x / self.problem.parameters.free.scale, self.problem.parameters.free
+        multiplier = self.program.solve(self.weight).duals[0]
+        loss, rows, found = self.program.value(z)[0], len(self.program.model.b), []
+        for i in np.flatnonzero((multiplier > 0) & (box[0] < box[1])):
+            bound = box[1][i] if abs(z[i] - box[1][i]) < abs(z[i] - box[0][i]) else box[0][i]
+            less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
+            gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
+            found.append(Held(parameters.names[i], float(bound * parameters.scale[i]), float(multiplier[i]), gain))
+        return tuple(sorted(found, key=lambda h: -h.gain))
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """Evidence that this is a solution, computed anew and without the solver's word.
+
+        ``gradient`` is that of the nonlinear problem (data of the last linearization, penalty, and multipliers of the
+        bounds) relative to the data's at nominal; None where loss or penalty have no gradient. ``step`` is how far the
+        convex program at the solution would still go; ``violation`` by how much the constraints are missed.
+        """
+        z, program = self.x / self.problem.parameters.free.scale, self.program
+        again = program.solve(self.weight)
+        gradient = None
+        if program._posed.quadratic and (program._posed.box is not None or not self.formulation.constraints):
+            model = program.model
+            g = 2 * (model.A.T @ (model.A @ z - model.b) + (self.weight if self.formulation.penalty else 0.0) * z)
+            box = program._posed.box
+            if self.formulation.constraints and box is not None:
+                at_low, at_high = z <= box[0] + 1e-9, z >= box[1] - 1e-9
+                g = np.where((at_low & (g > 0)) | (at_high & (g < 0)), 0.0, g)
+            start = self.problem.linearize(np.zeros_like(self.x))
+            gradient = float(np.linalg.norm(g) / max(float(np.linalg.norm(2 * start.A.T @ start.b)), 1e-300))
+        step = float(np.linalg.norm(again.z - z) / (1 + np.linalg.norm(z)))
+        return Certificate(gradient, step, program.violation(z))
 
     def parameter_rows(self) -> list[dict[str, Any]]:
         """Return name, unit, nominal, identified, deviation and std of every identified parameter."""
@@ -153,7 +258,7 @@ class Calibration:
         """Return the parameters and errors as a person reads them."""
         before, after = (1e3 * e.mean() for e in (self.nominal_errors(), self.errors()))
         errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
-        return "\n".join([self.parameter_table(), "", errors, self.weight_sentence(), self.message])
+        return "\n".join([self.parameter_table(), "", errors, self.weight_sentence(), *self.remarks()])
 
     @property
     def selector(self) -> str:
@@ -167,7 +272,26 @@ class Calibration:
         if self.formulation.penalty is None:
             return f"Formulation '{self.formulation.name}' has no penalty and needs no weight."
         origin = self.selector + (f": {self.selection.note}" if self.selection else "")
-        return f"Weight {self.weight:.4g} ({origin}), formulation '{self.formulation.name}'."
+        text = f"Weight {self.weight:.4g} ({origin}), formulation '{self.formulation.name}'."
+        return text if self.selection is None else " ".join(filter(None, [text, disagreement(self.program)]))
+
+    def remarks(self) -> list[str]:
+        """Say what a reader must know besides the figures: blunders, bounds that hold, what did not converge."""
+        lines = []
+        if self.flagged:
+            rows = ", ".join(f"{f.label} ({f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm)" for f in self.flagged[:8])
+            more = f" and {len(self.flagged) - 8} more" if len(self.flagged) > 8 else ""
+            lines.append(f"Distrusted rows: {rows}{more}.")
+            if self.formulation.loss is cp.sum_squares:
+                lines.append("A squared loss lets such rows pull the fit: use formulation 'robust', or leave them out.")
+        for h in self.held[:5]:
+            unit, si = display(self.problem.parameters.dimension_of(h.name))
+            tenth = f"{0.1 * abs(h.bound) / si:.3g} {unit}"
+            lines.append(
+                f"{h.name} is held at {h.bound / si:+.3g} {unit}: loosening its tolerance by {tenth} would lower the "
+                f"whitened RMS by {h.gain:.2g}."
+            )
+        return [*lines, self.message]
 
 
 def calibrate(
@@ -182,8 +306,9 @@ def calibrate(
 ) -> Calibration:
     """Identify the parameters of a problem.
 
-    Every pass linearizes at the current deviations, solves for the *total* deviation and takes the
-    step, halved until the nonlinear objective falls. The loop ends when a step is shorter than
+    Every pass linearizes at the current deviations, solves for the *total* deviation and takes the step;
+    where that does not lower the nonlinear objective, the program is solved again in a smaller trust region.
+    The loop ends when a step is shorter than
     ``tolerance * (1 + ||z||)``; its fixed point is a stationary point of the nonlinear problem.
 
     Parameters
@@ -225,7 +350,7 @@ def calibrate(
         raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
     program, selection, history = formulation.compile(model), None, []
     lam, settled = fixed or 0.0, fixed is not None or formulation.penalty is None
-    converged = False
+    converged, radius, names = False, np.inf, dict(zip(problem.data.configuration, problem.data.label, strict=True))
     message = f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight."
     for _ in range(max_iterations):
         if not settled and callable(weight):
@@ -233,25 +358,38 @@ def calibrate(
             lam = selection.weight
         before = _objective(program, z, lam)
         start_feasible = program.violation(z) <= FEASIBLE
-        step = program.solve(lam).z - z
-        length, room = float(np.linalg.norm(step)), 1 + float(np.linalg.norm(z))
-        for halvings in range(12):
-            trial = z + step / 2**halvings
-            candidate = program.on(problem.linearize(scale * trial))
-            after = _objective(candidate, trial, lam)
+        for _ in range(MOST_REGIONS):
+            try:
+                estimate = program.solve(lam, z, radius)
+            except NoSolutionFound as error:
+                raise error.naming(names) from None
+            step = estimate.z - z
+            length, room = float(np.linalg.norm(step)), 1 + float(np.linalg.norm(z))
+            candidate = program.on(problem.linearize(scale * (z + step)))
+            after = _objective(candidate, z + step, lam)
             if after <= before * (1 + 1e-9) or not start_feasible or length <= tolerance * room:
                 break
+            radius = SHRINK * float(np.max(np.abs(step)))
         else:
-            message = "Not converged: no step along the solution lowers the nonlinear objective; check the start."
+            message = (
+                f"Not converged: no step lowers the nonlinear objective, not even one of {radius:.1e} scales; "
+                "the formulation may have no minimum here, or the start be far off."
+            )
             break
-        z, program = trial, candidate
-        history.append(Iteration(after, length, lam, halvings))
+        touched = float(np.max(np.abs(step), initial=0.0)) > 0.99 * radius
+        z, program = z + step, candidate
+        history.append(Iteration(after, length, lam, radius))
+        radius = 3 * radius if touched else np.inf if length < 0.1 * radius else radius
         if progress:
             progress(history[-1])
         if settled and length <= tolerance * (1 + float(np.linalg.norm(z))):
             converged, message = True, f"Converged after {len(history)} passes."
             break
         settled = settled or length <= SETTLED * room or len(history) >= max_iterations // 2
+    else:
+        last = [iteration.step for iteration in history[-4:]]
+        if len(last) == 4 and min(last) > 0.5 * max(last):
+            message = "Not converged: the steps no longer get shorter; the data hardly decide, give a larger weight."
     if elsewhere:
         message += " Frames were stated far from where the data put them; their deviations count from there."
     return Calibration(problem, formulation, scale * z, lam, selection, converged, message, tuple(history), program)

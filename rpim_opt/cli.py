@@ -36,6 +36,10 @@ def calibrate(
     select: Annotated[
         str | None, typer.Option(help="How to choose the weight: reml, l_curve, two_step, a number.")
     ] = None,
+    formulation: Annotated[
+        str | None, typer.Option(help="Instead of the file's: tikhonov, robust, bounded, ...")
+    ] = None,
+    refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, write result.json.
@@ -45,16 +49,20 @@ def calibrate(
     with _progress() as say:
         from rpim_opt.calibration import calibrate
         from rpim_opt.files import write_json
-        from rpim_opt.instances import load, parse_weight
+        from rpim_opt.instances import load, parse_formulation, parse_weight
 
         say("reading the problem")
         instance = load(problem, variant)
         weight = instance.weight if select is None else parse_weight(select)
         say("choosing the weight")
         result = calibrate(
-            instance.problem, instance.formulation, weight,
+            instance.problem, instance.formulation if formulation is None else parse_formulation(formulation), weight,
             progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
         )  # fmt: skip
+        if refit and result.flagged:
+            say("calibrating without the distrusted rows")
+            print("Refitted without " + ", ".join(flag.label for flag in result.flagged) + ".\n")  # noqa: T201
+            result = result.without_flagged()
     print(f"{instance.title}\n{instance.source}\n")  # noqa: T201
     print(describe(instance, result))  # noqa: T201
     if out is not None:
@@ -128,6 +136,11 @@ def describe(instance: Instance, result: Calibration) -> str:
                 stats = _statistics(each[rows])
                 figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
                 errors.append([f"{which}, {method}", str(stats["count"]), *figures])
+        if name == "identification" and result.flagged:
+            distrusted = {flag.label for flag in result.flagged}
+            stats = _statistics(result.errors(data)[[label not in distrusted for label in data.label]])
+            figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
+            errors.append(["identification, trusted rows", str(stats["count"]), *figures])
         errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     angles = [
@@ -149,7 +162,7 @@ def describe(instance: Instance, result: Calibration) -> str:
         "",
         result.weight_sentence(),
         f"{len(model.b)} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
-        result.message,
+        *result.remarks(),
     ]
     return "\n".join(lines)
 
@@ -169,7 +182,7 @@ def result_json(instance: Instance, result: Calibration) -> dict[str, Any]:
         "formulation": result.formulation.name,
         "converged": result.converged,
         "iterations": len(result.history),
-        "flagged": [],
+        "flagged": [flag.label for flag in result.flagged],
         "parameters": result.parameter_rows(),
         "rows": {name: _rows(result, part) for name, part in data.items()},
     }

@@ -13,6 +13,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.stats import chi2
 
 from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound, choices
 from rpim_opt.parameters import Parameters
@@ -24,7 +25,8 @@ Constraint = Callable[[Any, Parameters], Any]
 ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 """Losses that see only the length of the residual: [A b] may be replaced by its triangular factor."""
 
-TIGHT = {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}
+TOLERANCES = [{"tol_gap_abs": t, "tol_gap_rel": t, "tol_feas": t} for t in (1e-12, 1e-10, 1e-8)]
+"""Tried in turn; CVXPY keeps the solver and its settings from call to call, so each is stated in full."""
 FEASIBLE = 1e-9
 """By how much a solution may miss its constraints, relative to its largest entry."""
 STATIONARY = 1e-7
@@ -193,34 +195,35 @@ class ConvexProgram:
                 estimates.append(self.solve(weight))
         return estimates
 
-    def reweighted(self, z: Array) -> LinearModel:
-        """Return the linear model whose squared loss touches the loss at z: rows scaled by sqrt(loss'(v) / 2 v).
+    def trusted(self, z: Array) -> LinearModel:
+        """Return the squared-loss model that a robust fit amounts to: what it trusts at z, weighed as the loss does.
 
-        That is the model of the estimator that iteratively reweighted least squares ends with, where degrees of
-        freedom, likelihoods and covariances are those of a linear estimator.
+        Configurations beyond `outlying` are left out; the others are scaled by the root of the median of
+        loss'(v) / (2 v), so that a weight means the same. Degrees of freedom, likelihoods and covariances of a robust
+        estimate are those of this model. With a squared loss it is the model itself.
 
         Raises
         ------
         InputError
-            For a loss without such a model: one whose slope is not defined, or that rests on few equations (minimax).
+            For a loss without a slope, or one that rests on few equations (minimax).
         """
         if self.formulation.loss is cp.sum_squares:
             return self.model
+        norms, (_, which, count) = self.norms(z), np.unique(self.model.group, return_inverse=True, return_counts=True)
+        keep = norms <= outlying(norms, count)
         over = self.formulation.loss_over == "configuration"
-        v = self.norms(z) if over else self.model.A @ z - self.model.b
+        v = norms if over else self.model.A @ z - self.model.b
         probe = cp.Variable(len(v))
-        probe.value = np.where(np.abs(v) > 1e-9, v, 1e-9)
+        probe.value = np.where(np.abs(v) > 1e-6, v, 1e-6)
         slope = self.formulation.loss(probe).grad[probe]
+        found = f"formulation '{self.formulation.name}'"
         if slope is None:
-            raise InputError(f"formulation '{self.formulation.name}'", "a loss without slope", "another selector")
-        weight = np.abs(np.asarray(slope.todense()).ravel()) / (2 * np.maximum(np.abs(v), 1e-6))
-        if np.count_nonzero(weight) <= max(1, 0.1 * len(weight)):
-            found = "a loss that rests on a few equations"
-            raise InputError(
-                f"formulation '{self.formulation.name}'", found, "another selector: l_curve, k_fold, or a number"
-            )
-        rows = weight[np.unique(self.model.group, return_inverse=True)[1]] if over else weight
-        return self.model.scaled(np.sqrt(rows))
+            raise InputError(found, "a loss without slope", "another selector: l_curve, corner, k_fold, or a number")
+        weight = np.abs(np.asarray(slope.todense()).ravel()) / (2 * np.abs(probe.value))
+        factor = float(np.median(weight[keep if over else keep[which]]))
+        if not factor > 0:
+            raise InputError(found, "a loss that rests on a few equations", "another selector: l_curve, corner, k_fold")
+        return self.model.scaled(np.sqrt(factor) * keep[which])
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
@@ -270,13 +273,23 @@ class ConvexProgram:
         raise NoSolutionFound(self, weight, "active set: no end")
 
 
+def outlying(norms: Array, count: np.ndarray) -> np.ndarray:
+    """Return above which whitened norm (N,) a row or configuration with ``count`` equations is an outlier.
+
+    What one good set of data in a hundred would exceed, s sqrt(chi2_k^-1(1 - 0.01 / N)), with the declared noise s = 1
+    or, where that is larger, median(norm / median of chi_k).
+    """
+    noise = max(1.0, float(np.median(norms / np.sqrt(chi2.ppf(0.5, count)))))
+    return noise * np.sqrt(chi2.ppf(1 - 0.01 / len(norms), count))
+
+
 class _Posed:
     """The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
 
     With a squared loss and a squared (or no) penalty, both terms are one squared norm: in the singular
     basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = |u|^2 + const.
     Posed in u the program is perfectly conditioned at every weight, where posed in z an interior-point
-    solver calls answers "optimal" that have no correct digit.
+    solver calls answers "optimal" that have no correct digit. Other losses and penalties are posed in the same u.
     """
 
     def __init__(self, formulation: Formulation, model: LinearModel, trusted: bool = False):
@@ -295,19 +308,22 @@ class _Posed:
         over = formulation.penalty_over
         self.differences = [np.asarray(D, dtype=float) for D in over(model.parameters)] if over else None
         rows = n + 1 if self.reduced else m
+        u = cp.Variable(n)
+        self.basis, self.centre = cp.Parameter((n, n)), cp.Parameter(n)
+        self.z: Any = self.basis @ u + self.centre
+        link: list[Any] = []
         if self.quadratic:
-            u = cp.Variable(n)
-            self.basis, self.centre = cp.Parameter((n, n)), cp.Parameter(n)
-            self.z, objective = self.basis @ u + self.centre, cp.sum_squares(u)
-            self.constraints = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
+            objective = cp.sum_squares(u)
+            self.constraints: list[list[Any]] = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
         else:
-            self.z = cp.Variable(n)
             self.A, self.b, self.weight = (
                 cp.Parameter((rows, n)),
                 cp.Parameter(rows),
                 cp.Parameter(nonneg=True),
             )
-            r = self.A @ self.z - self.b
+            expression, self.z = self.z, cp.Variable(n)
+            link = [self.z == expression]  # the penalty's weight may not multiply the basis: DPP
+            r = self.A @ u - self.b
             norms = None if whole and not self.limited else _norms(r, model.group)
             objective = formulation.loss(r if whole else norms)
             if formulation.penalty is not None:
@@ -316,7 +332,7 @@ class _Posed:
             self.constraints = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
             if norms is not None and self.limited:
                 self.constraints.append([norms <= formulation.largest])
-        every = [constraint for group in self.constraints for constraint in group]
+        every: list[Any] = link + [constraint for group in self.constraints for constraint in group]
         if trusted:
             self.middle, self.radius = cp.Parameter(n), cp.Parameter(nonneg=True)
             every.append(cp.abs(self.z - self.middle) <= self.radius)
@@ -354,7 +370,7 @@ class _Posed:
     def solve(self, program: ConvexProgram, weight: float) -> tuple[Array, tuple[Array, ...]]:
         self._set(program.model, weight)
         status = ""
-        for settings in (TIGHT, {}):
+        for settings in TOLERANCES:
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", UserWarning)
@@ -375,18 +391,20 @@ class _Posed:
         raise NoSolutionFound(program, weight, status, conflict)
 
     def _set(self, model: LinearModel, weight: float) -> None:
-        if self.quadratic:
-            beta, s, Vt = model.svd
-            if self.constrained and not s.all():
-                # a nominal value for unseen directions may not meet the constraints: let them move, at a price
-                weight = max(weight, 1e-16 * s[0] ** 2)
-            D = np.sqrt(s**2 + weight)
-            inverse = np.divide(1.0, D, out=np.zeros_like(D), where=D > 0)
-            self.basis.value = Vt.T * inverse
-            self.centre.value = Vt.T @ (inverse**2 * s * beta)
-        else:
+        beta, s, Vt = model.svd
+        given = weight
+        if self.constrained or not self.quadratic:
+            # a nominal value for unseen directions may not be the answer: let them move, at a price
+            weight = max(weight, 1e-16 * s[0] ** 2) if not s.all() or not self.quadratic else weight
+        D = np.sqrt(s**2 + weight)
+        inverse = np.divide(1.0, D, out=np.zeros_like(D), where=D > 0)
+        self.basis.value = Vt.T * inverse
+        self.centre.value = Vt.T @ (inverse**2 * s * beta)
+        if not self.quadratic:
             R = model.triangle if self.reduced else np.column_stack([model.A, model.b])
-            self.A.value, self.b.value, self.weight.value = R[:, : self.n], R[:, self.n], weight
+            self.A.value = R[:, : self.n] @ self.basis.value
+            self.b.value = R[:, self.n] - R[:, : self.n] @ self.centre.value
+            self.weight.value = given
 
 
 def _listed(constraints: Any) -> list[Any]:
@@ -559,7 +577,7 @@ def by_kind(parameters: Parameters) -> list[Array]:
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
 
-    For parameters of consecutive joints that share a cause: ``differences("ratio?")`` for one wrong scale of all encoders.
+    For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders.
     """
 
     def rows(parameters: Parameters) -> list[Array]:

@@ -151,7 +151,7 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         kind = stated.kinds[each.measurement]
         for role in ROLES:
             file = getattr(each, role)
-            if file is None:
+            if not file:
                 continue
             robodk = each.layout == "robodk"
             try:
@@ -329,6 +329,11 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     raise InputError("key robot", f"'{name}'", accepted, folder / "problem.toml" if folder else None)
 
 
+def parse_formulation(text: str) -> Formulation:
+    """Return the ready formulation of that name."""
+    return lookup(FORMULATIONS, text, "formulation")
+
+
 def parse_weight(text: str, file: object = None) -> float | Selector:
     """Return the selector of that name, or the number that the text is."""
     try:
@@ -352,5 +357,5 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
     merged = dict(base)
     for key, value in over.items():
         tables = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
-        merged[key] = _overlay(base[key], value) if tables else value
+        merged[key] = _overlay(base[key], value) if tables and value else value  # an empty table clears
     return merged

@@ -84,6 +84,10 @@ class Parameters:
         """(P,) which parameters place something (base, reflectors, anchors, ...) and are not the robot's own."""
         return np.array([not _ON_THE_ROBOT.fullmatch(name) for name in self.names])
 
+    def dimension_of(self, name: str) -> str:
+        """Return the dimension of a parameter."""
+        return self.dimensions[self.names.index(name)]
+
     def identify(self, patterns: Iterable[str]) -> Parameters:
         """Return the same table with just the parameters identified that match one of the patterns.
 

@@ -65,10 +65,6 @@ class LinearModel:
         """Number of directions in the parameters that the data see."""
         return int(np.count_nonzero(self.svd[1]))
 
-    def without(self, group: int) -> LinearModel:
-        """Return the model that has not seen one configuration: its rows are zero, the shape stays."""
-        return self.scaled(self.group != group)
-
     def scaled(self, rows: Array) -> LinearModel:
         """Return the model with its equations multiplied by numbers (m,)."""
         return replace(self, A=self.A * rows[:, None], b=self.b * rows)
@@ -145,6 +141,14 @@ class CalibrationProblem:
                 residual = self._evaluate(block, "residual", x)[0][:, 0, of]
                 errors[block.row] = np.sqrt(np.sum(residual**2, axis=1))
         return errors
+
+    def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every row's residual (N,), and how many equations each has (N,)."""
+        norms, count = np.zeros(len(self.data)), np.zeros(len(self.data), dtype=int)
+        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
+            r = (whitening @ self._evaluate(block, "residual", x)[0].transpose(0, 2, 1))[:, :, 0]
+            norms[block.row], count[block.row] = np.sqrt(np.sum(r**2, axis=1)), r.shape[1]
+        return norms, count
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values, -d residual / dx, (m, n) [SI]."""

@@ -124,12 +124,13 @@ def test_reml_finds_the_ratio_of_noise_and_deviations() -> None:
 
 
 def test_reml_says_what_it_cannot_choose() -> None:
-    import cvxpy as cp
-
     problem, _ = simulated(noise=5e-5)
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
-    with pytest.raises(ro.InputError, match="selector reml: found formulation 'robust', accepted: squared loss"):
-        ro.reml(ro.Formulation("robust", loss=cp.norm1, penalty=cp.sum_squares).compile(model))
+    with pytest.raises(ro.InputError, match="selector reml: found formulation 'lasso', accepted: a squared norm"):
+        ro.reml(ro.lasso.compile(model))
+    few, _ = simulated(("a[234]", "d5"), noise=5e-5, configurations=12)
+    with pytest.raises(ro.InputError, match="found a loss that rests on a few equations, accepted: another selector"):
+        ro.reml(ro.minimax.compile(few.linearize(np.zeros(4))))
     sphere = ro.load("sphere").problem
     chosen = ro.reml(ro.tikhonov.compile(sphere.linearize(np.zeros(len(sphere.parameters.free)))))
     assert (chosen.weight, chosen.interior) == (1.0, False)
