@@ -67,6 +67,8 @@ if TYPE_CHECKING:
     from rpim_opt.selection import reml as reml
     from rpim_opt.selection import robust_gcv as robust_gcv
     from rpim_opt.selection import two_step as two_step
+    from rpim_opt.uncertainty import Uncertainty as Uncertainty
+    from rpim_opt.uncertainty import monte_carlo as monte_carlo
 
 __version__ = "0.1.0"
 
@@ -118,6 +120,7 @@ _HOME = {
         "robust_gcv",
         "two_step",
     ),
+    "uncertainty": ("Uncertainty", "monte_carlo"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = sorted(_MODULE_OF)

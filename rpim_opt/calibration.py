@@ -128,26 +128,52 @@ class Calibration:
                 mdh[places[name]] += deviation
         return replace(self.problem.robot, mdh=mdh)
 
+    @property
+    def penalty_weight(self) -> float:
+        """The weight, zero where there is no penalty."""
+        return self.weight if self.formulation.penalty is not None else 0.0
+
+    @property
+    def linear_penalty(self) -> bool:
+        """Whether the penalty is a squared norm, or there is none: the estimate is then linear in the data."""
+        return self.formulation.penalty in (None, cp.sum_squares) and self.formulation.penalty_over is None
+
+    @cached_property
+    def equations(self) -> int:
+        """How many equations the fit rests on: those that a robust loss trusts."""
+        return int(np.count_nonzero(np.any(self.linear.A != 0, axis=1) | (self.linear.b != 0)))
+
+    @cached_property
+    def _factor(self) -> float:
+        """By how much a robust loss weighs the rows that it trusts, against the squared loss."""
+        whole, part = self.program.model.A, self.linear.A
+        rows = np.linalg.norm(part, axis=1) > 0
+        return float(np.sum(part[rows] ** 2) / np.sum(whole[rows] ** 2)) if rows.any() else 1.0
+
+    @cached_property
+    def noise_variance(self) -> float:
+        """sigma^2 = RSS / (m - dof) in units of the declared noise, or 1 where no equation is left over."""
+        model = self.linear
+        spare = self.equations - self.degrees_of_freedom
+        rss = float(np.sum((model.A @ (self.x / model.parameters.scale) - model.b) ** 2))
+        return rss / spare / self._factor if spare > 1e-6 else 1.0
+
     @cached_property
     def covariance(self) -> Array:
         """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S.
 
-        That is the Bayesian covariance with the prior that the penalty stands for; sigma^2 =
-        RSS / (m - dof), dof = sum s_i^2 / (s_i^2 + weight), or the declared noise where no equation is
-        left over. It holds for a squared loss, squared penalty and inactive constraints. Directions that
-        neither data nor penalty see are infinite.
+        That is the Bayesian covariance with the prior that the penalty stands for (`Uncertainty` takes it apart).
+        It holds for a squared loss, or for what a robust loss trusts, a squared penalty and inactive bounds.
+        Directions that neither data nor penalty see are infinite.
         """
-        model = self.linear
-        _, s, Vt = model.svd
-        total = s**2 + (self.weight if self.formulation.penalty is not None else 0.0)
-        spare = len(model.b) - self.degrees_of_freedom
-        rss = float(np.sum((model.A @ (self.x / model.parameters.scale) - model.b) ** 2))
-        variance = rss / spare if spare > 1e-6 else 1.0
-        scaled = np.divide(variance, total, out=np.zeros_like(total), where=total > 0)
+        _, s, Vt = self.linear.svd
+        total = s**2 + self.penalty_weight
+        scaled = np.divide(self.noise_variance * self._factor, total, out=np.zeros_like(total), where=total > 0)
         C = (Vt.T * scaled) @ Vt
         unseen = np.sum(Vt[total == 0] ** 2, axis=0) > 1e-12
         C[unseen, unseen] = np.inf
-        return C * np.outer(model.parameters.scale, model.parameters.scale)
+        scale = self.linear.parameters.scale
+        return C * np.outer(scale, scale)
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
@@ -179,8 +205,7 @@ class Calibration:
     def degrees_of_freedom(self) -> float:
         """Sum s_i^2 / (s_i^2 + weight), of the trusted rows where the loss is robust."""
         s = self.linear.svd[1]
-        weight = self.weight if self.formulation.penalty is not None else 0.0
-        return float(np.sum(s[s > 0] ** 2 / (s[s > 0] ** 2 + weight)))
+        return float(np.sum(s[s > 0] ** 2 / (s[s > 0] ** 2 + self.penalty_weight)))
 
     @cached_property
     def held(self) -> tuple[Held, ...]:

@@ -110,6 +110,40 @@ def simulate(
 
 
 @app.command()
+def design(
+    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
+    count: Annotated[int, typer.Option(help="How many configurations to choose.")] = 30,
+    criterion: Annotated[str, typer.Option(help="V (predicted positions), D, A or E.")] = "V",
+    candidates: Annotated[int, typer.Option(help="How many random candidates within the joint limits.")] = 1000,
+    table: Annotated[Path | None, typer.Option(help="A table of candidates instead: q1_deg, ...")] = None,
+    seed: Annotated[int, typer.Option(help="Of the random candidates.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
+) -> None:
+    """Choose the configurations to measure next, from candidates, by optimal design."""
+    with _progress() as say:
+        from rpim_opt.design import design as choose
+        from rpim_opt.design import joint_table, random_candidates, read_candidates
+        from rpim_opt.files import write_text
+        from rpim_opt.instances import load
+
+        say("reading the problem")
+        instance = load(problem)
+        robot = instance.problem.robot
+        q = random_candidates(robot, candidates, seed) if table is None else read_candidates(table, robot)
+        found = choose(instance.problem, q, count, criterion, progress=say)
+    text = joint_table(robot, q[found.chosen], found.chosen)
+    print(found)  # noqa: T201
+    if out is None:
+        print(text, end="")  # noqa: T201
+        return
+    try:
+        write_text(out, text)
+    except OSError as error:
+        raise RpimError(f"{out}: cannot be written: {error}.") from None
+    print(f"Written: {out}")  # noqa: T201
+
+
+@app.command()
 def robots() -> None:
     """List the ready robots that a problem file may name."""
     from rpim_opt.instances import find_robot

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import cvxpy as cp
 from pydantic import Field
 
 from rpim_opt.dataset import Dataset, read_data
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import Angle, Length, Table, read_toml, validate
-from rpim_opt.formulation import FORMULATIONS, Formulation
+from rpim_opt.formulation import FORMULATIONS, Constraint, Formulation, at_nominal, equal, signed
 from rpim_opt.frames import starting_parameters
 from rpim_opt.kinematics import FRAME
 from rpim_opt.measurement import MEASUREMENTS, Measurement, of_fixture
@@ -80,6 +82,21 @@ class _Observation(Table):
     noise: dict[str, Any] = Field(default_factory=dict)
 
 
+class _Constraints(Table):
+    at_nominal: list[str] = Field(default_factory=list)
+    positive: list[str] = Field(default_factory=list)
+    negative: list[str] = Field(default_factory=list)
+    equal: list[list[str]] = Field(default_factory=list)
+
+    def all(self) -> tuple[Constraint, ...]:
+        boxes = [
+            (self.at_nominal, at_nominal),
+            (self.positive, partial(signed, 1)),
+            (self.negative, partial(signed, -1)),
+        ]
+        return (*(make(*patterns) for patterns, make in boxes if patterns), *(equal(*names) for names in self.equal))
+
+
 class _ProblemTable(Table):
     title: str
     source: str = ""
@@ -96,6 +113,7 @@ class _ProblemTable(Table):
     noise: dict[str, Any] = Field(default_factory=dict)
     scale: dict[str, float | int] = Field(default_factory=dict)
     tolerance: dict[str, float | int] = Field(default_factory=dict)
+    constraints: _Constraints = _Constraints()
     base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
     tool: dict[str, Any] = Field(default_factory=dict)
     published: dict[str, dict[str, float]] = Field(default_factory=dict)
@@ -182,6 +200,13 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
             problem.on(data["validation"])
     except InputError as error:
         raise error.within(path) from None
+    formulation = lookup(FORMULATIONS, table.formulation, "formulation", path)
+    formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
+    try:
+        for constraint in formulation.constraints:
+            constraint(cp.Variable(len(problem.parameters.free)), problem.parameters.free)
+    except InputError as error:
+        raise error.within(path) from None
     for key in table.published:
         if not (folder / key).is_file():
             raise InputError("table published", f"'{key}'", "the name of a table in this folder", path)
@@ -193,7 +218,7 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         source=table.source,
         problem=problem,
         validation=data.get("validation"),
-        formulation=lookup(FORMULATIONS, table.formulation, "formulation", path),
+        formulation=formulation,
         weight=parse_weight(table.selector, path),
         published={role: table.published.get(files[role][0], {}) for role in ROLES if files[role]},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},

@@ -65,6 +65,10 @@ class LinearModel:
         """Number of directions in the parameters that the data see."""
         return int(np.count_nonzero(self.svd[1]))
 
+    def with_values(self, b: Array) -> LinearModel:
+        """Return the model with other right-hand sides (m,)."""
+        return replace(self, b=b)
+
     def scaled(self, rows: Array) -> LinearModel:
         """Return the model with its equations multiplied by numbers (m,)."""
         return replace(self, A=self.A * rows[:, None], b=self.b * rows)

@@ -31,8 +31,11 @@ ORDER = {
     "selection": {"cvxpy"},
     "text": {"rich"},
     "calibration": {"cvxpy"},
+    "uncertainty": set(),
+    "baselines": set(),
+    "design": set(),
     "inspection": set(),
-    "instances": {"pydantic"},
+    "instances": {"pydantic", "cvxpy"},
     "simulation": {"pydantic"},
     "cli": {"typer", "rich"},
 }

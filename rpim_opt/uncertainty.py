@@ -1,0 +1,211 @@
+"""How certain the identified parameters and the positions they predict are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from rpim_opt.calibration import Calibration
+from rpim_opt.dataset import Dataset
+from rpim_opt.exceptions import InputError
+from rpim_opt.measurement import position
+from rpim_opt.robot import Array
+from rpim_opt.text import table
+from rpim_opt.units import display
+
+
+class Prediction(NamedTuple):
+    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals."""
+
+    position: Array
+    covariance: Array
+    coverage_factor: float
+
+    @property
+    def expanded(self) -> Array:
+        """Half widths (N, 3) [m] of the intervals of the coordinates."""
+        return self.coverage_factor * np.sqrt(np.einsum("nii->ni", self.covariance))
+
+
+class NoiseTest(NamedTuple):
+    """Observed over declared noise, and the probability that noise as declared would show as much or more."""
+
+    ratio: float
+    probability: float
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """The uncertainty of a calibration, by the law of propagation (JCGM 100) on its last linearization.
+
+    With A = U diag(s) V' whitened and scaled, weight w, filter f = s^2 / (s^2 + w) and the noise level sigma::
+
+        noise      sigma^2 S V diag(s^2 / (s^2 + w)^2) V' S          what other data of this kind would change
+        prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            what the penalty holds back: its bias, in the mean
+        total      noise + prior = sigma^2 S (A'A + w)^-1 S          if deviations are as large as the penalty expects
+
+    It holds for a squared loss, or for what a robust loss trusts, and a squared penalty. A parameter at an active
+    bound is not known better for it: such parameters are listed in ``at_bound``, and their intervals are those
+    without the bound. Other penalties (lasso) have no such covariance and are refused.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    confidence
+        Of the intervals; 0.95 by default.
+    """
+
+    result: Calibration
+    confidence: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not 0 < self.confidence < 1:
+            raise InputError("confidence", f"{self.confidence}", "a probability between 0 and 1")
+        if not self.result.linear_penalty:
+            found = f"formulation '{self.result.formulation.name}'"
+            raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that are left to estimate the noise: m - sum f."""
+        return max(self.result.equations - self.result.degrees_of_freedom, 0.0)
+
+    @cached_property
+    def noise_level(self) -> float:
+        """Sigma = sqrt(RSS / (m - dof)), in units of the declared noise; 1 where no equation is left over."""
+        return float(np.sqrt(self.result.noise_variance))
+
+    @property
+    def _level(self) -> float:
+        """sigma^2 in units of the model that the fit rests on, which a robust loss weighs by a factor."""
+        return self.result.noise_variance * self.result._factor
+
+    @property
+    def coverage_factor(self) -> float:
+        """Student's t of the confidence with the noise's degrees of freedom."""
+        probability = (1 + self.confidence) / 2
+        return float(student.ppf(probability, self.freedom)) if self.freedom > 1 else float(student.ppf(probability, 1))
+
+    def _spread(self, by: Array) -> Array:
+        """S V diag(by) V' S; infinite in what neither data nor penalty see."""
+        model = self.result.linear
+        C = (model.svd[2].T * by) @ model.svd[2]
+        return C * np.outer(model.parameters.scale, model.parameters.scale)
+
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance (n, n) [SI] from the noise alone."""
+        s, w = self.result.linear.svd[1], self.result.penalty_weight
+        total = s**2 + w
+        return self._level * self._spread(np.divide(s**2, total**2, out=np.zeros_like(s), where=total > 0))
+
+    @cached_property
+    def prior(self) -> Array:
+        """Mean square (n, n) [SI] of what the penalty holds back; directions that the data do not see are here."""
+        s, w = self.result.linear.svd[1], self.result.penalty_weight
+        total = s**2 + w
+        return self._level * self._spread(np.divide(w, total**2, out=np.zeros_like(s), where=total > 0))
+
+    @property
+    def total(self) -> Array:
+        """Covariance (n, n) [SI]: noise and prior together."""
+        return self.result.covariance
+
+    @cached_property
+    def at_bound(self) -> tuple[str, ...]:
+        """Parameters that a bound holds back: their intervals do not know of the bound."""
+        return tuple(h.name for h in self.result.held)
+
+    def intervals(self) -> Array:
+        """Return lower and upper ends (n, 2) [SI] of the deviations' intervals."""
+        half = self.coverage_factor * np.sqrt(np.diag(self.total))
+        return np.column_stack([self.result.x - half, self.result.x + half])
+
+    def noise_test(self) -> NoiseTest:
+        """Compare the observed noise with the declared: RSS against chi^2 with m - dof degrees of freedom."""
+        if self.freedom < 1:
+            return NoiseTest(1.0, 1.0, "No equation is left over to tell the noise: it is the declared one.")
+        statistic = self.noise_level**2 * self.freedom
+        upper = float(chi2.sf(statistic, self.freedom))
+        probability = 2 * min(upper, 1 - upper)
+        if probability >= 0.01:
+            verdict = f"The data scatter as declared ({self.noise_level:.2f} times)."
+        elif upper < 0.5:
+            verdict = (
+                f"The data scatter {self.noise_level:.2f} times as much as declared: noise is larger, rows are wrong, "
+                "or the model lacks something (backlash, elasticity)."
+            )
+        else:
+            verdict = (
+                f"The data scatter {self.noise_level:.2f} times as much as declared: the noise is stated too large."
+            )
+        return NoiseTest(self.noise_level, probability, verdict)
+
+    def predict(self, q: Array, marker: str = "") -> Prediction:
+        """Return the positions that a reflector will have, with their uncertainty, anywhere in the workspace.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m].
+        marker
+            The reflector; the only one by default.
+
+        Returns
+        -------
+        Positions in the instrument's frame; their covariance J C J', without the noise of a new measurement.
+        """
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
+        data = replace(data, blocks=tuple(replace(block, markers=(marker,)) for block in data.blocks))
+        problem = self.result.problem.on(data)
+        J = problem.jacobian(self.result.x).reshape(len(q), 3, -1)
+        covariance = np.einsum("nij,jk,nlk->nil", J, self.total, J)
+        return Prediction(problem.modelled(self.result.x)[0], covariance, self.coverage_factor)
+
+    def budget(self) -> str:
+        """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty)."""
+        free, rows = self.result.problem.parameters.free, []
+        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
+        values = free.values(self.result.x)
+        for i, name in enumerate(free.names):
+            unit, si = display(free.dimensions[i])
+            figures = [values[i], noise[i], prior[i], both[i], self.coverage_factor * both[i]]
+            mark = " *" if name in self.at_bound else ""
+            rows.append([name + mark, unit, *(f"{v / si:.4f}" for v in figures)])
+        head = [
+            "parameter",
+            "unit",
+            "value",
+            "u, noise",
+            "u, prior",
+            "u, combined",
+            f"U, k = {self.coverage_factor:.2f}",
+        ]
+        lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.freedom:.1f}."]
+        return "\n".join(lines + (["* held by a bound, of which the interval does not know."] if self.at_bound else []))
+
+
+def monte_carlo(result: Calibration, draws: int = 200, seed: int = 0) -> Array:
+    """Return deviations (draws, n) [SI] identified from data drawn anew around the fit, noise at the observed level.
+
+    The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
+    with `Uncertainty.noise`. Every draw solves the linearized program at the same weight.
+    """
+    rng, program = np.random.default_rng(seed), result.program
+    z = result.x / result.problem.parameters.free.scale
+    level = np.sqrt(result.noise_variance)
+    fitted = program.model.A @ z
+    found = []
+    for _ in range(draws):
+        b = fitted + level * rng.normal(size=len(fitted))
+        drawn = program.on(program.model.with_values(b))
+        found.append(drawn.path([result.weight])[0].z)
+    return np.array(found) * result.problem.parameters.free.scale
