@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from rpim_opt.calibration import calibrate as calibrate
     from rpim_opt.dataset import Dataset as Dataset
     from rpim_opt.dataset import read_data as read_data
+    from rpim_opt.design import Design as Design
+    from rpim_opt.design import choose as choose
+    from rpim_opt.design import random_candidates as random_candidates
     from rpim_opt.exceptions import InputError as InputError
     from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
     from rpim_opt.exceptions import RpimError as RpimError
@@ -51,6 +54,9 @@ if TYPE_CHECKING:
     from rpim_opt.observability import observe as observe
     from rpim_opt.parameters import Parameters as Parameters
     from rpim_opt.parameters import model_parameters as model_parameters
+    from rpim_opt.plots import plot_errors as plot_errors
+    from rpim_opt.plots import plot_l_curve as plot_l_curve
+    from rpim_opt.plots import plot_selection as plot_selection
     from rpim_opt.problem import CalibrationProblem as CalibrationProblem
     from rpim_opt.problem import LinearModel as LinearModel
     from rpim_opt.robot import Robot as Robot
@@ -120,6 +126,8 @@ _HOME = {
         "robust_gcv",
         "two_step",
     ),
+    "design": ("Design", "choose", "random_candidates"),
+    "plots": ("plot_errors", "plot_l_curve", "plot_selection"),
     "uncertainty": ("Uncertainty", "monte_carlo"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -66,8 +66,8 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
 def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, preconditioned: bool = False) -> Baseline:
     """Descend along the gradient of the sum of squares, by the linear model's exact steps.
 
-    As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by the
-    column norms of the Jacobian, which is what makes it move at all along the weak directions.
+    As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by
+    the column norms of the Jacobian, which is what makes it move at all along the weak directions.
     """
     scale = problem.parameters.free.scale
     model = problem.linearize(np.zeros_like(scale))

@@ -211,17 +211,18 @@ class Calibration:
     def held(self) -> tuple[Held, ...]:
         """What the tolerances cost: the parameters that a bound holds back, the costliest first.
 
-        ``gain`` is by how much the root mean square of the whitened residuals would fall if the bound were loosened by
-        a tenth of its size, from the multiplier of the bound. A large gain is an alarm: wrong data, or a drawing
-        that does not describe this robot.
+        ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if the
+        bound were loosened by a tenth of its size, from the multiplier of the bound. A large gain is an alarm: wrong
+        data, or a drawing that does not describe this robot.
         """
         box = self.program._posed.box
-        if box is None or not self.formulation.constraints or not self.program._posed.quadratic:
+        if box is None or not self.formulation.constraints:
             return ()
         z, parameters = self.x / self.problem.parameters.free.scale, self.problem.parameters.free
-        multiplier = self.program.solve(self.weight).duals[0]
+        multiplier = np.sum(self.program.solve(self.weight).duals, axis=0)
         loss, rows, found = self.program.value(z)[0], len(self.program.model.b), []
-        for i in np.flatnonzero((multiplier > 0) & (box[0] < box[1])):
+        near = np.minimum(z - box[0], box[1] - z) < 1e-6 * (1 + np.abs(z))
+        for i in np.flatnonzero((multiplier > 1e-6 * loss / rows) & near & (box[0] < box[1])):
             bound = box[1][i] if abs(z[i] - box[1][i]) < abs(z[i] - box[0][i]) else box[0][i]
             less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
             gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))

@@ -34,7 +34,7 @@ def calibrate(
     problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
     variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
     select: Annotated[
-        str | None, typer.Option(help="How to choose the weight: reml, l_curve, two_step, a number.")
+        str | None, typer.Option(help="How to choose the weight: reml, l_curve, gcv, k_fold, ..., or a number.")
     ] = None,
     formulation: Annotated[
         str | None, typer.Option(help="Instead of the file's: tikhonov, robust, bounded, ...")
@@ -121,8 +121,7 @@ def design(
 ) -> None:
     """Choose the configurations to measure next, from candidates, by optimal design."""
     with _progress() as say:
-        from rpim_opt.design import design as choose
-        from rpim_opt.design import joint_table, random_candidates, read_candidates
+        from rpim_opt.design import choose, joint_table, random_candidates, read_candidates
         from rpim_opt.files import write_text
         from rpim_opt.instances import load
 

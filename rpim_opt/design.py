@@ -88,7 +88,7 @@ def joint_table(robot: Robot, q: Array, index: np.ndarray) -> str:
     return "\n".join(lines) + "\n"
 
 
-def design(
+def choose(
     problem: CalibrationProblem,
     candidates: Array,
     count: int,

@@ -385,10 +385,23 @@ class _Posed:
                 if program.violation(z) > max(FEASIBLE, 1e-8 * self.limited) * max(1.0, float(np.max(np.abs(z)))):
                     status = "optimal, but outside the constraints"
                     continue
-                duals = [np.concatenate([np.ravel(c.dual_value) for c in group]) for group in self.constraints if group]
-                return z, tuple(duals)
+                return z, tuple(self._duals(k) for k in range(len(self.formulation.constraints)))
         conflict = _conflict(program) if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE) else None
         raise NoSolutionFound(program, weight, status, conflict)
+
+    def _duals(self, k: int) -> np.ndarray:
+        """Multipliers of the k-th constraint: of a box (n,), as if loosened on the side that holds."""
+        values = np.concatenate([np.ravel(c.dual_value) for c in self.constraints[k]])
+        constraint = self.formulation.constraints[k]
+        if not isinstance(constraint, Box):
+            return values
+        lower, upper = constraint.limits(self.parameters)
+        sides = [lower == upper, np.isfinite(lower) & (lower < upper), np.isfinite(upper) & (lower < upper)]
+        found = np.zeros(self.n)
+        for side in sides:
+            part, values = np.split(values, [np.count_nonzero(side)])
+            found[side] += np.abs(part)
+        return found
 
     def _set(self, model: LinearModel, weight: float) -> None:
         beta, s, Vt = model.svd

@@ -281,22 +281,32 @@ def robust_gcv(program: ConvexProgram, gamma: float = 1.4) -> Selection:
 
 
 def discrepancy(program: ConvexProgram) -> Selection:
-    """Choose the largest weight that fits as well as the declared noise allows: rho(w) = m - dof(w) (Morozov)."""
+    """Choose the largest weight that fits as well as the declared noise allows: rho(w) <= m - dof(w) (Morozov 1966)."""
+    chosen = _linear_rule(program, "discrepancy", _misfit, "misfit equal to the declared noise", EDGES)
+    fits = np.flatnonzero(chosen.score <= 0)
+    weights = chosen.weights
+    if not len(fits):
+        note = "no weight fits as well as the declared noise promises: it is too small, or the model lacks something"
+        return replace(chosen, weight=float(weights[0]), interior=False, note=note)
+    k = int(fits[-1])
+    if k == len(weights) - 1:
+        note = "every weight fits better than the declared noise: it is stated too large"
+        return replace(chosen, weight=float(weights[k]), interior=False, note=note)
+    share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])
+    weight = float(np.exp(np.log(weights[k]) + share * np.log(weights[k + 1] / weights[k])))
+    return replace(chosen, weight=weight, interior=True, note="misfit equal to the declared noise")
 
-    def of(model: LinearModel) -> Callable[[Array], Array]:
-        beta2, s2, perp = _filters(model)
 
-        def score(weights: Array) -> Array:
-            g = weights[:, None] / (s2 + weights[:, None])
-            return np.abs(np.log((g**2 @ beta2 + perp) / np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)))
+def _misfit(model: LinearModel) -> Callable[[Array], Array]:
+    """Return the function from weights (K,) to ln(rho / (m - dof))."""
+    beta2, s2, perp = _filters(model)
 
-        return score
+    def score(weights: Array) -> Array:
+        g = weights[:, None] / (s2 + weights[:, None])
+        left = np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)
+        return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
 
-    edges = {
-        "lower": "no weight fits as well as the declared noise promises: it is too small, or the model lacks something",
-        "upper": "every weight fits better than the declared noise: it is too large",
-    }
-    return _linear_rule(program, "discrepancy", of, "misfit equal to the declared noise", edges)
+    return score
 
 
 def quasi_optimality(program: ConvexProgram) -> Selection:

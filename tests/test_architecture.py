@@ -34,6 +34,7 @@ ORDER = {
     "uncertainty": set(),
     "baselines": set(),
     "design": set(),
+    "plots": set(),
     "inspection": set(),
     "instances": {"pydantic", "cvxpy"},
     "simulation": {"pydantic"},

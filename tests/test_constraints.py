@@ -91,6 +91,18 @@ def test_constrained_calibrations_reproduce_their_reference(variant: str | None)
         assert all(h.gain < 0.01 for h in result.held)
 
 
+def test_a_robust_loss_tells_what_a_tolerance_costs_too() -> None:
+    problem, truth = simulated(("a[234]", "d5"), noise=3e-5, configurations=20)
+    tight = problem.parameters.toleranced({"a3_mm": 0.5e3 * abs(truth[1]), "a2_mm": 50})
+    held = ro.calibrate(
+        ro.CalibrationProblem(problem.robot, tight, problem.data),
+        ro.Formulation("both", ro.huber(), cp.sum_squares, (ro.within_tolerance,), "configuration"),
+        1.0,
+    ).held
+    assert [h.name for h in held] == ["a3"]
+    assert held[0].gain > 0.1
+
+
 def test_what_is_known_helps() -> None:
     errors = {}
     for variant in (None, "equal_links", "parallel_axes"):
