@@ -211,8 +211,8 @@ class Calibration:
     def held(self) -> tuple[Held, ...]:
         """What the tolerances cost: the parameters that a bound holds back, the costliest first.
 
-        ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if the
-        bound were loosened by a tenth of its size, from the multiplier of the bound. A large gain is an alarm: wrong
+        ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
+        the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong
         data, or a drawing that does not describe this robot.
         """
         box = self.program._posed.box
