@@ -11,6 +11,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rpim_opt.calibration import Calibration as Calibration
     from rpim_opt.calibration import calibrate as calibrate
+    from rpim_opt.constraints import Box as Box
+    from rpim_opt.constraints import at_nominal as at_nominal
+    from rpim_opt.constraints import by_kind as by_kind
+    from rpim_opt.constraints import by_link as by_link
+    from rpim_opt.constraints import differences as differences
+    from rpim_opt.constraints import equal as equal
+    from rpim_opt.constraints import in_ball as in_ball
+    from rpim_opt.constraints import signed as signed
+    from rpim_opt.constraints import within_tolerance as within_tolerance
     from rpim_opt.dataset import Dataset as Dataset
     from rpim_opt.dataset import read_data as read_data
     from rpim_opt.design import Design as Design
@@ -19,25 +28,16 @@ if TYPE_CHECKING:
     from rpim_opt.exceptions import InputError as InputError
     from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
     from rpim_opt.exceptions import RpimError as RpimError
-    from rpim_opt.formulation import Box as Box
     from rpim_opt.formulation import Formulation as Formulation
-    from rpim_opt.formulation import at_nominal as at_nominal
     from rpim_opt.formulation import bounded as bounded
-    from rpim_opt.formulation import by_kind as by_kind
-    from rpim_opt.formulation import by_link as by_link
-    from rpim_opt.formulation import differences as differences
-    from rpim_opt.formulation import equal as equal
     from rpim_opt.formulation import group_lasso as group_lasso
     from rpim_opt.formulation import huber as huber
-    from rpim_opt.formulation import in_ball as in_ball
     from rpim_opt.formulation import lasso as lasso
     from rpim_opt.formulation import least_squares as least_squares
     from rpim_opt.formulation import minimax as minimax
     from rpim_opt.formulation import robust as robust
-    from rpim_opt.formulation import signed as signed
     from rpim_opt.formulation import sum_of_norms as sum_of_norms
     from rpim_opt.formulation import tikhonov as tikhonov
-    from rpim_opt.formulation import within_tolerance as within_tolerance
     from rpim_opt.frames import hand_eye as hand_eye
     from rpim_opt.frames import register as register
     from rpim_opt.frames import starting_parameters as starting_parameters
@@ -82,26 +82,28 @@ _HOME = {
     "calibration": ("Calibration", "calibrate"),
     "dataset": ("Dataset", "read_data"),
     "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
-    "formulation": (
-        "Formulation",
+    "constraints": (
         "Box",
         "at_nominal",
-        "bounded",
         "by_kind",
         "by_link",
         "differences",
         "equal",
+        "in_ball",
+        "signed",
+        "within_tolerance",
+    ),
+    "formulation": (
+        "Formulation",
+        "bounded",
         "group_lasso",
         "huber",
-        "in_ball",
         "lasso",
         "least_squares",
         "minimax",
         "robust",
-        "signed",
         "sum_of_norms",
         "tikhonov",
-        "within_tolerance",
     ),
     "inspection": ("Inspection", "inspect"),
     "instances": ("Instance", "load", "robots"),

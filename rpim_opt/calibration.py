@@ -215,7 +215,7 @@ class Calibration:
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong
         data, or a drawing that does not describe this robot.
         """
-        box = self.program._posed.box
+        box = self.program.box
         if box is None or not self.formulation.constraints:
             return ()
         z, parameters = self.x / self.problem.parameters.free.scale, self.problem.parameters.free
@@ -240,11 +240,11 @@ class Calibration:
         z, program = self.x / self.problem.parameters.free.scale, self.program
         again = program.solve(self.weight)
         gradient = None
-        if program._posed.quadratic and (program._posed.box is not None or not self.formulation.constraints):
+        if program.squared and program.box is not None:
             model = program.model
             g = 2 * (model.A.T @ (model.A @ z - model.b) + (self.weight if self.formulation.penalty else 0.0) * z)
-            box = program._posed.box
-            if self.formulation.constraints and box is not None:
+            box = program.box
+            if self.formulation.constraints:
                 at_low, at_high = z <= box[0] + 1e-9, z >= box[1] - 1e-9
                 g = np.where((at_low & (g > 0)) | (at_high & (g < 0)), 0.0, g)
             start = self.problem.linearize(np.zeros_like(self.x))

@@ -12,10 +12,11 @@ from typing import Any, Literal
 import cvxpy as cp
 from pydantic import Field
 
+from rpim_opt.constraints import Constraint, at_nominal, equal, signed
 from rpim_opt.dataset import Dataset, read_data
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import Angle, Length, Table, read_toml, validate
-from rpim_opt.formulation import FORMULATIONS, Constraint, Formulation, at_nominal, equal, signed
+from rpim_opt.formulation import FORMULATIONS, Formulation
 from rpim_opt.frames import starting_parameters
 from rpim_opt.kinematics import FRAME
 from rpim_opt.measurement import MEASUREMENTS, Measurement, of_fixture

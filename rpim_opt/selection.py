@@ -178,6 +178,8 @@ def _linear_rule(
     return selection
 
 
+ROOM = 1.1
+"""Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 EDGES = {
     "lower": "the smallest weight of the grid is best: the data want no penalty",
     "upper": "the largest weight of the grid is best: the data want no deviation",
@@ -281,7 +283,10 @@ def robust_gcv(program: ConvexProgram, gamma: float = 1.4) -> Selection:
 
 
 def discrepancy(program: ConvexProgram) -> Selection:
-    """Choose the largest weight that fits as well as the declared noise allows: rho(w) <= m - dof(w) (Morozov 1966)."""
+    """Choose the largest weight that fits as well as the declared noise allows (Morozov 1966).
+
+    rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
+    """
     chosen = _linear_rule(program, "discrepancy", _misfit, "misfit equal to the declared noise", EDGES)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
@@ -298,12 +303,12 @@ def discrepancy(program: ConvexProgram) -> Selection:
 
 
 def _misfit(model: LinearModel) -> Callable[[Array], Array]:
-    """Return the function from weights (K,) to ln(rho / (m - dof))."""
+    """Return the function from weights (K,) to ln(rho / (tau^2 (m - dof)))."""
     beta2, s2, perp = _filters(model)
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
-        left = np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)
+        left = ROOM**2 * np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)
         return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
 
     return score

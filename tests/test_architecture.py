@@ -27,6 +27,7 @@ ORDER = {
     "problem": {"casadi"},
     "observability": set(),
     "frames": set(),
+    "constraints": {"cvxpy"},
     "formulation": {"cvxpy"},
     "selection": {"cvxpy"},
     "text": {"rich"},

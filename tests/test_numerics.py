@@ -78,7 +78,7 @@ def test_the_discrepancy_is_the_declared_noise() -> None:
     if chosen.interior:
         e, s = program.path([chosen.weight])[0], program.model.svd[1]
         dof = np.sum(s**2 / (s**2 + chosen.weight))
-        assert e.loss == pytest.approx(len(program.model.b) - dof, rel=1e-3)
+        assert e.loss == pytest.approx(1.1**2 * (len(program.model.b) - dof), rel=1e-3)
 
 
 def test_the_corner_without_a_grid_is_the_corner() -> None:

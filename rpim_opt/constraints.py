@@ -1,0 +1,154 @@
+"""Constraints of a formulation, and the groups that its penalty may see."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from rpim_opt.exceptions import InputError, choices
+from rpim_opt.parameters import Parameters
+from rpim_opt.robot import Array
+
+Constraint = Callable[[Any, Parameters], Any]
+"""From z and the identified parameters to a CVXPY constraint, or several."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A constraint lower <= z <= upper, whose solutions are polished to rounding by an active set.
+
+    Parameters
+    ----------
+    name
+        What reports call it.
+    limits
+        From the identified `Parameters` to lower and upper bounds (n,) of z, infinite where there is none.
+    """
+
+    name: str
+    limits: Callable[[Parameters], tuple[Array, Array]]
+
+    def __call__(self, z: Any, parameters: Parameters) -> list[Any]:
+        """Return the CVXPY constraints."""
+        lower, upper = self.limits(parameters)
+        fixed = np.flatnonzero(lower == upper)
+        low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
+        high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
+        parts = [
+            (fixed, lambda k: z[k] == lower[k]),
+            (low, lambda k: z[k] >= lower[k]),
+            (high, lambda k: z[k] <= upper[k]),
+        ]
+        return [make(k) for k, make in parts if len(k)]
+
+
+def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
+    bound = parameters.tolerance / parameters.scale
+    if not np.isfinite(bound).any():
+        raise InputError("table tolerance", "no tolerance for any identified parameter", "length_mm, angle_mrad, ...")
+    return -bound, bound
+
+
+within_tolerance = Box("within tolerance", _tolerances)
+"""|x_i| <= tolerance_i, where a tolerance is stated."""
+
+
+def at_nominal(*patterns: str) -> Box:
+    """Keep the parameters that match a pattern at their nominal values: z_i = 0."""
+
+    def limits(parameters: Parameters) -> tuple[Array, Array]:
+        chosen = _matching(parameters, patterns, "at_nominal")
+        return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
+
+    return Box("at nominal", limits)
+
+
+def signed(sign: int, *patterns: str) -> Box:
+    """Keep the deviations that match a pattern on one side: sign z_i >= 0."""
+
+    def limits(parameters: Parameters) -> tuple[Array, Array]:
+        chosen = _matching(parameters, patterns, "signed")
+        return np.where(chosen & (sign > 0), 0.0, -np.inf), np.where(chosen & (sign < 0), 0.0, np.inf)
+
+    return Box("signed", limits)
+
+
+def equal(*names: str) -> Constraint:
+    """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel."""
+
+    def constraint(z: Any, parameters: Parameters) -> Any:
+        k = [parameters.names.index(n) for n in names if n in parameters.names]
+        if len(k) < len(names) or len(k) < 2:
+            missing = next((n for n in names if n not in parameters.names), names[0] if names else "")
+            raise InputError(
+                "equal", f"'{missing}'", "identified parameters, two or more: " + choices(missing, parameters.names)
+            )
+        scale, nominal = parameters.scale[k], parameters.nominal[k]
+        unit = scale.max()
+        value = cp.multiply(scale / unit, z[k]) + nominal / unit
+        return value[1:] == value[0]
+
+    return constraint
+
+
+def in_ball(radius: float, *patterns: str) -> Constraint:
+    """Keep the deviations that match a pattern in a ball: |z| <= radius, in units of the scales."""
+
+    def constraint(z: Any, parameters: Parameters) -> Any:
+        return cp.norm(z[np.flatnonzero(_matching(parameters, patterns, "in_ball"))]) <= radius
+
+    return constraint
+
+
+def _matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.ndarray:
+    chosen = np.zeros(len(parameters), dtype=bool)
+    for pattern in patterns:
+        hits = np.array([fnmatchcase(name, pattern) for name in parameters.names])
+        if not hits.any():
+            raise InputError(
+                what, f"pattern '{pattern}'", "identified parameters: " + choices(pattern, parameters.names)
+            )
+        chosen |= hits
+    return chosen
+
+
+# --- groups of the penalty ---------------------------------------------------------------------------------
+
+
+def _grouped(parameters: Parameters, key: Callable[[str], str]) -> list[Array]:
+    keys = [key(name) for name in parameters.names]
+    return [np.eye(len(keys))[[i for i, k in enumerate(keys) if k == one]] for one in dict.fromkeys(keys)]
+
+
+def by_link(parameters: Parameters) -> list[Array]:
+    """Group the parameters by link (``alpha3, a3, theta3, d3``) and by frame (``base``, ``tool``)."""
+    return _grouped(
+        parameters, lambda name: re.sub(r"^[a-z_]+?(\d+)$", r"\1", name) if name[-1].isdigit() else name.split("_")[0]
+    )
+
+
+def by_kind(parameters: Parameters) -> list[Array]:
+    """Group the parameters by kind (all ``alpha``, all ``a``, ...)."""
+    return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
+
+
+def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
+    """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
+
+    For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders.
+    """
+
+    def rows(parameters: Parameters) -> list[Array]:
+        chosen, eye = _matching(parameters, patterns, "differences"), np.eye(len(parameters))
+        k = np.flatnonzero(chosen)
+        return [eye[[i]] - eye[[j]] for i, j in zip(k[1:], k[:-1], strict=True)] + [
+            eye[[i]] for i in np.flatnonzero(~chosen)
+        ]
+
+    return rows
