@@ -121,7 +121,7 @@ class ConvexProgram:
 
     @property
     def box(self) -> tuple[Array, Array] | None:
-        """Lower and upper bounds (n,) of z where every constraint is a `Box`, infinite where there is none; else None."""
+        """Lower and upper bounds (n,) of z, infinite where there is none; None where a constraint is no `Box`."""
         return self._posed.box
 
     @property
