@@ -252,10 +252,20 @@ class Calibration:
         step = float(np.linalg.norm(again.z - z) / (1 + np.linalg.norm(z)))
         return Certificate(gradient, step, program.violation(z))
 
+    def _deviations(self) -> Array:
+        """Return standard deviations (n,) [SI]; infinite where the formulation has none (lasso, minimax)."""
+        unknown = np.full(len(self.x), np.inf)
+        if not self.linear_penalty:
+            return unknown
+        try:
+            return np.sqrt(np.diag(self.covariance))
+        except InputError:  # a loss that no squared one stands for
+            return unknown
+
     def parameter_rows(self) -> list[dict[str, Any]]:
         """Return name, unit, nominal, identified, deviation and std of every identified parameter."""
         free, rows = self.problem.parameters.free, []
-        values, std = free.values(self.x), np.sqrt(np.diag(self.covariance))
+        values, std = free.values(self.x), self._deviations()
         for i, name in enumerate(free.names):
             unit, si = display(free.dimensions[i])
             rows.append(

@@ -158,6 +158,9 @@ def test_every_ready_formulation_calibrates(name: str) -> None:
     assert result.converged
     assert 1e3 * result.errors().mean() < 0.12
     assert result.certificate.step < 1e-6
+    known = name not in ("lasso", "group_lasso", "minimax")
+    assert all((row["std"] is not None) == known for row in result.parameter_rows())
+    assert "mm after" in str(result)
     assert result.certificate.violation < 1e-9
 
 
