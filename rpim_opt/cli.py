@@ -143,6 +143,41 @@ def design(
 
 
 @app.command()
+def study(
+    name: Annotated[str, typer.Argument(help="A file of the folder studies, without its ending.")],
+    quick: Annotated[bool, typer.Option(help="The small version.")] = False,
+    workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on where an interrupted run was.")] = False,
+    gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than studies/baselines.json allows.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
+) -> None:
+    """Run a study: replicates in parallel, with the time that is left; the results say what made them.
+
+    Exit codes: 0 done, 1 a metric got worse, 2 unusable input.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from rpim_opt.study import regressions, run_study
+
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name)
+        report, folder = run_study(
+            name, quick, workers, scheduler, resume, out,
+            progress=lambda done, every: bar.update(task, completed=done, total=every),
+        )  # fmt: skip
+    print(report.text)  # noqa: T201
+    print(f"\nWritten: {folder}")  # noqa: T201
+    worse = regressions(name, quick, report.metrics) if gate else []
+    for line in worse:
+        print(f"Worse: {line}", file=sys.stderr)  # noqa: T201
+    if worse:
+        raise typer.Exit(1)
+
+
+@app.command()
 def robots() -> None:
     """List the ready robots that a problem file may name."""
     from rpim_opt.instances import find_robot

@@ -20,3 +20,9 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "")
     stream = StringIO()
     Console(file=stream, width=120, color_system=None, markup=False).print(grid)
     return "\n".join(line.rstrip() for line in stream.getvalue().strip("\n").splitlines() if line.strip())
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table; the first column is aligned left, the others right."""
+    lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,25 +1,21 @@
 """Compare how near the selectors come to the best weight on classic ill-posed problems.
 
-Run: ``python studies/ill_posed.py [--quick]``; writes ``studies/ill_posed.md``. Everything is simulated.
-
-Problems as in P. C. Hansen, Regularization Tools 4.1 (Numerical Algorithms 46:189, 2007), from their published
-formulas, by the midpoint rule; n = 64, white noise of 1e-1 to 1e-4 of the norm of the data. Compared is the error of
-the solution at the chosen weight with the error at the best of 400 weights.
+Everything is simulated. Problems as in P. C. Hansen, Regularization Tools 4.1 (Numerical Algorithms 46:189, 2007), from
+their published formulas, by the midpoint rule; n = 64, white noise of 1e-1 to 1e-4 of the norm of the data. Compared is
+the error of the solution at the chosen weight with the error at the best of 400 weights.
 """
 
 from __future__ import annotations
 
-import sys
-import warnings
-from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
-from rpim_opt.text import table
+from rpim_opt.study import Metric, Report
+from rpim_opt.text import markdown
 
 NOISES = (1e-1, 1e-2, 1e-3, 1e-4)
 SELECTORS = (ro.l_curve, ro.corner, ro.gcv, ro.reml, ro.discrepancy, ro.quasi_optimality, ro.leave_one_out, ro.ncp)
@@ -82,14 +78,20 @@ def heat(n: int) -> tuple[np.ndarray, np.ndarray]:
     return K, x
 
 
-PROBLEMS: tuple[Callable[[int], tuple[np.ndarray, np.ndarray]], ...] = (shaw, phillips, deriv2, baart, gravity, heat)
+PROBLEMS = {make.__name__: make for make in (shaw, phillips, deriv2, baart, gravity, heat)}
+QUESTION = "Which selector comes nearest to the best weight on classic ill-posed problems?"
+METRICS = {f"{name}_median": Metric("lower", 0.1) for name in ("gcv", "discrepancy", "leave_one_out", "l_curve")}
 
 
-def ratios(
-    make: Callable[[int], tuple[np.ndarray, np.ndarray]], noise: float, seed: int, n: int = 64
-) -> dict[str, float]:
-    """Error at the chosen weight over error at the best weight, by selector."""
-    A, x = make(n)
+def cases(quick: bool) -> list[dict[str, Any]]:
+    """Return every problem at every noise level, 100 seeds or 3."""
+    seeds = range(3 if quick else 100)
+    return [{"problem": name, "noise": noise, "seed": seed} for name in PROBLEMS for noise in NOISES for seed in seeds]
+
+
+def run(problem: str, noise: float, seed: int, n: int = 64) -> dict[str, float]:
+    """Return the error at the chosen weight over the error at the best weight, by selector."""
+    A, x = PROBLEMS[problem](n)
     sigma = noise * np.linalg.norm(A @ x) / np.sqrt(n)
     b = A @ x + sigma * np.random.default_rng(seed).normal(size=n)
     size = np.linalg.norm(x) / np.sqrt(n)  # the scale: the root mean square of the solution
@@ -105,47 +107,20 @@ def ratios(
     return {rule.__name__: error(rule(program).weight) / best for rule in SELECTORS}
 
 
-def main(arguments: list[str]) -> None:
-    """Run and write the table."""
-    seeds = 3 if "--quick" in arguments else 100
-    found: dict[str, list[float]] = {rule.__name__: [] for rule in SELECTORS}
-    by_problem: dict[str, dict[str, list[float]]] = {}
-    for make in PROBLEMS:
-        part: dict[str, list[float]] = {rule.__name__: [] for rule in SELECTORS}
-        for noise in NOISES:
-            for seed in range(seeds):
-                for name, ratio in ratios(make, noise, seed).items():
-                    part[name].append(ratio)
-        by_problem[make.__name__] = part
-        for name, values in part.items():
-            found[name] += values
-        print(f"{make.__name__} done", file=sys.stderr)
-    rows, cases = [], len(PROBLEMS) * len(NOISES) * seeds
-    for name, values in found.items():
-        v = np.array(values)
-        each = [f"{np.median(part[name]):.2f}" for part in by_problem.values()]
-        rows.append(
-            [name, f"{np.median(v):.2f}", f"{np.percentile(v, 95):.3g}", f"{100 * np.mean(v > 2):.0f} %", *each]
-        )
-    head = ["selector", "median", "95th percentile", "worse than 2", *by_problem]
-    print(table(head, rows))
-    if "--quick" in arguments:
-        return
-    lines = ["| " + " | ".join(r) + " |" for r in (head, [":--"] + ["--:"] * (len(head) - 1), *rows)]
-    text = [
-        "# Selectors on classic ill-posed problems",
-        "",
-        "Made by `python studies/ill_posed.py`. Error of the solution at the chosen weight over the error at the",
-        f"best weight: median, 95th percentile and share worse than 2 over {cases} simulated cases (6 problems, noise",
-        f"1e-1 to 1e-4, {seeds} seeds each, n = 64); on the right the median by problem. REML assumes white",
-        "deviations, which these smooth solutions are not: it is the default for robots, not for them.",
-        "",
-        *lines,
-        "",
-    ]
-    (Path(__file__).parent / "ill_posed.md").write_text("\n".join(text), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    warnings.simplefilter("error")
-    main(sys.argv[1:])
+def report(rows: list[dict[str, Any]]) -> Report:
+    """Return median, 95th percentile and share worse than 2, and the medians by problem."""
+    lines, metrics = [], {}
+    for rule in SELECTORS:
+        name = rule.__name__
+        v = np.array([row[name] for row in rows])
+        each = [np.median([row[name] for row in rows if row["problem"] == problem]) for problem in PROBLEMS]
+        metrics[f"{name}_median"] = float(np.median(v))
+        figures = [f"{np.median(v):.2f}", f"{np.percentile(v, 95):.3g}", f"{100 * np.mean(v > 2):.0f} %"]
+        lines.append([name, *figures, *(f"{e:.2f}" for e in each)])
+    text = (
+        f"Error of the solution at the chosen weight over the error at the best weight, {len(rows)} cases (6 simulated "
+        "problems, noise 1e-1 to 1e-4, n = 64); on the right the median by problem. REML assumes white deviations, which "
+        "these smooth solutions are not: it is the default for robots, not for them.\n\n"
+    )
+    head = ["selector", "median", "95th percentile", "worse than 2", *PROBLEMS]
+    return Report(text + markdown(head, lines), metrics)

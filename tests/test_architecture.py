@@ -39,6 +39,7 @@ ORDER = {
     "inspection": set(),
     "instances": {"pydantic", "cvxpy"},
     "simulation": {"pydantic"},
+    "study": {"distributed", "joblib", "pyarrow"},
     "cli": {"typer", "rich"},
 }
 

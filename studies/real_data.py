@@ -1,0 +1,56 @@
+"""Calibrate every set of ../shared/data that is at hand, on its fixed split and with few configurations.
+
+The sets stay where they are; without them there is nothing to report. Weights by REML on the identification rows.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rpim_opt as ro
+from rpim_opt.study import Metric, Report
+from rpim_opt.text import markdown
+
+QUESTION = "How accurate is a calibration on real measurements, with all configurations and with ten?"
+FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
+METRICS = {"rms_over_least_squares": Metric("lower", 0.02)}
+
+
+def cases(quick: bool) -> list[dict[str, Any]]:
+    """Return every set with all its configurations, and with ten or twenty drawn at random."""
+    sets = sorted(p.name for p in FOLDER.iterdir() if (p / "problem.toml").is_file()) if FOLDER.is_dir() else []
+    whole = [{"name": name, "count": 0, "seed": 0} for name in sets]
+    counts, seeds = ((10,), range(2)) if quick else ((10, 20), range(10))
+    return whole + [{"name": n, "count": c, "seed": s} for n in sets for c in counts for s in seeds]
+
+
+def run(name: str, count: int, seed: int) -> dict[str, float]:
+    """Return the root mean square error on the validation rows [mm]."""
+    instance = ro.load(FOLDER / name)
+    problem, validation = instance.problem, instance.validation
+    if count:
+        problem = problem.on(problem.data.configurations(count, seed))
+    found = {}
+    for method, weight in (("rpim-opt", instance.weight), ("least squares", 1e-6)):
+        result = ro.calibrate(problem, ro.tikhonov, weight)
+        found[method] = 1e3 * float(np.sqrt(np.mean(result.errors(validation) ** 2)))
+        found["nominal"] = 1e3 * float(np.sqrt(np.mean(result.nominal_errors(validation) ** 2)))
+    return found
+
+
+def report(rows: list[dict[str, Any]]) -> Report:
+    """Return the errors by set and number of configurations."""
+    if not rows:
+        return Report("The measurements of ../shared/data are not here.", {})
+    lines, ratios = [], []
+    for name, count in dict.fromkeys((row["name"], row["count"]) for row in rows):
+        part = [row for row in rows if (row["name"], row["count"]) == (name, count)]
+        figures = [float(np.mean([row[m] for row in part])) for m in ("nominal", "least squares", "rpim-opt")]
+        ratios.append(figures[2] / figures[1])
+        lines.append([name, str(count) if count else "all", str(len(part)), *(f"{f:.3f}" for f in figures)])
+    text = "Root mean square error on the validation rows [mm], mean over random draws of configurations.\n\n"
+    head = ["set", "configurations", "draws", "nominal, frames fitted", "least squares", "rpim-opt"]
+    return Report(text + markdown(head, lines), {"rms_over_least_squares": float(np.exp(np.mean(np.log(ratios))))})

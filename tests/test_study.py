@@ -1,0 +1,131 @@
+"""Studies: the same results whoever computes them, resumed where they were, gated against a baseline."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import rpim_opt as ro
+from rpim_opt import study
+from tests.test_cli import run
+
+TOY = """
+from rpim_opt.study import Metric, Report
+import numpy as np
+
+QUESTION = "Do random numbers have a mean?"
+METRICS = {"mean": Metric("lower", 0.1)}
+
+
+def cases(quick):
+    return [{"seed": seed} for seed in range(4 if quick else 12)]
+
+
+def run(seed):
+    if LOG:
+        with open(LOG, "a") as stream:
+            stream.write(f"{seed}\\n")
+    if STOP and seed == 3:
+        raise KeyboardInterrupt
+    return {"value": float(np.random.default_rng(seed).uniform())}
+
+
+def report(rows):
+    return Report(f"{len(rows)} numbers", {"mean": float(np.mean([row["value"] for row in rows]))})
+"""
+
+
+@pytest.fixture
+def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "studies"
+    folder.mkdir()
+    monkeypatch.setattr(study, "studies_folder", lambda: folder)
+
+    def write(stop: bool = False) -> Path:
+        study.load_study.cache_clear()
+        log = str(folder / "log.txt")
+        (folder / "toy.py").write_text(TOY.replace("QUESTION", f"LOG, STOP = {log!r}, {stop}\nQUESTION", 1))
+        return folder
+
+    return write
+
+
+def values(folder: Path) -> list[float]:
+    from pyarrow import parquet
+
+    return parquet.read_table(folder / "replicates.parquet").column("value").to_pylist()
+
+
+def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
+    toy()
+    counts = []
+    one, _ = study.run_study("toy", out=tmp_path / "one", progress=lambda done, every: counts.append((done, every)))
+    two, _ = study.run_study("toy", workers=2, out=tmp_path / "two")
+    assert values(tmp_path / "one") == values(tmp_path / "two")
+    assert one.metrics == two.metrics
+    assert counts == [(k, 12) for k in range(13)]
+    assert json.loads((tmp_path / "one" / "metrics.json").read_text()) == one.metrics
+    text = (tmp_path / "one" / "README.md").read_text()
+    assert text.startswith("# Do random numbers have a mean?\n")
+    for part in ("rpim-opt study toy`", "12 replicates", "numpy", "clarabel", "commit"):
+        assert part in text
+
+
+def test_a_dask_cluster_gives_the_same(toy, tmp_path: Path) -> None:
+    import warnings
+
+    toy()
+    here, _ = study.run_study("toy", out=tmp_path / "here")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
+        from distributed import LocalCluster
+
+        with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+            there, _ = study.run_study("toy", scheduler=cluster.scheduler_address, out=tmp_path / "there")
+    assert there.metrics == here.metrics
+    assert values(tmp_path / "here") == values(tmp_path / "there")
+
+
+def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
+    folder, out = toy(stop=True), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        study.run_study("toy", out=out)
+    journal = out / "replicates.jsonl"
+    assert len(journal.read_text().splitlines()) == 3
+    with journal.open("a") as stream:
+        stream.write('{"case": {"seed": 5}, "fou')  # cut off while it was written
+    toy(stop=False)
+    (folder / "log.txt").unlink()
+    resumed, _ = study.run_study("toy", out=out, resume=True)
+    assert (folder / "log.txt").read_text().split() == [str(k) for k in range(3, 12)]
+    assert not journal.exists()
+    fresh, _ = study.run_study("toy", out=tmp_path / "fresh")
+    assert resumed.metrics == fresh.metrics
+
+
+def test_the_gate(toy, tmp_path: Path) -> None:
+    folder = toy()
+    mean = study.run_study("toy", quick=True, out=tmp_path / "out")[0].metrics["mean"]
+    with pytest.raises(ro.InputError, match="baseline: found none for 'toy-quick'"):
+        study.regressions("toy", True, {"mean": mean})
+    (folder / "baselines.json").write_text(json.dumps({"toy-quick": {"mean": mean}}))
+    assert study.regressions("toy", True, {"mean": 1.09 * mean}) == []
+    assert "lower is better, tolerance 10%" in study.regressions("toy", True, {"mean": 1.11 * mean})[0]
+    assert study.regressions("toy", True, {})
+    assert study.regressions("toy", True, {"mean": float("nan")})
+
+
+def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
+    folder = toy()
+    assert run(monkeypatch, "study", "toy", "--quick", "--out", str(tmp_path / "out")) == 0
+    assert "4 numbers" in capsys.readouterr().out
+    (folder / "baselines.json").write_text(json.dumps({"toy-quick": {"mean": 1e-9}}))
+    assert run(monkeypatch, "study", "toy", "--quick", "--gate", "--out", str(tmp_path / "out")) == 1
+    assert "Worse: mean: found" in capsys.readouterr().err
+    assert run(monkeypatch, "study", "tay") == 2
+    assert "did you mean toy?" in capsys.readouterr().err
+    (folder / "broken.py").write_text("QUESTION = 1\n")
+    assert run(monkeypatch, "study", "broken") == 2
+    assert "no 'METRICS'" in capsys.readouterr().err
