@@ -118,9 +118,9 @@ def report(rows: list[dict[str, Any]]) -> Report:
         figures = [f"{np.median(v):.2f}", f"{np.percentile(v, 95):.3g}", f"{100 * np.mean(v > 2):.0f} %"]
         lines.append([name, *figures, *(f"{e:.2f}" for e in each)])
     text = (
-        f"Error of the solution at the chosen weight over the error at the best weight, {len(rows)} cases (6 simulated "
-        "problems, noise 1e-1 to 1e-4, n = 64); on the right the median by problem. REML assumes white deviations, which "
-        "these smooth solutions are not: it is the default for robots, not for them.\n\n"
+        f"Error of the solution at the chosen weight over the error at the best weight, {len(rows)} simulated cases of "
+        "6 problems, noise 1e-1 to 1e-4, n = 64; on the right the median by problem. REML assumes white deviations, "
+        "which these smooth solutions are not: it is the default for robots, not for them.\n\n"
     )
     head = ["selector", "median", "95th percentile", "worse than 2", *PROBLEMS]
     return Report(text + markdown(head, lines), metrics)
