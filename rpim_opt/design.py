@@ -53,10 +53,10 @@ class Design:
     def __str__(self) -> str:
         """Return the choice in a sentence."""
         names = {"D": "det^(1/n)", "A": "mean variance", "E": "least information", "V": "predicted variance"}
-        return (
-            f"{len(self.chosen)} of {len(self.weights)} configurations, {self.criterion}-optimal "
-            f"({names[self.criterion]}): no other set is more than {100 * self.gap:.2f} % better."
-        )
+        what = f"{len(self.chosen)} of {len(self.weights)} configurations, {self.criterion}-optimal ({names[self.criterion]})"
+        if self.gap > 1:
+            return f"{what}: too few for a useful bound on how near the best set is; choose more."
+        return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
 
 
 def random_candidates(robot: Robot, count: int, seed: int = 0, share: float = 1.0) -> Array:

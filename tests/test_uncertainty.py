@@ -84,6 +84,7 @@ def test_a_design_is_near_the_best_and_better_than_chance(criterion: str) -> Non
     assert found.weights.sum() == pytest.approx(40)
     assert (found.bound >= found.value) == (criterion in "DE")
     assert f"{criterion}-optimal" in str(found)
+    assert "no other set is more than" in str(found)
 
 
 def test_a_designed_set_predicts_better_than_the_best_of_two_hundred_random_ones() -> None:
