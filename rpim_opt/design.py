@@ -53,7 +53,8 @@ class Design:
     def __str__(self) -> str:
         """Return the choice in a sentence."""
         names = {"D": "det^(1/n)", "A": "mean variance", "E": "least information", "V": "predicted variance"}
-        what = f"{len(self.chosen)} of {len(self.weights)} configurations, {self.criterion}-optimal ({names[self.criterion]})"
+        count = f"{len(self.chosen)} of {len(self.weights)} configurations"
+        what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
         if self.gap > 1:
             return f"{what}: too few for a useful bound on how near the best set is; choose more."
         return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
