@@ -1,8 +1,8 @@
 """Compare selectors on simulated robots: right and wrong priors, few configurations, noise larger than declared.
 
-Simulated: the paper's arm, deviations of 0.3 mm and 1 mrad (reflector 0.5 mm), joints within 120 degrees, 0.03 mm noise.
-The weight is chosen on one linearization at nominal; its error on unseen configurations is compared with that at the
-best of 60 weights, which only a simulation knows.
+Simulated: the paper's arm, deviations of 0.3 mm and 1 mrad (reflector 0.5 mm), joints within 120 degrees, 0.03 mm
+noise. The weight is chosen on one linearization at nominal; its error on unseen configurations is compared with that at
+the best of 60 weights, which only a simulation knows.
 """
 
 from __future__ import annotations
