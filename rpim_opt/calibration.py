@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError, NoSolutionFound
-from rpim_opt.formulation import FEASIBLE, ConvexProgram, Formulation, outlying, tikhonov
+from rpim_opt.formulation import FEASIBLE, ConvexProgram, Estimate, Formulation, outlying, tikhonov
 from rpim_opt.frames import relocated
 from rpim_opt.problem import CalibrationProblem, LinearModel
 from rpim_opt.robot import MDH, Array, Robot
@@ -208,6 +208,11 @@ class Calibration:
         return float(np.sum(s[s > 0] ** 2 / (s[s > 0] ** 2 + self.penalty_weight)))
 
     @cached_property
+    def _again(self) -> Estimate:
+        """The solution of the convex program at the end, solved once more."""
+        return self.program.solve(self.weight)
+
+    @cached_property
     def held(self) -> tuple[Held, ...]:
         """What the tolerances cost: the parameters that a bound holds back, the costliest first.
 
@@ -219,7 +224,7 @@ class Calibration:
         if box is None or not self.formulation.constraints:
             return ()
         z, parameters = self.x / self.problem.parameters.free.scale, self.problem.parameters.free
-        multiplier = np.sum(self.program.solve(self.weight).duals, axis=0)
+        multiplier = np.sum(self._again.duals, axis=0)
         loss, rows, found = self.program.value(z)[0], len(self.program.model.b), []
         near = np.minimum(z - box[0], box[1] - z) < 1e-6 * (1 + np.abs(z))
         for i in np.flatnonzero((multiplier > 1e-6 * loss / rows) & near & (box[0] < box[1])):
@@ -238,18 +243,17 @@ class Calibration:
         convex program at the solution would still go; ``violation`` by how much the constraints are missed.
         """
         z, program = self.x / self.problem.parameters.free.scale, self.program
-        again = program.solve(self.weight)
         gradient = None
         if program.squared and program.box is not None:
             model = program.model
-            g = 2 * (model.A.T @ (model.A @ z - model.b) + (self.weight if self.formulation.penalty else 0.0) * z)
+            g = 2 * (model.A.T @ (model.A @ z - model.b) + self.penalty_weight * z)
             box = program.box
             if self.formulation.constraints:
                 at_low, at_high = z <= box[0] + 1e-9, z >= box[1] - 1e-9
                 g = np.where((at_low & (g > 0)) | (at_high & (g < 0)), 0.0, g)
             start = self.problem.linearize(np.zeros_like(self.x))
             gradient = float(np.linalg.norm(g) / max(float(np.linalg.norm(2 * start.A.T @ start.b)), 1e-300))
-        step = float(np.linalg.norm(again.z - z) / (1 + np.linalg.norm(z)))
+        step = float(np.linalg.norm(self._again.z - z) / (1 + np.linalg.norm(z)))
         return Certificate(gradient, step, program.violation(z))
 
     def _deviations(self) -> Array:

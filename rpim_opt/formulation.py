@@ -172,7 +172,9 @@ class ConvexProgram:
         weight = self._weight(weight)
         posed, box = self._posed, self._posed.box
         if centre is not None and np.isfinite(radius):
-            posed = self._trust.setdefault("posed", _Posed(self.formulation, self.model, trusted=True))
+            if "posed" not in self._trust:
+                self._trust["posed"] = _Posed(self.formulation, self.model, trusted=True)
+            posed = self._trust["posed"]
             posed.centred(centre, radius)
             if box is not None:
                 box = np.maximum(box[0], centre - radius), np.minimum(box[1], centre + radius)

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from rpim_opt.dataset import Block, Dataset
+from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError
 from rpim_opt.kinematics import FRAME, forward_kinematics, numeric_frame, roll_pitch_yaw
 from rpim_opt.measurement import of_fixture
-from rpim_opt.parameters import Parameters, model_parameters
+from rpim_opt.parameters import Parameters, model_parameters, tool_prefix
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
 
@@ -158,9 +159,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
     for block in seen:
         flange, marker = forward_kinematics(robot, block.q[:, 0]), block.markers[0]
         if block.measurement.name == "pose":
-            measured = np.array([numeric_pose(y) for y in block.y])
             try:
-                base, tool = hand_eye(flange, measured, places[marker][:3])
+                base, tool = hand_eye(flange, _transforms(block.y), places[marker][:3])
             except InputError:
                 pass  # too few turns: positions and the stated tool have to do
             else:
@@ -170,28 +170,17 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
             places[marker][:3] = tool_from_distances(flange, block.y[:, :3], places[marker][:3], TOOL_ERROR)
         source.append(flange[:, :3, :3] @ places[marker][:3] + flange[:, :3, 3])
         target.append(block.y[:, :3])
-        weight.append(
-            1
-            / np.trace(
-                np.broadcast_to(block.covariance, (len(flange), *block.covariance.shape[1:]))[:, :3, :3],
-                axis1=1,
-                axis2=2,
-            )
-        )
+        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
+        weight.append(1 / np.broadcast_to(variance, len(flange)))
     q = np.concatenate(weight)
     return _six(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
 
 
-def numeric_pose(y: Array) -> Array:
-    """Return the transform (4, 4) of a measured pose: x, y, z [m] and unit quaternion, w first."""
-    w, x, y_, z = y[3:]
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y_ * y_ + z * z), 2 * (x * y_ - w * z), 2 * (x * z + w * y_)],
-        [2 * (x * y_ + w * z), 1 - 2 * (x * x + z * z), 2 * (y_ * z - w * x)],
-        [2 * (x * z - w * y_), 2 * (y_ * z + w * x), 1 - 2 * (x * x + y_ * y_)],
-    ]
-    T[:3, 3] = y[:3]
+def _transforms(y: Array) -> Array:
+    """Return the transforms (N, 4, 4) of measured poses (N, 7): x, y, z [m] and unit quaternion, w first."""
+    T = np.tile(np.eye(4), (len(y), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
+    T[:, :3, 3] = y[:, :3]
     return T
 
 
@@ -260,13 +249,13 @@ def relocated(problem: CalibrationProblem) -> CalibrationProblem | None:
     if not p.identified[at["base_"]].all():
         return None
     for block in problem.data.blocks:
-        at[_prefix(block)] = [index[_prefix(block) + c] for c in FRAME]
-    tools = {b.markers[0]: p.nominal[at[_prefix(b)]] for b in problem.data.blocks}
+        at[tool_prefix(block.markers[0])] = [index[tool_prefix(block.markers[0]) + c] for c in FRAME]
+    tools = {b.markers[0]: p.nominal[at[tool_prefix(b.markers[0])]] for b in problem.data.blocks}
     try:
         base, places = locate(problem.robot, problem.data, tools)
     except InputError:
         return None
-    found = {"base_": base} | {_prefix(b): places[b.markers[0]] for b in problem.data.blocks}
+    found = {"base_": base} | {tool_prefix(b.markers[0]): places[b.markers[0]] for b in problem.data.blocks}
     nominal, moved = p.nominal.copy(), False
     for prefix, place in found.items():
         k = np.array(at[prefix])
@@ -277,10 +266,6 @@ def relocated(problem: CalibrationProblem) -> CalibrationProblem | None:
         if (far & free).any():
             nominal[k[free]], moved = place[free], True
     return replace(problem, parameters=replace(p, nominal=nominal)) if moved else None
-
-
-def _prefix(block: Block) -> str:
-    return f"tool_{block.markers[0]}_" if block.markers[0] else "tool_"
 
 
 def _deviation(place: Place, nominal: Array) -> Array:

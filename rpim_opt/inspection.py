@@ -14,7 +14,7 @@ from rpim_opt.formulation import tikhonov
 from rpim_opt.frames import locate
 from rpim_opt.kinematics import FRAME
 from rpim_opt.observability import Observability, combination, near_parallel, observe
-from rpim_opt.parameters import Parameters
+from rpim_opt.parameters import tool_prefix
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array
 from rpim_opt.text import table
@@ -279,7 +279,7 @@ def _fitted(problem: CalibrationProblem, data: Dataset) -> float:
         return float("inf")
     p = problem.parameters
     index = {name: i for i, name in enumerate(p.names)}
-    prefix = {b.markers[0]: f"tool_{b.markers[0]}_" if b.markers[0] else "tool_" for b in blocks}
+    prefix = {b.markers[0]: tool_prefix(b.markers[0]) for b in blocks}
     tools = {m: [p.nominal[index[pre + c]] for c in FRAME] for m, pre in prefix.items()}
     part = Dataset(tuple(blocks), data.label, data.configuration)
     try:
@@ -290,7 +290,7 @@ def _fitted(problem: CalibrationProblem, data: Dataset) -> float:
     nominal[[index[f"base_{c}"] for c in FRAME]] = base
     for m, pre in prefix.items():
         nominal[[index[pre + c] for c in FRAME]] = places[m]
-    moved = Parameters(p.names, p.dimensions, nominal, p.scale, p.tolerance, p.identified)
+    moved = replace(p, nominal=nominal)
     errors = CalibrationProblem(problem.robot, moved, part).errors(np.zeros(len(p.free)))
     points = np.concatenate([b.y[:, :3] for b in blocks])
     extent = np.linalg.norm(points.std(axis=0))

@@ -8,6 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rpim_opt.exceptions import InputError
 from rpim_opt.kinematics import FRAME_DIMENSION, roll_pitch_yaw
@@ -129,11 +130,12 @@ def rotation_between(p: Any, q: Any) -> Any:
 
 def _turned(y: Array, e: Array) -> Array:
     """Move poses (N, 7) by e (N, 6), the positions and then the rotations about the instrument's axes."""
-    angle = np.linalg.norm(e[:, 3:], axis=1)[:, None]
-    p = np.hstack([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * e[:, 3:]])
-    w, v, q, u = p[:, :1], p[:, 1:], y[:, 3:4], y[:, 4:]
-    turned = np.hstack([w * q - np.sum(v * u, axis=1, keepdims=True), w * u + q * v + np.cross(v, u)])
-    return np.hstack([y[:, :3] + e[:, :3], turned])
+    turned = Rotation.from_rotvec(e[:, 3:]) * Rotation.from_quat(y[:, [4, 5, 6, 3]])
+    return np.hstack([y[:, :3] + e[:, :3], _w_first(turned)])
+
+
+def _w_first(rotation: Rotation) -> Array:
+    return rotation.as_quat()[:, [3, 0, 1, 2]]
 
 
 def _unit_quaternions(y: Array) -> Array:
@@ -145,10 +147,7 @@ def _unit_quaternions(y: Array) -> Array:
 
 
 def _from_angles(y: Array) -> Array:
-    half = y[:, 3:] / 2
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half).T, np.sin(half).T
-    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
-    return np.column_stack([y[:, :3], w, x, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy])
+    return np.hstack([y[:, :3], _w_first(Rotation.from_euler("xyz", y[:, 3:]))])
 
 
 def _from_matrices(y: Array) -> Array:
@@ -158,10 +157,7 @@ def _from_matrices(y: Array) -> Array:
     if len(wrong):
         found = f"a matrix that misses R R' = 1 by {off[wrong[0]]:.2g}, determinant {np.linalg.det(R[wrong[0]]):.3g}"
         raise InputError(str(wrong[0]), found, "a rotation within 0.001, determinant 1")
-    M = ca.SX.sym("R", 3, 3)
-    function = ca.Function("quaternion", [M], [quaternion(M)])
-    q = [function(matrix).full().ravel() for matrix in R]
-    return np.hstack([y[:, :3], q])
+    return np.hstack([y[:, :3], _w_first(Rotation.from_matrix(R))])
 
 
 # --- closed-form starts ------------------------------------------------------------------------------------

@@ -166,6 +166,11 @@ def group_of(name: str, dimension: str) -> str:
     return dimension if _ON_THE_ROBOT.fullmatch(name) else "base"
 
 
+def tool_prefix(marker: str) -> str:
+    """Return the prefix of a reflector's parameters: ``tool_``, or ``tool_A_`` for marker A."""
+    return f"tool_{marker}_" if marker else "tool_"
+
+
 def model_parameters(
     robot: Robot,
     base: Sequence[float] | Array = (0.0,) * 6,
@@ -193,7 +198,7 @@ def model_parameters(
         entries += [(f"{extra}{i}", dimension, 0.0) for extra, dimension in extras.items()]
     places: dict[str, Sequence[float] | Array] = {"base_": base}
     for marker, tool in (tools or {"": (0.0,) * 6}).items():
-        places[f"tool_{marker}_" if marker else "tool_"] = tool
+        places[tool_prefix(marker)] = tool
     for prefix, place in places.items():
         entries += [(prefix + c, FRAME_DIMENSION[c], v) for c, v in zip(FRAME_DIMENSION, place, strict=True)]
     entries += [(name, dimension, value) for name, (dimension, value) in (own or {}).items()]

@@ -12,7 +12,7 @@ from rpim_opt.dataset import Block, Dataset
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.kinematics import FRAME, call_rows, chain, frame
 from rpim_opt.measurement import Measurement, of_fixture
-from rpim_opt.parameters import Parameters
+from rpim_opt.parameters import Parameters, tool_prefix
 from rpim_opt.robot import Array, Robot
 
 RANK_TOLERANCE = 1e-10
@@ -103,7 +103,7 @@ class CalibrationProblem:
             if block.q.shape[2] != self.robot.dof:
                 raise InputError("q", f"{block.q.shape[2]} columns", f"{self.robot.dof}, one a joint")
             for marker in block.markers:
-                if _tool(marker) + "x" not in p.names:
+                if tool_prefix(marker) + "x" not in p.names:
                     known = sorted({n.split("_")[1] for n in p.names if n.startswith("tool_") and n.count("_") == 2})
                     raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
             for name in block.measurement.parameters:
@@ -204,11 +204,6 @@ class CalibrationProblem:
         return rows
 
 
-def _tool(marker: str) -> str:
-    """Return the prefix of a reflector's parameters."""
-    return f"tool_{marker}_" if marker else "tool_"
-
-
 @lru_cache(maxsize=256)
 def _functions(
     joint_types: tuple[str, ...],
@@ -241,7 +236,7 @@ def _functions(
     def reflector(point: int, marker: str) -> ca.SX:
         at = slice(point * dof, (point + 1) * dof)
         torque = ca.vertsplit(tau[at]) if torques else (0,) * dof
-        return place("base_") @ chain(joint_types, ca.vertsplit(q[at]), torque, value) @ place(_tool(marker))
+        return place("base_") @ chain(joint_types, ca.vertsplit(q[at]), torque, value) @ place(tool_prefix(marker))
 
     transforms = [reflector(point, marker) for point, marker in enumerate(markers)]
     own: dict[str, ca.SX] = {name: place(of_fixture(name + "_", fixture)) for name in measurement.frames}

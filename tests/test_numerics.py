@@ -75,10 +75,10 @@ def test_the_discrepancy_is_the_declared_noise() -> None:
     assert "too small" in ro.discrepancy(program).note
     program = tikhonov_program(noise=4.9e-5, seed=4)
     chosen = ro.discrepancy(program)
-    if chosen.interior:
-        e, s = program.path([chosen.weight])[0], program.model.svd[1]
-        dof = np.sum(s**2 / (s**2 + chosen.weight))
-        assert e.loss == pytest.approx(1.1**2 * (len(program.model.b) - dof), rel=1e-3)
+    assert chosen.interior
+    e, s = program.path([chosen.weight])[0], program.model.svd[1]
+    dof = np.sum(s**2 / (s**2 + chosen.weight))
+    assert e.loss == pytest.approx(1.1**2 * (len(program.model.b) - dof), rel=1e-3)
 
 
 def test_the_corner_without_a_grid_is_the_corner() -> None:
