@@ -48,7 +48,10 @@ def studies_folder() -> Path:
 
 @lru_cache(maxsize=8)
 def load_study(path: Path) -> ModuleType:
-    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case) and report(rows)."""
+    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case), report(rows).
+
+    If it has prepare(quick), that is called once before the first case.
+    """
     spec = importlib.util.spec_from_file_location(f"study_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise InputError("the study", str(path), "a Python file")
@@ -109,6 +112,8 @@ def run_study(
     folder = out or path.parent / "results" / (f"{name}-quick" if quick else name)
     folder.mkdir(parents=True, exist_ok=True)
     journal = folder / "replicates.jsonl"
+    if hasattr(study, "prepare"):
+        study.prepare(quick)
     cases = study.cases(quick)
     keys = [json.dumps(case, sort_keys=True) for case in cases]
     done = _finished(journal, set(keys)) if resume else {}

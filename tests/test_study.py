@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rpim_opt as ro
@@ -129,3 +130,29 @@ def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
     (folder / "broken.py").write_text("QUESTION = 1\n")
     assert run(monkeypatch, "study", "broken") == 2
     assert "no 'METRICS'" in capsys.readouterr().err
+
+
+BENCH = Path(__file__).parents[2] / "shared" / "bench"
+
+
+@pytest.mark.skipif(not BENCH.is_dir(), reason="the peers' benchmark ../shared/bench is not here")
+@pytest.mark.parametrize("situation", ["clean52", "few10", "blunders52"])
+def test_peers_study_draws_the_shared_benchmark(situation: str, tmp_path: Path):
+    peers = study.load_study(study.find_study("peers"))
+    peers.write_problem(tmp_path, situation, 0)
+    for name in ("calib", "valid"):
+        ours, theirs = (folder / f"{name}.csv" for folder in (tmp_path, BENCH / situation))
+        assert ours.read_text().splitlines()[0] == theirs.read_text().splitlines()[0]
+        rows = [np.loadtxt(path, delimiter=",", skiprows=1) for path in (ours, theirs)]
+        np.testing.assert_allclose(*rows, rtol=0, atol=1.5e-9)  # nine decimals, the last one rounded
+
+
+def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
+    folder = toy()
+    path = folder / "toy.py"
+    path.write_text(
+        path.read_text()
+        + f"\n\ndef prepare(quick):\n    with open({str(tmp_path / 'p')!r}, 'a') as f:\n        f.write('x')\n"
+    )
+    study.run_study("toy", quick=True, out=tmp_path / "out")
+    assert (tmp_path / "p").read_text() == "x"
