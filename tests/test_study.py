@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +78,6 @@ def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
 
 
 def test_a_dask_cluster_gives_the_same(toy, tmp_path: Path) -> None:
-    import warnings
 
     toy()
     here, _ = study.run_study("toy", out=tmp_path / "here")
@@ -156,3 +158,56 @@ def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
     )
     study.run_study("toy", quick=True, out=tmp_path / "out")
     assert (tmp_path / "p").read_text() == "x"
+
+
+MONTE_CARLO = """
+import numpy as np
+import rpim_opt as ro
+from rpim_opt.study import Metric, Report
+
+QUESTION = "How do 1000 calibrations of the paper's arm scatter?"
+METRICS = {"mean": Metric("lower", 0.0)}
+
+
+def cases(quick):
+    return [{"seed": seed} for seed in range(1000)]
+
+
+def run(seed):
+    instance = ro.load("paper_arm")
+    data = instance.problem.data
+    y = data.blocks[0].y + 3e-5 * np.random.default_rng(seed).normal(size=data.blocks[0].y.shape)
+    result = ro.calibrate(instance.problem.on(ro.Dataset.of(data.q, y, 3e-5)), ro.tikhonov, ro.reml)
+    return {"value": float(1e3 * result.errors(instance.validation).mean())}
+
+
+def report(rows):
+    return Report(f"{len(rows)} calibrations", {"mean": float(np.mean([row["value"] for row in rows]))})
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "studies_folder", lambda: tmp_path)
+    (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
+    here, _ = study.run_study("monte_carlo", out=tmp_path / "here")
+    killed: list[int] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports, event loops and the worker that dies
+        from distributed import Client, LocalCluster
+
+        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+            with Client(cluster) as client:
+                workers = list(client.run(os.getpid).values())
+
+            def progress(done: int, of: int) -> None:
+                if done == 300:
+                    os.kill(workers[0], signal.SIGKILL)
+                    killed.append(done)
+
+            address = cluster.scheduler_address
+            there, _ = study.run_study("monte_carlo", scheduler=address, out=tmp_path / "there", progress=progress)
+    assert killed == [300]
+    assert values(tmp_path / "there") == values(tmp_path / "here")
+    assert len(values(tmp_path / "there")) == 1000
+    assert there.metrics == here.metrics
