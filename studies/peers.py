@@ -248,6 +248,7 @@ def report(rows: list[dict[str, Any]]) -> Report:
 
 def _figure(found: dict[str, dict]) -> Any:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     names = list(dict.fromkeys(key for by in found.values() for key in by))[::-1]
     figure = Figure(figsize=(9, 0.3 * len(names) + 1.2), layout="constrained")
@@ -258,7 +259,10 @@ def _figure(found: dict[str, dict]) -> Any:
             color = "C3" if key[0] == "rpim_opt" else "C0"
             ax.semilogx(values, [y] * len(values), "o", ms=3, alpha=0.35, color=color, mew=0)
             ax.semilogx([np.mean(values)] if values else [], [y] if values else [], "|", ms=11, mew=2, color=color)
-        ax.set_title(situation, fontsize=10)
+        ax.set_title({"clean52": "52 clean", "few10": "ten", "blunders52": "52, four wrong"}[situation], fontsize=10)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.xaxis.set_major_formatter(ScalarFormatter())
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlabel("RMS position error [mm]")
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(range(len(names)), [f"{tool}, {method}" for tool, method in names], fontsize=8)
