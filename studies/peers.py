@@ -264,6 +264,7 @@ def _figure(found: dict[str, dict]) -> Any:
         ax.xaxis.set_major_formatter(ScalarFormatter())
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlabel("RMS position error [mm]")
+        ax.tick_params(axis="x", labelsize=7)
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(range(len(names)), [f"{tool}, {method}" for tool, method in names], fontsize=8)
     return figure

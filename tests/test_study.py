@@ -211,3 +211,16 @@ def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeyp
     assert values(tmp_path / "there") == values(tmp_path / "here")
     assert len(values(tmp_path / "there")) == 1000
     assert there.metrics == here.metrics
+
+
+def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
+    folder, out = toy(), tmp_path / "out"
+    report, _ = study.run_study("toy", out=out)
+    before = (out / "README.md").read_text()
+    (folder / "log.txt").unlink()
+    again, _ = study.run_study("toy", out=out, redraw=True)
+    assert again.metrics == report.metrics
+    assert (out / "README.md").read_text() == before
+    assert not (folder / "log.txt").exists()  # nothing was computed
+    with pytest.raises(ro.InputError, match="no replicates"):
+        study.run_study("toy", out=tmp_path / "empty", redraw=True)
