@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -58,6 +59,11 @@ class Chain:
     origins: Array
     axes: Array
     tail: Array
+
+    @classmethod
+    def about_z(cls, origins: Sequence[Array], tail: Array) -> Chain:
+        """Return a chain whose axes are all z."""
+        return cls(np.array(origins), np.tile([0.0, 0.0, 1.0], (len(origins), 1)), tail)
 
 
 def identified(result: Calibration, marker: str = "") -> Described:
@@ -127,7 +133,7 @@ def describe(
         C = np.linalg.inv(step) @ C @ link_of(theta=theta, d=d, beta=beta) @ link_of(alpha=alpha, a=a)
     table[-1, 2:4] = _turned(-np.arctan2(C[1, 0], C[0, 0]), near[-1, 2]), -C[2, 3]
     G[-1] = turns[-1].T
-    return table, base, turns[-1].T @ chain.tail, G
+    return table + 0.0, base, turns[-1].T @ chain.tail, G
 
 
 def corrected(G: Array, table: Array, base: Array, tool: Array) -> Chain:
@@ -142,7 +148,7 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> Chain:
     """
     before = [base, *(np.linalg.inv(g) @ link_of(beta=row[4]) for g, row in zip(G, table, strict=True))]
     origins = [b @ link_of(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
-    return Chain(np.array(origins), np.tile([0.0, 0.0, 1.0], (len(G), 1)), before[-1] @ tool)
+    return Chain.about_z(origins, before[-1] @ tool)
 
 
 def without_beta(robot: Robot) -> Robot:
@@ -162,7 +168,7 @@ def without_beta(robot: Robot) -> Robot:
     before = [np.eye(4), *(link_of(beta=row[4]) for row in table[:-1])]
     origins = [b @ link_of(*row[:4]) for b, row in zip(before, table, strict=True)]
     origins[0] = link_of(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
-    plain = describe(Chain(np.array(origins), np.tile([0.0, 0.0, 1.0], (n, 1)), np.eye(4)), table, 1e-10)[0]
+    plain = describe(Chain.about_z(origins, np.eye(4)), table, 1e-10)[0]
     plain[0, :2], plain[:, 4] = table[0, :2], 0.0
     result = replace(robot, mdh=plain)
     q = np.random.default_rng(0).uniform(-1, 1, (20, n))

@@ -119,7 +119,9 @@ class _Joint:
             at = _tag_end(data, self.element.start)
             text = "".join(f' {name}="{value}"' for name, value in new.items())
             return {(at, at): f"<origin{text}/>"} if new else {}
-        places = {m[1].decode(): m.span(2) for m in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start))}
+        places = {
+            m[1].decode(): m.span(2) for m in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start))
+        }
         edits = {places[name]: f'"{value}"' for name, value in new.items() if name in places}
         after_name = element.start + len("<origin")
         absent = "".join(f' {name}="{value}"' for name, value in new.items() if name not in places)
@@ -138,7 +140,7 @@ class _Urdf:
     data: bytes
     name: str
     joints: Mapping[str, _Joint]
-    above: Mapping[str, _Joint]
+    above: Mapping[str, _Joint]  # by child link
     links: tuple[str, ...]
 
     def path_between(self, base: str | None, tip: str | None) -> list[_Joint]:
@@ -155,7 +157,9 @@ class _Urdf:
             leaves = [link for link in self.links if link not in parents and self._up(link, base) is not None]
             if len(leaves) != 1:
                 found = ", ".join(leaves)
-                raise InputError(f"links at the end of chains from '{base}'", found, "one, or the argument tip", self.path)
+                raise InputError(
+                    f"links at the end of chains from '{base}'", found, "one, or the argument tip", self.path
+                )
             tip = leaves[0]
         chain = self._up(tip, base)
         if chain is None:
@@ -195,14 +199,14 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
         or mimic joints between base and tip, no or several candidates for base or tip.
     """
     urdf = _parse(Path(path))
-    joints, chain = _chain(urdf, base, tip)
+    every, joints, chain = _chain(urdf, base, tip)
     table, T_base, T_tool, _ = describe(chain)
     robot = Robot(
         name=urdf.name,
         mdh=table,
         joint_types=tuple(joint.kind for joint in joints),
         limits=np.array([joint.limits for joint in joints]),
-        source=f"{urdf.path.name}, {joints[0].parent} to {tip or joints[-1].child}",
+        source=f"{urdf.path.name}, {every[0].parent} to {every[-1].child}",
     )
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
 
@@ -241,16 +245,15 @@ def write_urdf(
         no fixed joint after its last moving one.
     """
     urdf = _parse(Path(source))
-    joints, chain = _chain(urdf, base, tip)
-    nominal, T_base, T_tool, G = describe(chain)
+    every, joints, chain = _chain(urdf, base, tip)
+    _, T_base, T_tool, G = describe(chain)
     kinds = tuple(joint.kind for joint in joints)
     if robot.joint_types != kinds or not np.array_equal(robot.joint_map, np.eye(len(kinds))):
-        found = f"joints {', '.join(robot.joint_types)}" + ("" if robot.joint_types != kinds else " with signs or couplings")
-        raise InputError("robot", found, f"the file's {', '.join(kinds)}", urdf.path)
+        found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == kinds else "")
+        raise InputError("joints of the robot", found, f"those of the file, {', '.join(kinds)}", urdf.path)
     result = corrected(G, robot.mdh, frame_or(base_frame, T_base), frame_or(tool_frame, T_tool))
     edits: dict[tuple[int, int], str] = {}
     before, place = np.eye(4), 0
-    every = urdf.path_between(base, tip)
     for joint in every:
         if joint.kind:  # the fixed joints before it stay, this one takes the whole correction
             edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ result.origins[place])
@@ -267,10 +270,10 @@ def write_urdf(
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
-def _chain(urdf: _Urdf, base: str | None, tip: str | None) -> tuple[list[_Joint], Chain]:
-    """Return the moving joints between two links, and their geometry."""
-    joints, origins, T = [], [], np.eye(4)
-    for joint in urdf.path_between(base, tip):
+def _chain(urdf: _Urdf, base: str | None, tip: str | None) -> tuple[list[_Joint], list[_Joint], Chain]:
+    """Return all joints between two links, those of them that move, and their geometry."""
+    every, joints, origins, T = urdf.path_between(base, tip), [], [], np.eye(4)
+    for joint in every:
         T = T @ joint.origin
         if joint.kind:
             mimic = [e.attributes.get("joint", "") for e in joint.element.children if e.tag == "mimic"]
@@ -281,7 +284,7 @@ def _chain(urdf: _Urdf, base: str | None, tip: str | None) -> tuple[list[_Joint]
             T = np.eye(4)
     if not joints:
         raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint", urdf.path)
-    return joints, Chain(np.array(origins), np.array([joint.axis for joint in joints]), T)
+    return every, joints, Chain(np.array(origins), np.array([joint.axis for joint in joints]), T)
 
 
 def _parse(path: Path) -> _Urdf:
