@@ -34,7 +34,7 @@ from rpim_opt.robot import Array, Robot
 DEEPEST = 100
 """How deep elements may be nested."""
 KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 
 
@@ -119,10 +119,9 @@ class _Joint:
             at = _tag_end(data, self.element.start)
             text = "".join(f' {name}="{value}"' for name, value in new.items())
             return {(at, at): f"<origin{text}/>"} if new else {}
-        places = {
-            m[1].decode(): m.span(2) for m in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start))
-        }
-        edits = {places[name]: f'"{value}"' for name, value in new.items() if name in places}
+        tag = (element.start, _tag_end(data, element.start))
+        places = {m[1].decode(): (m.start(2) + 1, m.end(2) - 1) for m in ATTRIBUTE.finditer(data, *tag)}
+        edits = {places[name]: value for name, value in new.items() if name in places}
         after_name = element.start + len("<origin")
         absent = "".join(f' {name}="{value}"' for name, value in new.items() if name not in places)
         return edits | ({(after_name, after_name): absent} if absent else {})
@@ -150,7 +149,12 @@ class _Urdf:
                 raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
         roots = [link for link in self.links if link not in self.above]
         if base is None and len(roots) > 1:
-            raise InputError("links without a parent", ", ".join(roots), "one, or the argument base", self.path)
+            raise InputError(
+                "links without a parent",
+                ", ".join(roots),
+                "one, or the argument base (urdf_base in problem.toml)",
+                self.path,
+            )
         base = base or roots[0]
         parents = {joint.parent for joint in self.joints.values()}
         if tip is None:
@@ -158,7 +162,10 @@ class _Urdf:
             if len(leaves) != 1:
                 found = ", ".join(leaves)
                 raise InputError(
-                    f"links at the end of chains from '{base}'", found, "one, or the argument tip", self.path
+                    f"links at the end of chains from '{base}'",
+                    found,
+                    "one, or the argument tip (urdf_tip in problem.toml)",
+                    self.path,
                 )
             tip = leaves[0]
         chain = self._up(tip, base)
