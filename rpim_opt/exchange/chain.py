@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from rpim_opt.calibration import Calibration
 from rpim_opt.exceptions import InputError
-from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, forward_kinematics, frame_numbers, link, numeric_frame
+from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, forward_kinematics, frame_numbers, link
 from rpim_opt.parameters import tool_prefix
-from rpim_opt.robot import Array, Robot
+from rpim_opt.robot import MDH, Array, Robot
 
 NEAR_PARALLEL = 0.1
 """Axes nearer to parallel than this [rad] get Hayati's beta, as `observability.near_parallel` proposes."""
+ANOTHER_ARM = 0.1
+"""A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
 LARGEST = 2**24
 """Bytes that a description may have: a hundred times what the largest public ones need."""
 
@@ -136,7 +138,7 @@ def describe(
     return table + 0.0, base, turns[-1].T @ chain.tail, G
 
 
-def corrected(G: Array, table: Array, base: Array, tool: Array) -> Chain:
+def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Array], Array]:
     """Return the origins and tail that give other MDH parameters, base and tool on the frames of `describe`.
 
     With the MDH frame i before Rot(y, beta_i) times G_i as the frame of joint i::
@@ -148,7 +150,21 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> Chain:
     """
     before = [base, *(np.linalg.inv(g) @ link_of(beta=row[4]) for g, row in zip(G, table, strict=True))]
     origins = [b @ link_of(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
-    return Chain.about_z(origins, before[-1] @ tool)
+    return origins, before[-1] @ tool
+
+
+def require_same_arm(robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path) -> None:
+    """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints, or another drawing."""
+    if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, np.eye(len(joint_types))):
+        found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")
+        raise InputError("joints of the robot", found, f"those of the file, {', '.join(joint_types)}", file)
+    deviation = np.abs(robot.mdh - table)
+    deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
+    joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
+    if deviation[joint, column] > ANOTHER_ARM:
+        found = f"{MDH[column]}{joint + 1} off by {deviation[joint, column]:.3g} m or rad"
+        accepted = "a robot whose parameters were identified from this file's"
+        raise InputError("robot", found, accepted, file)
 
 
 def without_beta(robot: Robot) -> Robot:
@@ -209,11 +225,6 @@ def origin_numbers(T: Array, old: Array) -> tuple[str | None, str | None]:
     moved = np.abs(T[:3, 3] - old[:3, 3]).max() > 1e-14
     turned = np.abs(T[:3, :3] - old[:3, :3]).max() > 1e-14
     return texts[0] if moved else None, texts[1] if turned else None
-
-
-def frame_or(place: Array | None, other: Array) -> Array:
-    """Return the transform of a frame's six numbers, ``other`` where there are none."""
-    return other if place is None else numeric_frame(place)
 
 
 def _to_axis(axis: Array) -> Array:

@@ -16,6 +16,7 @@ from rpim_opt.exchange.chain import (
     link_of,
     origin_numbers,
     read_bytes,
+    require_same_arm,
     spliced,
     without_beta,
 )
@@ -24,6 +25,7 @@ from rpim_opt.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot import MDH, Array, Robot
 
 JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+REVOLUTE = ("revolute",) * 6
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
 LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
 DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
@@ -71,13 +73,13 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     path = Path(source)
     data = read_bytes(path)
     chain, places = _yaml_chain(data, path)
-    _, base, tool, G = describe(chain)
-    _six_revolute(robot, path)
-    result = corrected(G, robot.mdh, base, tool)
-    if np.abs(result.tail - chain.tail).max() > 1e-13:
+    table, base, tool, G = describe(chain)
+    require_same_arm(robot, table, REVOLUTE, path)
+    origins, _ = corrected(G, robot.mdh, base, tool)
+    if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0", path)
     edits = {}
-    for name, T, old in zip(JOINTS, result.origins, chain.origins, strict=True):
+    for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
         texts = origin_numbers(T, old)
         numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
         edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
@@ -135,7 +137,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     """
     path = Path(path)
     deltas, _ = _deltas(read_bytes(path), path)
-    _six_revolute(nominal, path)
+    require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
     table = nominal.mdh.copy()
     table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
     table[1:, :2] += np.column_stack([deltas["alpha"], deltas["a"]])[:-1]
@@ -170,7 +172,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     path = Path(source)
     data = read_bytes(path)
     old, places = _deltas(data, path)
-    _six_revolute(robot, path)
+    require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that holds where axis 1 is", path)
     change = without_beta(robot).mdh - nominal.mdh
@@ -202,11 +204,6 @@ def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[
         values[name] = np.array([_finite(part.strip(), f"key {key}", path) for part in parts])
         places[name] = tuple(section.start(1) + edge for edge in found[0].span(1))
     return values, places
-
-
-def _six_revolute(robot: Robot, path: Path) -> None:
-    if robot.joint_types != ("revolute",) * 6 or not np.array_equal(robot.joint_map, np.eye(6)):
-        raise InputError("robot", f"'{robot.name}'", "six revolute joints without signs or couplings", path)
 
 
 def _finite(text: str, where: str, path: Path) -> float:

@@ -22,9 +22,9 @@ from rpim_opt.exchange.chain import (
     Described,
     corrected,
     describe,
-    frame_or,
     origin_numbers,
     read_bytes,
+    require_same_arm,
     spliced,
 )
 from rpim_opt.files import write_bytes
@@ -248,32 +248,31 @@ def write_urdf(
     Raises
     ------
     InputError
-        As `read_urdf`, and for a robot with other joints, couplings, or a tool or last beta for which the chain has
-        no fixed joint after its last moving one.
+        As `read_urdf`, and for another robot, couplings, or a tool or last beta for which the chain has no fixed
+        joint after its last moving one.
     """
     urdf = _parse(Path(source))
     every, joints, chain = _chain(urdf, base, tip)
-    _, T_base, T_tool, G = describe(chain)
-    kinds = tuple(joint.kind for joint in joints)
-    if robot.joint_types != kinds or not np.array_equal(robot.joint_map, np.eye(len(kinds))):
-        found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == kinds else "")
-        raise InputError("joints of the robot", found, f"those of the file, {', '.join(kinds)}", urdf.path)
-    result = corrected(G, robot.mdh, frame_or(base_frame, T_base), frame_or(tool_frame, T_tool))
+    table, T_base, T_tool, G = describe(chain)
+    require_same_arm(robot, table, tuple(joint.kind for joint in joints), urdf.path)
+    T_base = T_base if base_frame is None else numeric_frame(base_frame)
+    T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
+    origins, tail = corrected(G, robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
     before, place = np.eye(4), 0
     for joint in every:
         if joint.kind:  # the fixed joints before it stay, this one takes the whole correction
-            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ result.origins[place])
+            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ origins[place])
             before, place = np.eye(4), place + 1
         else:
             before = before @ joint.origin
-    if np.abs(result.tail - chain.tail).max() > 1e-13:
+    if np.abs(tail - chain.tail).max() > 1e-13:
         if every[-1].kind:
             what = f"a tool or beta{len(joints)} that moves the tip '{every[-1].child}'"
             accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it"
             raise InputError("robot", what, accepted, urdf.path)
         rest = np.linalg.inv(before @ np.linalg.inv(every[-1].origin))
-        edits |= every[-1].origin_edits(urdf.data, rest @ result.tail)
+        edits |= every[-1].origin_edits(urdf.data, rest @ tail)
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
