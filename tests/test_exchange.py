@@ -73,8 +73,10 @@ def random_urdf(seed: int, style: str) -> str:
             add("fixed", f"F{i}", f"flange{i}", rng.normal(size=3) * (style != "parallel"), np.zeros(3))
         limits = '<limit lower="-2" upper="1.5" effort="1" velocity="1"/>' if kind != "continuous" else ""
         add(kind, f"J{i}", f"L{i}", xyz, rpy, f'<axis xyz="{text(axis)}"/>{limits}<dynamics damping="0.5"/>')
-    add("fixed", "to_tip", "tip", rng.normal(size=3), rng.uniform(-3, 3, 3))
-    return "".join(parts) + EXTRA
+    add("fixed", "to_hand", "hand", rng.normal(size=3), rng.uniform(-3, 3, 3))
+    if rng.random() < 0.5:
+        add("fixed", "to_palm", "palm", rng.normal(size=3), rng.uniform(-3, 3, 3))
+    return "".join(parts).replace(f'"{parent}"', '"tip"') + EXTRA
 
 
 def urdf_kinematics(path: Path, tip: str, q: np.ndarray) -> np.ndarray:
@@ -126,6 +128,8 @@ def test_a_urdf_reads_as_a_robot_with_the_same_kinematics(tmp_path: Path, style:
     assert np.abs(reach(arm, q) - urdf_kinematics(path, "tip", q)).max() < EXACT
     assert np.abs(arm.robot.mdh[:, [1, 3]]).max() < 60  # a few metres a joint, and never a far common normal
     assert arm.names == tuple(f"J{i + 1}" for i in range(arm.robot.dof))
+    limited = [f'type="continuous" name="{name}"' not in path.read_text() for name in arm.names]
+    assert arm.robot.limits.tolist() == [[-2, 1.5] if known else [-np.inf, np.inf] for known in limited]
     assert (arm.robot.name, arm.robot.source) == ("arm & co", "arm.urdf, base to tip")
 
 
@@ -165,9 +169,10 @@ PLAIN = """<robot name="two">
 </robot>"""
 
 
-def test_origins_that_the_file_leaves_out_are_put_in(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_origins_that_the_file_leaves_out_are_put_in(tmp_path: Path, mark: str) -> None:
     path, target = tmp_path / "arm.urdf", tmp_path / "new.urdf"
-    path.write_text(PLAIN)
+    path.write_text(mark + PLAIN.replace("arm", "\u00e4rm"))
     arm = ro.read_urdf(path)
     assert np.isinf(arm.robot.limits).all()  # no limit element, and a continuous joint
     mdh = arm.robot.mdh + np.random.default_rng(0).uniform(-0.1, 0.1, (2, 5)) * [[1, 1, 1, 1, 1], [1, 1, 1, 1, 0]]
@@ -242,6 +247,7 @@ HOSTILE = {
     "own parent": (PLAIN.replace('parent link="base"', 'parent link="arm"'), "a cycle of joints"),
     "two roots": (PLAIN.replace("<link", '<link name="x"/><link', 1), "without a parent: found x, base"),
     "nan": (PLAIN.replace("0.5 0 0", "nan 0 0"), "'nan 0 0', accepted: 3 finite numbers"),
+    "metres as no unit has them": (PLAIN.replace("0.5 0 0", "1e300 0 0"), "'1e300 0 0'"),
     "infinite": (PLAIN.replace("0.5 0 0", "1e999 0 0"), "'1e999 0 0'"),
     "two numbers": (PLAIN.replace("0.5 0 0", "0.5 0"), "'0.5 0', accepted: 3 finite numbers"),
     "comma": (PLAIN.replace("0.5 0 0", "0,5 0 0"), "'0,5 0 0'"),

@@ -33,6 +33,8 @@ from rpim_opt.robot import Array, Robot
 
 DEEPEST = 100
 """How deep elements may be nested."""
+LARGEST_NUMBER = 1e6
+"""Size [m or rad] that no number of an origin or axis reaches."""
 KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
@@ -73,7 +75,8 @@ class _Joint:
         element = self._only(tag)
         text = (element.attributes if element else {}).get(attribute, default)
         parts = text.split()
-        if len(parts) != count or not all(NUMBER.fullmatch(p) and math.isfinite(float(p)) for p in parts):
+        largest = LARGEST_NUMBER if count > 1 else math.inf  # limits may be any number
+        if len(parts) != count or not all(NUMBER.fullmatch(p) and abs(float(p)) < largest for p in parts):
             hint = "; expand the file with the command xacro first" if "$" in text else ""
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
             raise self.error(f"{tag} {attribute}", repr(text[:40]), wanted + hint)
@@ -97,7 +100,7 @@ class _Joint:
         """Unit vector (3,) in the joint's frame."""
         axis = self.numbers("axis", "xyz", "1 0 0", 3)
         length = float(np.linalg.norm(axis))
-        if not 1e-6 < length < 1e6:
+        if not length > 1e-6:
             raise self.error("axis xyz", f"a vector of length {length:g}", "a unit vector")
         return axis / length
 
@@ -120,7 +123,7 @@ class _Joint:
             text = "".join(f' {name}="{value}"' for name, value in new.items())
             return {(at, at): f"<origin{text}/>"} if new else {}
         tag = (element.start, _tag_end(data, element.start))
-        places = {m[1].decode(): (m.start(2) + 1, m.end(2) - 1) for m in ATTRIBUTE.finditer(data, *tag)}
+        places = {m[1].decode(errors="replace"): (m.start(2) + 1, m.end(2) - 1) for m in ATTRIBUTE.finditer(data, *tag)}
         edits = {places[name]: value for name, value in new.items() if name in places}
         after_name = element.start + len("<origin")
         absent = "".join(f' {name}="{value}"' for name, value in new.items() if name not in places)
