@@ -43,7 +43,7 @@ ORDER = {
     "exchange.plain": set(),
     "instances": {"pydantic", "cvxpy"},
     "simulation": {"pydantic"},
-    "study": {"distributed", "joblib", "pyarrow"},
+    "study": {"distributed", "joblib", "matplotlib", "pyarrow"},
     "cli": {"typer", "rich"},
 }
 
