@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from scipy.linalg import qr, solve_triangular
 from scipy.sparse import csr_array
 from scipy.stats import chi2
 
+from rpim_opt.conic import Conic, Term
 from rpim_opt.constraints import Box, Constraint, by_link, within_tolerance
 from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
 from rpim_opt.robot import Array
 
-Term = Callable[[Any], Any]
+Function = Callable[[Any], Any]
 ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 """Losses that see only the length of the residual: [A b] may be replaced by its triangular factor."""
 
-TOLERANCES = [{"tol_gap_abs": t, "tol_gap_rel": t, "tol_feas": t} for t in (1e-12, 1e-10, 1e-8)]
-"""Tried in turn; CVXPY keeps the solver and its settings from call to call, so each is stated in full."""
 FEASIBLE = 1e-9
 """By how much a solution may miss its constraints, relative to its largest entry."""
 STATIONARY = 1e-7
@@ -65,8 +64,8 @@ class Formulation:
     """
 
     name: str
-    loss: Term = cp.sum_squares
-    penalty: Term | None = None
+    loss: Function = cp.sum_squares
+    penalty: Function | None = None
     constraints: tuple[Constraint, ...] = ()
     loss_over: str = "equation"
     penalty_over: Callable[[Parameters], Sequence[Array]] | None = None
@@ -77,8 +76,8 @@ class Formulation:
             raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
 
     def compile(self, model: LinearModel) -> ConvexProgram:
-        """Pose the program in CVXPY; `ConvexProgram.on` reuses it for other data of the same shape."""
-        return ConvexProgram(self, model, _Posed(self, model))
+        """Pose the program in CVXPY, or take the one that was posed for the same shape before."""
+        return ConvexProgram(self, model, _posed(self, model))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +102,10 @@ class ConvexProgram:
     formulation: Formulation
     model: LinearModel
     _posed: _Posed
-    _trust: dict[str, _Posed] = field(default_factory=dict)
 
     def on(self, model: LinearModel) -> ConvexProgram:
         """Return the program for another model of the same shape, without posing it anew."""
-        return ConvexProgram(self.formulation, model, self._posed, self._trust)
+        return ConvexProgram(self.formulation, model, self._posed)
 
     @property
     def squared(self) -> bool:
@@ -131,15 +129,10 @@ class ConvexProgram:
 
     def value(self, z: Array) -> tuple[float, float]:
         """Return loss(A z - b) and penalty(z)."""
-        loss, penalty = self.formulation.loss, self.formulation.penalty
         r = self.model.A @ z - self.model.b
         if self.formulation.loss_over == "configuration":
             r = self.norms(z)
-        fit = squared_norm(r) if loss is cp.sum_squares else float(loss(cp.Constant(r)).value)
-        if penalty is None:
-            return fit, 0.0
-        over = self._posed.penalized(z)
-        return fit, squared_norm(over) if penalty is cp.sum_squares else float(penalty(cp.Constant(over)).value)
+        return self._posed.loss(r), self._posed.penalty(self._posed.penalized(z))
 
     def norms(self, z: Array) -> Array:
         """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
@@ -169,18 +162,14 @@ class ConvexProgram:
             When the solver does not end with "optimal", or its point misses the constraints; ``conflict`` names
             what contradicts what when the program is infeasible.
         """
-        weight = self._weight(weight)
-        posed, box = self._posed, self._posed.box
-        if centre is not None and np.isfinite(radius):
-            if "posed" not in self._trust:
-                self._trust["posed"] = _Posed(self.formulation, self.model, trusted=True)
-            posed = self._trust["posed"]
-            posed.centred(centre, radius)
-            if box is not None:
-                box = np.maximum(box[0], centre - radius), np.minimum(box[1], centre + radius)
-        polish = posed.quadratic and posed.constrained and box is not None and bool((box[0] <= box[1]).all())
+        weight, posed, box = self._weight(weight), self._posed, self.box
+        region = (centre - radius, centre + radius) if centre is not None and np.isfinite(radius) else None
+        if region is not None and box is not None:
+            box = np.maximum(box[0], region[0]), np.minimum(box[1], region[1])
+        limited = bool(posed.constrained or region is not None)
+        polish = posed.quadratic and limited and box is not None and bool((box[0] <= box[1]).all())
         try:
-            z, duals = posed.solve(self, weight)
+            z, duals = posed.solve(self, weight, region)
         except NoSolutionFound:
             if not polish:
                 raise
@@ -194,16 +183,34 @@ class ConvexProgram:
         """Return the solutions at many weights.
 
         A squared loss with a squared penalty has a formula, z = V diag(s / (s^2 + weight)) U'b; where that
-        meets the constraints it is the solution, and only elsewhere a program is solved.
+        meets the constraints it is the solution. In a box the active set continues from weight to weight; otherwise
+        a program is solved.
         """
-        estimates = []
-        for weight in map(self._weight, weights):
-            z = self._formula(weight) if self._posed.quadratic else None
-            if z is not None and (self.closed_form or self.violation(z) <= 0):
-                estimates.append(Estimate(z, weight, *self.value(z)))
-            else:
+        checked = np.array([self._weight(weight) for weight in weights])
+        if not self._posed.quadratic:
+            return [self.solve(weight) for weight in checked]
+        formula = self._formulas(checked)
+        if self.closed_form:
+            return self._estimates(formula, checked)
+        estimates, z = [], None
+        for weight, free in zip(checked, formula, strict=True):
+            if self.violation(free) <= 0:
+                z, held = free, np.zeros_like(free)
+            elif self.box is None or (self.box[0] > self.box[1]).any():
                 estimates.append(self.solve(weight))
+                continue
+            else:
+                z, held = self._polished(np.clip(free if z is None else z, *self.box), weight, *self.box)
+            estimates.append(Estimate(z, weight, *self.value(z), (held,)))
         return estimates
+
+    def _estimates(self, z: Array, weights: Array) -> list[Estimate]:
+        """Return solutions (K, n) with their values, all at once."""
+        R, n = self.model.triangle, z.shape[1]
+        loss = np.sum((z @ R[:, :n].T - R[:, n]) ** 2, axis=1)
+        penalty = np.sum(z**2, axis=1) if self.formulation.penalty else np.zeros(len(z))
+        rows = zip(z, weights, loss, penalty, strict=True)
+        return [Estimate(each, float(w), float(fit), float(size)) for each, w, fit, size in rows]
 
     def trusted(self, z: Array) -> LinearModel:
         """Return the squared-loss model that a robust fit amounts to: what it trusts at z, weighed as the loss does.
@@ -223,13 +230,12 @@ class ConvexProgram:
         keep = norms <= outlying(norms, count)
         over = self.formulation.loss_over == "configuration"
         v = norms if over else self.model.A @ z - self.model.b
-        probe = cp.Variable(len(v))
-        probe.value = np.where(np.abs(v) > 1e-6, v, 1e-6)
-        slope = self.formulation.loss(probe).grad[probe]
+        v = np.where(np.abs(v) > 1e-6, v, 1e-6)
+        slope = self._posed.loss_term(len(v)).slope(v)
         found = f"formulation '{self.formulation.name}'"
         if slope is None:
             raise InputError(found, "a loss without slope", "another selector: l_curve, corner, k_fold, or a number")
-        weight = np.abs(np.asarray(slope.todense()).ravel()) / (2 * np.abs(probe.value))
+        weight = np.abs(slope) / (2 * np.abs(v))
         factor = float(np.median(weight[keep if over else keep[which]]))
         if not factor > 0:
             raise InputError(found, "a loss that rests on a few equations", "another selector: l_curve, corner, k_fold")
@@ -242,9 +248,15 @@ class ConvexProgram:
         return 0.0 if self.formulation.penalty is None else float(weight)
 
     def _formula(self, weight: float) -> Array:
+        return self._formulas(np.array([weight]))[0]
+
+    def _formulas(self, weights: Array) -> Array:
+        """Return the unconstrained solutions (K, n) of a squared loss and penalty."""
         beta, s, Vt = self.model.svd
-        gain = np.divide(s, s**2 + weight, out=np.zeros_like(s), where=s > 0)
-        return Vt.T @ (gain * beta)
+        gain = np.zeros((len(weights), len(s)))
+        seen = s > 0
+        gain[:, seen] = s[seen] * beta[seen] / (s[seen] ** 2 + weights[:, None])
+        return gain @ Vt
 
     def _polished(self, z: Array, weight: float, lower: Array, upper: Array) -> tuple[Array, Array]:
         """Return the exact minimum in a box, from a point near it, and by how much each bound holds it back.
@@ -260,7 +272,7 @@ class ConvexProgram:
         for _ in range(10 * n + 10):
             r = b - A @ z
             step = np.zeros(n)
-            step[free] = np.linalg.lstsq(A[:, free], r, rcond=1e-15)[0] if free.any() else 0.0
+            step[free] = _least_squares(A[:, free], r) if free.any() else 0.0
             to_bound = np.where(step > 0, upper - z, np.where(step < 0, lower - z, np.inf))
             share = np.divide(to_bound, step, out=np.full(n, np.inf), where=step != 0)
             k = int(np.argmin(share))
@@ -293,20 +305,64 @@ def outlying(norms: Array, count: np.ndarray) -> np.ndarray:
     return noise * np.sqrt(chi2.ppf(1 - 0.01 / len(norms), count))
 
 
-class _Posed:
-    """The CVXPY problem of a shape: data and weight are its parameters, so it is canonicalized once.
+def _least_squares(A: Array, b: Array) -> Array:
+    """Return the least-squares solution, by QR where A has full rank and else of least norm."""
+    factors: Any = qr(np.column_stack([A, b]), mode="r", overwrite_a=True, check_finite=False)
+    n = A.shape[1]
+    R = factors[0][:n, :n]
+    diagonal = np.abs(np.diag(R))
+    if len(R) < n or not diagonal.min() > 1e-14 * diagonal.max():
+        return np.asarray(np.linalg.lstsq(A, b, rcond=1e-15)[0], dtype=float)
+    return solve_triangular(R, factors[0][:n, n], check_finite=False)
 
-    With a squared loss and a squared (or no) penalty, both terms are one squared norm: in the singular
-    basis, u = D (V'z - D^-2 s U'b) with D = sqrt(s^2 + weight) gives loss + weight penalty = |u|^2 + const.
-    Posed in u the program is perfectly conditioned at every weight, where posed in z an interior-point
-    solver calls answers "optimal" that have no correct digit. Other losses and penalties are posed in the same u.
+
+@dataclass(frozen=True)
+class _Shape:
+    """What a posed program depends on, besides the formulation; the data of a calibration are no part of it."""
+
+    unknowns: int
+    equations: int
+    group: bytes
+    signature: tuple[Any, ...]
+    parameters: Parameters = field(compare=False)
+    groups: np.ndarray = field(compare=False)
+
+
+def _posed(formulation: Formulation, model: LinearModel) -> _Posed:
+    m, n = model.A.shape
+    grouped = formulation.loss_over == "configuration" or np.isfinite(formulation.largest)
+    groups = np.unique(model.group, return_inverse=True)[1] if grouped else np.empty(0, dtype=int)
+    p = model.parameters
+    own = bool(formulation.constraints) or formulation.penalty_over is not None
+    signature = (p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes()) if own else ()
+    shape = _Shape(n, m, groups.tobytes(), signature, p, groups)
+    try:
+        return _posed_once(formulation, shape)
+    except TypeError:  # a user's function or constraint that cannot be told from others
+        return _Posed(formulation, shape)
+
+
+@lru_cache(maxsize=64)
+def _posed_once(formulation: Formulation, shape: _Shape) -> _Posed:
+    return _Posed(formulation, shape)
+
+
+class _Posed:
+    """The program of a formulation for one shape: CVXPY canonicalizes it once, in z and the residual r.
+
+    Data come in by substitution. With D = sqrt(s^2 + weight) and the singular values of A,
+
+        z = V D^-1 u + V D^-2 s U'b        r = A z - b
+
+    so that a squared loss with a squared (or no) penalty is |u|^2 + const: perfectly conditioned at every weight,
+    where posed in z an interior-point solver calls answers "optimal" that have no correct digit.
     """
 
-    def __init__(self, formulation: Formulation, model: LinearModel, trusted: bool = False):
-        m, n = model.A.shape
-        self.n, self.formulation, self.parameters = n, formulation, model.parameters
-        self.limited = np.isfinite(formulation.largest)
-        self.constrained = bool(formulation.constraints) or self.limited or trusted
+    def __init__(self, formulation: Formulation, shape: _Shape):
+        self.formulation, self.shape, self.parameters = formulation, shape, shape.parameters
+        self.n = n = shape.unknowns
+        self.limited = bool(np.isfinite(formulation.largest))
+        self.constrained = bool(formulation.constraints) or self.limited
         whole = formulation.loss_over == "equation"
         plain = formulation.penalty_over is None
         self.quadratic = (
@@ -316,39 +372,25 @@ class _Posed:
         )
         self.reduced = formulation.loss in ROTATION_INVARIANT and whole and not self.limited
         over = formulation.penalty_over
-        self.differences = [np.asarray(D, dtype=float) for D in over(model.parameters)] if over else None
-        rows = n + 1 if self.reduced else m
-        u = cp.Variable(n)
-        self.basis, self.centre = cp.Parameter((n, n)), cp.Parameter(n)
-        self.z: Any = self.basis @ u + self.centre
-        link: list[Any] = []
-        if self.quadratic:
-            objective = cp.sum_squares(u)
-            self.constraints: list[list[Any]] = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
-        else:
-            self.A, self.b, self.weight = (
-                cp.Parameter((rows, n)),
-                cp.Parameter(rows),
-                cp.Parameter(nonneg=True),
-            )
-            expression, self.z = self.z, cp.Variable(n)
-            link = [self.z == expression]  # the penalty's weight may not multiply the basis: DPP
-            r = self.A @ u - self.b
-            norms = None if whole and not self.limited else _norms(r, model.group)
+        self.differences = [np.asarray(D, dtype=float) for D in over(self.parameters)] if over else None
+        z, weight = cp.Variable(n), cp.Parameter(nonneg=True)
+        self.constraints: list[list[Any]] = [_listed(c(z, self.parameters)) for c in formulation.constraints]
+        variables, objective = [z], 0.0 * cp.sum(z)
+        if not self.quadratic:
+            r = cp.Variable(n + 1 if self.reduced else shape.equations)
+            variables.append(r)
+            norms = None if whole and not self.limited else _norms(r, shape.groups)
             objective = formulation.loss(r if whole else norms)
             if formulation.penalty is not None:
-                over = self.z if plain else cp.hstack([cp.norm(D @ self.z) for D in self.differences or ()])
-                objective = objective + self.weight * formulation.penalty(over)
-            self.constraints = [_listed(c(self.z, model.parameters)) for c in formulation.constraints]
+                over = z if plain else cp.hstack([cp.norm(D @ z) for D in self.differences or ()])
+                objective = objective + weight * formulation.penalty(over)
             if norms is not None and self.limited:
                 self.constraints.append([norms <= formulation.largest])
-        every: list[Any] = link + [constraint for group in self.constraints for constraint in group]
-        if trusted:
-            self.middle, self.radius = cp.Parameter(n), cp.Parameter(nonneg=True)
-            every.append(cp.abs(self.z - self.middle) <= self.radius)
-        self.problem = cp.Problem(cp.Minimize(objective), every)
-        if not self.problem.is_dcp():
+        every = [constraint for group in self.constraints for constraint in group]
+        if not cp.Problem(cp.Minimize(objective), every).is_dcp():
             raise InputError(f"formulation '{formulation.name}'", "a program that is not convex", "CVXPY's DCP rules")
+        penalized = not self.quadratic and formulation.penalty is not None
+        self.conic = Conic(objective, every, variables, weight if penalized else None)
 
     @cached_property
     def _checks(self) -> tuple[cp.Variable, list[Any]]:
@@ -365,43 +407,68 @@ class _Posed:
         upper = np.min([high for _, high in limits] + [np.full(self.n, np.inf)], axis=0)
         return lower, upper
 
+    @cached_property
+    def _terms(self) -> dict[tuple[str, int], Term]:
+        return {}
+
+    def loss_term(self, size: int) -> Term:
+        """Return the loss as a function of numbers (size,)."""
+        return self._terms.setdefault(("loss", size), Term(self.formulation.loss, size))
+
+    def loss(self, r: Array) -> float:
+        """Return the loss of a residual, or of the configurations' norms."""
+        return squared_norm(r) if self.formulation.loss is cp.sum_squares else self.loss_term(len(r))(r)
+
+    def penalty(self, over: Array) -> float:
+        """Return the penalty of z, or of its groups' norms."""
+        penalty = self.formulation.penalty
+        if penalty is None or penalty is cp.sum_squares:
+            return 0.0 if penalty is None else squared_norm(over)
+        return self._terms.setdefault(("penalty", len(over)), Term(penalty, len(over)))(over)
+
     def penalized(self, z: Array) -> np.ndarray:
         """Return what the penalty gets: z, or the norms of its groups."""
         return z if self.differences is None else np.array([float(np.linalg.norm(D @ z)) for D in self.differences])
 
     def violation(self, z: Array) -> float:
+        """Return by how much z misses the formulation's constraints."""
+        if self.box is not None:
+            return float(np.max(np.maximum(self.box[0] - z, z - self.box[1]), initial=0.0))
         probe, checks = self._checks
         probe.value = z
         return max((float(np.max(c.violation())) for c in checks), default=0.0)
 
-    def centred(self, centre: Array, radius: float) -> None:
-        self.middle.value, self.radius.value = centre, radius
-
-    def solve(self, program: ConvexProgram, weight: float) -> tuple[Array, tuple[Array, ...]]:
-        self._set(program.model, weight)
-        status = ""
-        for settings in TOLERANCES:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)
-                    self.problem.solve(solver=cp.CLARABEL, **settings)
-                status = self.problem.status
-            except cp.SolverError as error:
-                status = str(error)
-            if status == cp.INFEASIBLE:
-                break
-            if status == cp.OPTIMAL and self.z.value is not None:
-                z = np.array(self.z.value)
-                if program.violation(z) > max(FEASIBLE, 1e-8 * self.limited) * max(1.0, float(np.max(np.abs(z)))):
-                    status = "optimal, but outside the constraints"
-                    continue
-                return z, tuple(self._duals(k) for k in range(len(self.formulation.constraints)))
+    def solve(
+        self, program: ConvexProgram, weight: float, region: tuple[Array, Array] | None
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Return z and the constraints' multipliers, from Clarabel."""
+        model = program.model
+        beta, s, Vt = model.svd
+        given = weight
+        if self.constrained or region is not None or not self.quadratic:
+            # a nominal value for unseen directions may not be the answer: let them move, at a price
+            weight = max(weight, 1e-16 * s[0] ** 2) if not s.all() or not self.quadratic else weight
+        D = np.sqrt(s**2 + weight)
+        inverse = np.divide(1.0, D, out=np.zeros_like(D), where=D > 0)
+        basis, centre = Vt.T * inverse, Vt.T @ (inverse**2 * s * beta)
+        T, c = basis, centre
+        if not self.quadratic:
+            R = model.triangle if self.reduced else np.column_stack([model.A, model.b])
+            T = np.vstack([basis, R[:, : self.n] @ basis])
+            c = np.concatenate([centre, R[:, : self.n] @ centre - R[:, self.n]])
+        box = None if region is None else (basis, region[0] - centre, region[1] - centre)
+        status, u, cones = self.conic.solve(T, c, given, float(self.quadratic), box)
+        if status == cp.OPTIMAL:
+            z = basis @ u + centre
+            if program.violation(z) <= max(FEASIBLE, 1e-8 * self.limited) * max(1.0, float(np.max(np.abs(z)))):
+                return z, tuple(self._duals(k, cones) for k in range(len(self.formulation.constraints)))
+            status = "optimal, but outside the constraints"
         conflict = _conflict(program) if status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE) else None
         raise NoSolutionFound(program, weight, status, conflict)
 
-    def _duals(self, k: int) -> np.ndarray:
+    def _duals(self, k: int, cones: Array) -> np.ndarray:
         """Multipliers of the k-th constraint: of a box (n,), as if loosened on the side that holds."""
-        values = np.concatenate([np.ravel(c.dual_value) for c in self.constraints[k]])
+        values = np.concatenate([self.conic.multipliers(cones, constraint) for constraint in self.constraints[k]])
         constraint = self.formulation.constraints[k]
         if not isinstance(constraint, Box):
             return values
@@ -412,22 +479,6 @@ class _Posed:
             part, values = np.split(values, [np.count_nonzero(side)])
             found[side] += np.abs(part)
         return found
-
-    def _set(self, model: LinearModel, weight: float) -> None:
-        beta, s, Vt = model.svd
-        given = weight
-        if self.constrained or not self.quadratic:
-            # a nominal value for unseen directions may not be the answer: let them move, at a price
-            weight = max(weight, 1e-16 * s[0] ** 2) if not s.all() or not self.quadratic else weight
-        D = np.sqrt(s**2 + weight)
-        inverse = np.divide(1.0, D, out=np.zeros_like(D), where=D > 0)
-        self.basis.value = Vt.T * inverse
-        self.centre.value = Vt.T @ (inverse**2 * s * beta)
-        if not self.quadratic:
-            R = model.triangle if self.reduced else np.column_stack([model.A, model.b])
-            self.A.value = R[:, : self.n] @ self.basis.value
-            self.b.value = R[:, self.n] - R[:, : self.n] @ self.centre.value
-            self.weight.value = given
 
 
 def _listed(constraints: Any) -> list[Any]:
@@ -479,7 +530,7 @@ HUBER = 2.0
 """Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
 
 
-def huber(threshold: float = HUBER) -> Term:
+def huber(threshold: float = HUBER) -> Function:
     """Return Huber's loss: v^2 up to the threshold, 2 threshold v - threshold^2 beyond, summed."""
     bound: Any = threshold  # CVXPY's annotation says int
     return lambda v: cp.sum(cp.huber(v, bound))

@@ -28,6 +28,7 @@ ORDER = {
     "observability": set(),
     "frames": set(),
     "constraints": {"cvxpy"},
+    "conic": {"clarabel", "cvxpy"},
     "formulation": {"cvxpy"},
     "selection": {"cvxpy"},
     "text": {"rich"},
