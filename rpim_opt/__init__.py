@@ -59,6 +59,8 @@ if TYPE_CHECKING:
     from rpim_opt.plots import plot_selection as plot_selection
     from rpim_opt.problem import CalibrationProblem as CalibrationProblem
     from rpim_opt.problem import LinearModel as LinearModel
+    from rpim_opt.record import Record as Record
+    from rpim_opt.results import load_result as load_result
     from rpim_opt.robot import Robot as Robot
     from rpim_opt.robot import read_robot as read_robot
     from rpim_opt.selection import Selection as Selection
@@ -113,6 +115,8 @@ _HOME = {
     "parameters": ("Parameters", "model_parameters"),
     "frames": ("hand_eye", "register", "starting_parameters", "tool_from_distances"),
     "problem": ("CalibrationProblem", "LinearModel"),
+    "record": ("Record",),
+    "results": ("load_result",),
     "robot": ("Robot", "read_robot"),
     "selection": (
         "Selection",
