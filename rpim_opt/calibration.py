@@ -191,6 +191,17 @@ class Calibration:
                 vectors[block.row] = part[:, [names.index(axis) for axis in "xyz"]]
         return vectors
 
+    def measured_positions(self, data: Dataset | None = None) -> Array:
+        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
+        data, points = data or self.problem.data, np.empty((len(data or self.problem.data), 3))
+        for block in data.blocks:
+            names = list(block.measurement.columns)
+            torque = None if block.torque is None else block.torque[:, 0]
+            modelled = self.forward(block.q[:, 0], block.markers[0], torque)[:, :3, 3]
+            seen = {"x", "y", "z"} <= set(names)
+            points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]] if seen else modelled
+        return points
+
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the position error of every row, (N,) [m]; of the identification data by default.
 

@@ -60,6 +60,10 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
         _compare(file, result)
     except InputError as error:
         raise error.within(path) from None
+    except (TypeError, ValueError, LookupError) as error:  # well-formed parts that were put together by hand
+        raise InputError(
+            "the file", f"parts that do not fit together ({error})", "one as it was written", path
+        ) from None
     return result
 
 
