@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from rpim_opt.problem import CalibrationProblem as CalibrationProblem
     from rpim_opt.problem import LinearModel as LinearModel
     from rpim_opt.record import Record as Record
+    from rpim_opt.report import write_report as write_report
     from rpim_opt.results import load_result as load_result
     from rpim_opt.robot import Robot as Robot
     from rpim_opt.robot import read_robot as read_robot
@@ -123,6 +124,7 @@ _HOME = {
     "frames": ("hand_eye", "register", "starting_parameters", "tool_from_distances"),
     "problem": ("CalibrationProblem", "LinearModel"),
     "record": ("Record",),
+    "report": ("write_report",),
     "results": ("load_result",),
     "robot": ("Robot", "read_robot"),
     "selection": (

@@ -77,6 +77,27 @@ def calibrate(
 
 
 @app.command()
+def report(
+    result: Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the result by default.")] = None,
+) -> None:
+    """Write a result as one HTML page that works offline, for whoever has to believe it."""
+    with _progress() as say:
+        from rpim_opt.report import write_report
+        from rpim_opt.results import load_result
+
+        say("reading the result")
+        loaded = load_result(result)
+        say("writing the report")
+        out = out or (result if result.is_dir() else result.parent) / "report.html"
+        try:
+            write_report(loaded, out)
+        except OSError as error:
+            raise RpimError(f"{out}: cannot be written: {error}.") from None
+    print(f"Written: {out}")  # noqa: T201
+
+
+@app.command()
 def inspect(
     problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
     variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,

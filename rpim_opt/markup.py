@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 Element = ElementTree.Element
 
 
-def tag(name: str, *children: str | Element, **attributes: object) -> Element:
+def tag(name: str, /, *children: str | Element, **attributes: object) -> Element:
     """Return an element; ``class_`` stands for ``class``, ``aria_label`` for ``aria-label``.
 
     >>> html(tag("p", "a < b ", tag("b", "c"), class_="note"))

@@ -39,6 +39,8 @@ ORDER = {
     "baselines": set(),
     "design": set(),
     "plots": set(),
+    "svg": set(),
+    "report": set(),
     "inspection": set(),
     "instances": {"pydantic", "cvxpy"},
     "simulation": {"pydantic"},
