@@ -209,14 +209,14 @@ class Calibration:
         """
         return (self.problem.on(data) if data else self.problem).errors(self.x, dimension)
 
-    def nominal_errors(self, data: Dataset | None = None) -> Array:
-        """Return the position error of every row before calibration, (N,) [m].
+    def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
+        """Return the position error of every row before calibration, (N,) [m]; with ``"angle"`` as in `errors`.
 
         The robot is as its drawing says. Frames (base, reflectors, anchors, ...) that the calibration identifies
         are fitted to the identification data first: before that they say nothing about the robot.
         """
         problem, x = self._nominal
-        return (problem.on(data) if data else problem).errors(x)
+        return (problem.on(data) if data else problem).errors(x, dimension)
 
     @cached_property
     def _nominal(self) -> tuple[CalibrationProblem, Array]:

@@ -245,7 +245,7 @@ def content(result: Any) -> dict[str, Any]:
         "held": [held._asdict() for held in result.held],
         "history": [{**vars(it), "radius": _finite(it.radius)} for it in result.history],
         "selection": _selection(result.selection),
-        "definition": _definition(formulation),
+        "definition": definition(formulation),
         "robot": _robot(result.problem.robot),
         "model": _parameters(result.problem.parameters),
         "data": {name: _data(part) for name, part in data.items()},
@@ -302,7 +302,8 @@ def _term(function: Any) -> Term:
     return name or getattr(function, "stated", None)
 
 
-def _definition(f: Formulation) -> dict[str, Any]:
+def definition(f: Formulation) -> dict[str, Any]:
+    """Return the terms of a formulation by the names of ready-made functions; None for those of a script."""
     return {
         "loss": _term(f.loss),
         "penalty": "none" if f.penalty is None else _term(f.penalty),
@@ -315,7 +316,7 @@ def _definition(f: Formulation) -> dict[str, Any]:
 
 def defined(formulation: Formulation) -> bool:
     """Whether a file can hold a formulation: all its functions are ready-made."""
-    parts = _definition(formulation)
+    parts = definition(formulation)
     return None not in (parts["loss"], parts["penalty"], parts["penalty_over"], *parts["constraints"])
 
 

@@ -1,6 +1,7 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
-const number = (v, digits = 3) => Number(v.toPrecision(digits)).toString();
+const number = (v, digits = 3) =>
+  v !== 0 && (v < 1e-3 || v >= 1e6) ? v.toExponential(digits - 1) : Number(v.toPrecision(digits)).toString();
 const millimetres = (v) => (v < 10 ? v.toFixed(3) : v < 100 ? v.toFixed(2) : v.toFixed(0)) + " mm";
 
 function curve({ weight, residual, solution, error, of, takers, chosen, x, y }) {
@@ -32,7 +33,7 @@ function space({ points, labels, before, after }) {
     item.setAttribute("class", kind);
     return svg.appendChild(item);
   };
-  const box = make("path", "box"), vectors = make("path", "vectors line after"), dots = make("path", "points");
+  const floor = make("path", "floor"), box = make("path", "box"), vectors = make("path", "vectors line after"), dots = make("path", "points");
   const near = make("circle", "near"), names = ["x", "y", "z"].map(() => make("text", "axis"));
   const low = [0, 1, 2].map((i) => points.reduce((m, p) => Math.min(m, p[i]), Infinity));
   const high = [0, 1, 2].map((i) => points.reduce((m, p) => Math.max(m, p[i]), -Infinity));
@@ -43,30 +44,34 @@ function space({ points, labels, before, after }) {
   const project = (p) => {
     const a = (turn * Math.PI) / 180, b = (lift * Math.PI) / 180, d = p.map((v, i) => v - middle[i]);
     const across = Math.cos(a) * d[0] - Math.sin(a) * d[1], away = Math.sin(a) * d[0] + Math.cos(a) * d[1];
-    const up = Math.cos(b) * d[2] + Math.sin(b) * away, scale = 360 / size;
+    const up = Math.cos(b) * d[2] + Math.sin(b) * away, scale = 400 / size;
     return [300 + scale * across, 210 - scale * up];
   };
   const place = (p) => project(p).map((v) => v.toFixed(1)).join(" ");
   const say = (text) => {
-    const { times } = when === "after" ? after : before;
-    says.textContent = `${text}Errors ${when} calibration, enlarged ${times.toLocaleString("en")} times.`;
+    says.textContent = `${text}Errors ${when} calibration, ${(when === "after" ? after : before).note}.`;
   };
   const draw = () => {
-    const { vectors: errors, times } = when === "after" ? after : before;
+    const { lines } = when === "after" ? after : before;
     places = points.map(project);
     dots.setAttribute("d", points.map((p) => `M${place(p)}h0`).join(""));
     vectors.setAttribute("class", `vectors line ${when}`);
-    vectors.setAttribute("d", points.map((p, k) => `M${place(p)}L${place(p.map((v, i) => v + times * errors[k][i]))}`).join(""));
+    vectors.setAttribute("d", points.map((p, k) => `M${place(p)}L${place(p.map((v, i) => v + lines[k][i]))}`).join(""));
     const corner = (k) => low.map((v, i) => ((k >> i) & 1 ? high[i] : v));
     const edges = [];
     for (let k = 0; k < 8; k++)
       for (let i = 0; i < 3; i++) if (!((k >> i) & 1)) edges.push(`M${place(corner(k))}L${place(corner(k | (1 << i)))}`);
     box.setAttribute("d", edges.join(""));
-    names.forEach((name, i) => {
-      const [px, py] = project(low.map((v, j) => (i === j ? (v + high[j]) / 2 : v)));
+    floor.setAttribute("d", `M${[0, 1, 3, 2].map((k) => place(corner(k))).join("L")}Z`);
+    names.forEach((name, i) => {  // beside the outermost of the four edges along this axis
+      const middles = [0, 1, 2, 3].map((k) => {
+        const [a, b] = [0, 1, 2].filter((j) => j !== i);
+        return project(corner(((k & 1) << a) | ((k >> 1) << b)).map((v, j) => (j === i ? middle[j] : v)));
+      });
+      const side = i === 2 ? 0 : 1, [px, py] = middles.sort((p, q) => (side ? q[1] - p[1] : p[0] - q[0]))[0];
       name.textContent = `${"xyz"[i]} ${(high[i] - low[i]).toFixed(2)} m`;
-      name.setAttribute("x", px);
-      name.setAttribute("y", py + 14);
+      name.setAttribute("x", side ? px : px - 40);
+      name.setAttribute("y", side ? py + 18 : py);
     });
     near.setAttribute("r", 0);
     svg.dataset.view = `${turn},${lift}`;
@@ -97,8 +102,7 @@ function space({ points, labels, before, after }) {
     near.setAttribute("r", found ? 8 : 0);
     near.setAttribute("cx", places[k][0]);
     near.setAttribute("cy", places[k][1]);
-    const error = 1000 * Math.hypot(...(when === "after" ? after : before).vectors[k]);
-    say(found ? `${labels[k]}: ${millimetres(error)}. ` : "");
+    say(found ? `${labels[k]}: ${millimetres((when === "after" ? after : before).errors[k])}. ` : "");
   });
   const steps = { ArrowLeft: [-5, 0], ArrowRight: [5, 0], ArrowUp: [0, 5], ArrowDown: [0, -5] };
   svg.addEventListener("keydown", (event) => {

@@ -19,7 +19,7 @@ from rpim_opt.files import write_text
 from rpim_opt.markup import Element, html, table, tag
 from rpim_opt.observability import combination, observe
 from rpim_opt.plots import error_bins, magnification
-from rpim_opt.record import defined, statistics
+from rpim_opt.record import definition, statistics
 from rpim_opt.robot import Array
 from rpim_opt.selection import Selection, compare, weight_grid
 from rpim_opt.svg import Axis, Chart
@@ -27,8 +27,8 @@ from rpim_opt.uncertainty import Uncertainty
 from rpim_opt.units import display
 
 HERE = Path(__file__).resolve().parent
-FEW = 30
-"""Up to so many rows their labels stand below the bars."""
+FEW, MANY, MOST = 30, 100, 2000
+"""Rows up to which labels stand below the bars; from which errors are points; that are drawn in space at most."""
 SETS = ("validation", "identification")
 
 
@@ -78,7 +78,11 @@ def page(result: Calibration) -> str:
         tag("title", f"Calibration: {title}"),
         tag("style", style),
     )
-    main = tag("main", tag("header", tag("p", "Robot calibration", class_="kind"), tag("h1", title)), *parts)
+    main = tag(
+        "main",
+        tag("header", tag("p", f"Robot calibration, {result.record.made[:10]}", class_="kind"), tag("h1", title)),
+        *parts,
+    )
     body = tag("body", main, tag("script", embedded, id="data", type="application/json"), tag("script", script))
     return "<!doctype html>\n" + html(tag("html", head, body, lang="en")) + "\n"
 
@@ -95,10 +99,11 @@ def _section(name: str, *content: Element | str) -> list[Element]:
     return [tag("section", tag("h2", name, id=key), *content, aria_labelledby=key)]
 
 
-def _table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Element:
+def _table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], prose: bool = False) -> Element:
+    """Return a table that scrolls by itself where it is too wide; with ``prose`` its last column is running text."""
     grid = table(header, rows)
     grid.insert(0, tag("caption", caption))
-    return tag("div", grid, class_="wide", tabindex="0", role="region", aria_label=caption)
+    return tag("div", grid, class_="wide prose" if prose else "wide", tabindex="0", role="region", aria_label=caption)
 
 
 def _figure(chart: Chart, caption: str, *legend: tuple[str, str]) -> Element:
@@ -134,13 +139,17 @@ def _summary(result: Calibration) -> list[Element]:
     name, data = next(iter(_sets(result).items()))
     before, after = statistics(result.nominal_errors(data)), statistics(result.errors(data))
     n, what = after["count"], _quantity(result)
-    moves = "falls" if after["mean_mm"] < before["mean_mm"] else "rises"
+    ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
+    factor = f"{ratio:.1f}" if ratio < 10 else f"{ratio:.0f}"
+    moves, times = ("falls", f", by a factor of {factor}") if ratio > 1 else ("rises", "")
     where = (
         f"On {n} measurements that the calibration did not see"
         if name == "validation"
         else f"On the {n} measurements that the calibration itself used (none were kept apart to check it)"
     )
-    sentence = f"{where}, the mean {what} {moves} from {_mm(before['mean_mm'])} mm to {_mm(after['mean_mm'])} mm."
+    sentence = (
+        f"{where}, the mean {what} {moves} from {_mm(before['mean_mm'])} mm to {_mm(after['mean_mm'])} mm{times}."
+    )
     if not result.converged:
         sentence = f"This calibration did not converge and should not be used. {sentence}"
     figures = [
@@ -164,29 +173,24 @@ def _summary(result: Calibration) -> list[Element]:
 
 
 def _errors(result: Calibration) -> list[Element]:
-    rows, figures, axes = [], [], []
+    rows, angles, blocks = [], [], []
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     for name, data in _sets(result).items():
         sets = {"before": 1e3 * result.nominal_errors(data), "after": 1e3 * result.errors(data)}
         for when, errors in sets.items():
-            s = statistics(errors / 1e3)
-            high = float(np.percentile(errors, 95))
-            figures_mm = [_mm(v) for v in (s["mean_mm"], s["rms_mm"], high, s["max_mm"])]
-            rows.append([f"{name}, {when}", str(s["count"]), *figures_mm])
-        figures += [_bars(result, name, data, sets), _histogram(name, sets)]
+            s, high = statistics(errors / 1e3), float(np.percentile(errors, 95))
+            rows.append([f"{name}, {when}", str(s["count"]), *map(_mm, (s["mean_mm"], s["rms_mm"], high, s["max_mm"]))])
+        figures = [_bars(result, name, data, sets), _histogram(name, sets)]
         vectors = [1e3 * result.error_vectors(data, nominal=nominal) for nominal in (True, False)]
         seen = np.isfinite(vectors[0]).all(axis=1)
         if seen.any():
-            figures.append(_axes(name, [v[seen] for v in vectors]))
-            for axis, a, b in zip("xyz", *(v[seen].T for v in vectors), strict=True):
-                spread = [f"{f(v):+.3f}" if f is np.mean else f"{f(v):.3f}" for v in (a, b) for f in (np.mean, np.std)]
-                axes.append([f"{name}, {axis}", *spread])
-    angles = []
-    for name, data in _sets(result).items():
-        turned = 1e3 * result.errors(data, "angle")
-        if len(turned := turned[np.isfinite(turned)]):
-            figures_mrad = [f"{v:.3f}" for v in (turned.mean(), np.sqrt(np.mean(turned**2)), turned.max())]
-            angles.append([f"{name}, after", str(len(turned)), *figures_mrad])
+            figures += _axes(name, [v[seen] for v in vectors])
+        blocks += [tag("h3", f"{name.capitalize()} rows"), tag("div", *figures, class_="figures")]
+        for when, errors in (("before", result.nominal_errors), ("after", result.errors)):
+            mrad = 1e3 * errors(data, "angle")
+            if len(mrad := mrad[np.isfinite(mrad)]):
+                spread = [f"{v:.3f}" for v in (mrad.mean(), np.sqrt(np.mean(mrad**2)), mrad.max())]
+                angles.append([f"{name}, {when}", str(len(mrad)), *spread])
     note = "Before: the robot of the drawing"
     note += ", its base, reflectors and other frames fitted to the identification data." if fitted.any() else "."
     used = "Identification rows were used to find the parameters; validation rows were not used for anything."
@@ -195,13 +199,8 @@ def _errors(result: Calibration) -> list[Element]:
         tag("p", f"{note} {used}"),
         _table("Error [mm]", ["data", "rows", "mean", "RMS", "95 % below", "largest"], rows),
         *([_table("Orientation error [mrad]", ["data", "rows", "mean", "RMS", "largest"], angles)] if angles else []),
-        tag("div", *figures, class_="figures"),
-        *(
-            [_table("Error by axis of the instrument, measured minus modelled [mm]",
-                    ["data", "mean before", "spread before", "mean after", "spread after"], axes)]
-            if axes else []
-        ),
-    )  # fmt: skip
+        *blocks,
+    )
 
 
 BEFORE_AFTER = (("before", "before"), ("after", "after"))
@@ -217,12 +216,15 @@ def _bars(result: Calibration, name: str, data: Dataset, sets: Mapping[str, Arra
     place = np.arange(n) + (0.0 if few else 1.0)
     for (when, errors), shift in zip(sets.items(), (-0.4, 0.0), strict=True):
         hints = [f"{label}, {when}: {_mm(e)} mm" for label, e in zip(data.label, errors, strict=True)]
-        chart.bars(place + shift, place + shift + 0.4, errors, when, hints)
+        if n > MANY:
+            chart.cloud(place, errors, when)
+        else:
+            chart.bars(place + shift, place + shift + 0.4, errors, when, hints)
     wrong = np.array([i for i, label in enumerate(data.label) if label in flagged], dtype=int)
     hints = [f"{data.label[i]}: distrusted" for i in wrong]
     chart.dots(place[wrong] + 0.2, 1.15 * sets["after"][wrong], "mark", hints)
     legend = [*BEFORE_AFTER, *([("mark", "distrusted")] if len(wrong) else [])]
-    return _figure(chart, f"Every {name} row. Logarithmic: a step of the grid is ten times the error.", *legend)
+    return _figure(chart, "Every row, on a logarithmic scale.", *legend)
 
 
 def _histogram(name: str, sets: Mapping[str, Array]) -> Element:
@@ -235,10 +237,10 @@ def _histogram(name: str, sets: Mapping[str, Array]) -> Element:
         bins = np.flatnonzero(count)
         hints = [f"{when}: {count[k]} rows from {_mm(edges[k])} to {_mm(edges[k + 1])} mm" for k in bins]
         chart.bars(edges[bins], edges[bins + 1], count[bins], when, hints)
-    return _figure(chart, f"How often each error occurs in the {name} rows.", *BEFORE_AFTER)
+    return _figure(chart, "How many rows have which error.", *BEFORE_AFTER)
 
 
-def _axes(name: str, vectors: Sequence[Array]) -> Element:
+def _axes(name: str, vectors: Sequence[Array]) -> list[Element]:
     rms = [np.sqrt(np.mean(v**2, axis=0)) for v in vectors]
     every = np.concatenate(rms)
     y = Axis("RMS [mm]", (max(0.5 * float(every.min()), 1e-7), max(float(every.max()), 1e-6)), log=True)
@@ -246,7 +248,15 @@ def _axes(name: str, vectors: Sequence[Array]) -> Element:
     for (when, _), shift, values in zip(BEFORE_AFTER, (-0.3, 0.0), rms, strict=True):
         hints = [f"{axis}, {when}: {_mm(v)} mm" for axis, v in zip("xyz", values, strict=True)]
         chart.bars(np.arange(3) + shift, np.arange(3) + shift + 0.3, values, when, hints)
-    return _figure(chart, f"Along the axes of the instrument, {name} rows.", *BEFORE_AFTER)
+    rows = []
+    for i, axis in enumerate("xyz"):
+        means, spreads = [v[:, i].mean() for v in vectors], [v[:, i].std() for v in vectors]
+        rows.append([axis, *(f"{m:+.3f} ± {s:.3f}" for m, s in zip(means, spreads, strict=True))])
+    caption = "Measured minus modelled, mean ± standard deviation [mm]"
+    return [
+        _figure(chart, "Along the axes of the instrument.", *BEFORE_AFTER),
+        _table(caption, ["axis", "before", "after"], rows),
+    ]
 
 
 def _space(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
@@ -261,10 +271,10 @@ def _space(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
     P, B, A = (np.vstack(part) for part in (points, before, after))
     if not len(P):
         return []
+    drawn = np.linspace(0, len(P) - 1, min(len(P), MOST)).astype(int)
     embedded["space"] = {
-        "points": P.round(6).tolist(), "labels": labels,
-        "before": {"vectors": B.round(9).tolist(), "times": magnification(P, B)},
-        "after": {"vectors": A.round(9).tolist(), "times": magnification(P, A)},
+        "points": P[drawn].round(6).tolist(), "labels": [labels[i] for i in drawn],
+        "before": _lines(P[drawn], B[drawn]), "after": _lines(P[drawn], A[drawn]),
     }  # fmt: skip
     low, high = P.min(axis=0), P.max(axis=0)
     span = ", ".join(f"{c} {a:.2f} to {b:.2f} m" for c, a, b in zip("xyz", low, high, strict=True))
@@ -279,11 +289,22 @@ def _space(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
     return _section(
         "Errors in space",
         tag("p", f"{len(P)} measured positions in the instrument's frame, {span}; a line from each shows which way and "
-            "how far the measurement lies off the model. Turn with the mouse, a finger or the arrow keys."),
+            "how far the measurement lies off the model. Turn with the mouse, a finger or the arrow keys."
+            + (f" {len(drawn)} of them are drawn." if len(drawn) < len(P) else "")),
         tag("div", *choices, *views, class_="controls"),
         view,
         tag("p", "The figure needs the page's script.", id="space-says", aria_live="polite", class_="says"),
     )  # fmt: skip
+
+
+def _lines(points: Array, vectors: Array) -> dict[str, Any]:
+    """Return errors [m] as lines to draw [m]: enlarged, those of blunders cut so that the others can be seen."""
+    length = np.linalg.norm(vectors, axis=1)
+    longest = 3 * float(np.percentile(length, 90))
+    cut = vectors * np.minimum(1.0, longest / np.maximum(length, 1e-12))[:, None]
+    times, beyond = magnification(points, cut), int(np.count_nonzero(length > longest))
+    note = f"enlarged {times:,.0f} times" + (f", {beyond} beyond {_mm(1e3 * longest)} mm cut" if beyond else "")
+    return {"lines": (times * cut).round(5).tolist(), "errors": (1e3 * length).round(6).tolist(), "note": note}
 
 
 def _weight(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
@@ -340,7 +361,7 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
             tag("div", tag("label", "Weight", slider), tag("output", id="weight-says", for_="weight"), class_="side"),
             class_="figures"),
         _table("What each selector takes, from the identification data alone",
-               ["selector", "weight", f"mean error, {name} [mm]", "why"], rows),
+               ["selector", "weight", f"mean error, {name} [mm]", "why"], rows, prose=True),
     )  # fmt: skip
 
 
@@ -361,15 +382,17 @@ def _parameters(result: Calibration) -> list[Element]:
         _, si = display(free.dimensions[i])
         bound = f"±{free.tolerance[i] / si:.4g}" if np.isfinite(free.tolerance[i]) else ""
         spread = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
-        name = row["name"] + (" (at its bound)" if row["name"] in held else "")
+        name = f"{row['name']} [{row['unit']}]" + (", at its bound" if row["name"] in held else "")
         figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}", spread, bound]
-        rows.append([name, row["unit"], *figures])
+        rows.append([name, *figures])
+    head = ["parameter", "nominal", "identified", "deviation", "± (95 %)", "tolerance"]
+    if not np.isfinite(free.tolerance).any():
+        head, rows = head[:-1], [row[:-1] for row in rows]
     charts = [
         _deviations(result, dimension, half)
         for dimension in ("length", "angle")
         if np.any(~free.of_frames & (np.array(free.dimensions) == dimension))
     ]
-    head = ["parameter", "unit", "nominal", "identified", "deviation", "± (95 %)", "tolerance"]
     return _section(
         "Parameters", tag("p", note), tag("div", *charts, class_="figures"),
         _table("Identified parameters", head, rows),
@@ -397,7 +420,11 @@ def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
                 chart.line(np.array([end, end]), np.array([k - 0.35, k + 0.35]), "mark")
         chart.dots(x[[k]], np.array([k]), "after", [f"{name}: {x[k]:+.4f} ± {spread[k]:.4f} {unit}"])
     legend = [("after", "deviation and interval"), *([("mark", "tolerance")] if len(stated) else [])]
-    return _figure(chart, f"The robot's own {dimension} parameters against the drawing.", *legend)
+    return _figure(
+        chart,
+        f"The robot's own {dimension} parameters against the drawing; intervals beyond the edge are cut.",
+        *legend,
+    )
 
 
 def _identifiability(result: Calibration) -> list[Element]:
@@ -408,9 +435,7 @@ def _identifiability(result: Calibration) -> list[Element]:
     if rank < n:
         text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."
     told = [f"No measurement depends on {', '.join(found.unseen)}."] if found.unseen else []
-    told += [
-        f"Free to change without changing any measurement: {combination(c)} (in mm and mrad)." for c in found.redundant
-    ]
+    told += [f"No measurement changes along {combination(c)} [mm, mrad]." for c in found.redundant]
     indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())
     beta, s, _ = result.program.model.svd
     k = np.flatnonzero(s > 0)
@@ -444,7 +469,7 @@ def _rows_apart(result: Calibration) -> list[Element]:
         text = "No row stands out beyond what one good set of data in a hundred would show, and none was left out."
         return _section("Distrusted rows", tag("p", text))
     head = ["row", "residual [sigmas]", "error [mm]", "what became of it"]
-    return _section("Distrusted rows", _table("Rows that stand out or were left out", head, rows))
+    return _section("Distrusted rows", _table("Rows that stand out or were left out", head, rows, prose=True))
 
 
 def _convergence(result: Calibration) -> list[Element]:
@@ -469,19 +494,17 @@ def _convergence(result: Calibration) -> list[Element]:
 
 
 def _provenance(result: Calibration) -> list[Element]:
-    record, robot, f = result.record, result.problem.robot, result.formulation
+    record, robot = result.record, result.problem.robot
     rows = []
     for name, data in _sets(result).items():
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
             rows.append([f"{name}, {what}", str(len(block.row)), _noise(block)])
-    penalty = "no penalty" if f.penalty is None else f"weight {result.weight:.4g} times a penalty"
     facts = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",
         "Robot": " - ".join(filter(None, [robot.name, f"{robot.dof} joints", robot.source])),
-        "Formulation": f"{f.name}: a convex loss and {penalty}, {len(f.constraints)} constraints"
-        + ("" if defined(f) else " (functions of a script, which are not in the result's file)"),
+        "Formulation": f"{result.formulation.name}: {_formulation(result)}",
         "Made": record.made,
         "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
     }
@@ -489,11 +512,27 @@ def _provenance(result: Calibration) -> list[Element]:
     return _section(
         "Where the data come from",
         tag("dl", *(tag("div", tag("dt", key), tag("dd", value)) for key, value in facts.items()), class_="facts"),
-        _table("Measurements and their declared standard deviations", ["data", "rows", "declared"], rows),
-        *([_table("Input files", ["file", "SHA-256"], files)] if files else []),
+        _table("Measurements and their declared standard deviations", ["data", "rows", "declared"], rows, prose=True),
+        *([_table("Input files", ["file", "SHA-256"], files, prose=True)] if files else []),
         tag("p", "All figures on this page were computed from the measurements and parameters of the calibration when "
             "the page was written."),
     )  # fmt: skip
+
+
+def _formulation(result: Calibration) -> str:
+    """Return what is minimized, in the words of the result's file."""
+
+    def said(term: Any) -> str:
+        if isinstance(term, list):
+            return f"{term[0]}({', '.join(map(str, term[1:]))})"
+        return term or "a function of a script, not in the file"
+
+    parts = definition(result.formulation)
+    over = "" if parts["penalty_over"] == "none" else f" over {said(parts['penalty_over'])}"
+    text = f"loss {said(parts['loss'])} of each {parts['loss_over']}, penalty {said(parts['penalty'])}{over}"
+    bounds = [said(c) for c in parts["constraints"]]
+    bounds += [] if parts["largest"] is None else [f"no configuration off by more than {parts['largest']:g} sigmas"]
+    return f"{text}, constraints: {', '.join(bounds) or 'none'}"
 
 
 def _noise(block: Any) -> str:

@@ -22,7 +22,7 @@ class Axis:
         if log:
             low, high = np.log10(low), np.log10(high)
         room = 0.0 if names else 0.04 * (high - low) or 0.5
-        self.low, self.high = low - room, high + room
+        self.low, self.high = low - room * (log or low != 0), high + room  # counts stand on zero
         self.start, self.end = 0.0, 1.0
 
     def __call__(self, values: ArrayLike) -> Array:
@@ -55,7 +55,7 @@ class Axis:
             if span / (m * 10.0 ** np.floor(np.log10(span / 5))) <= 6
         )
         values = step * np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1)
-        return [(float(v), f"{v:.6g}") for v in np.round(values / step) * step]
+        return [(float(v), f"{v:.6g}") for v in np.round(values / step) * step + 0.0]
 
 
 class Chart:
@@ -76,8 +76,8 @@ class Chart:
         longest = max((len(text) for _, text in y.ticks()), default=1)
         upright = sum(len(name) + 1 for name in x.names) * 7 > WIDTH - 80
         self.upright = upright and bool(x.names)
-        below = 7 * max(len(name) for name in x.names) if self.upright else 16
-        x.start, x.end = 24.0 + 7 * longest, float(WIDTH - RIGHT)
+        below = 4 + 8 * max(len(name) for name in x.names) if self.upright else 16
+        x.start, x.end = 30.0 + 7 * longest, float(WIDTH - RIGHT)
         y.start, y.end = float(height - below - (24 if x.label else 8)), float(TOP)
         if y.names:
             y.start, y.end = y.end, y.start
@@ -92,6 +92,11 @@ class Chart:
         """Draw a line through points."""
         places = [f"{a:g},{b:g}" for a, b in zip(self.x(x), self.y(y), strict=True)]
         self.add("path", d="M" + "L".join(places), class_=f"line {class_}")
+
+    def cloud(self, x: ArrayLike, y: ArrayLike, class_: str) -> None:
+        """Draw many points as one element."""
+        places = [f"M{a:g} {b:g}h0" for a, b in zip(self.x(x), self.y(y), strict=True)]
+        self.add("path", d="".join(places), class_=f"cloud {class_}")
 
     def dots(self, x: ArrayLike, y: ArrayLike, class_: str, hints: Sequence[str] = (), r: float = 3.5) -> None:
         """Draw points."""

@@ -20,10 +20,11 @@ def saved(tmp_path: Path, result: ro.Calibration, record: ro.Record | None = Non
     return ro.load_result(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", ["paper_arm", "blunders", "cable", "constrained", "distance", "joints", "markers", "mixed", "plane", "pose",
-             "scara", "seven_axis", "far_frames", "tracker"],
-)  # fmt: skip
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in (
+    "cable", "distance", "far_frames", "markers", "plane", "scara", "seven_axis", "sphere", "tracker")]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["paper_arm", "blunders", "constrained", "joints", "mixed", "pose", *SLOW])
 def test_a_loaded_result_is_the_same_to_the_last_bit(tmp_path: Path, name: str) -> None:
     instance = ro.load(name, "everything" if name == "constrained" else None)
     result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
