@@ -131,11 +131,12 @@ class Calibration:
         Parameters
         ----------
         path
-            The file.
+            The file, or a folder for ``result.json``.
         record
             Title, validation data and input files, as in ``load(...).record``; the calibration's own by default.
         """
-        write_json(Path(path), content(self if record is None else replace(self, record=record)))
+        path = Path(path) / "result.json" if Path(path).is_dir() else Path(path)
+        write_json(path, content(self if record is None else replace(self, record=record)))
 
     def forward(self, q: Array, marker: str = "", torque: Array | None = None) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.

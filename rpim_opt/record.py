@@ -256,9 +256,11 @@ def content(result: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def statistics(errors: Array) -> dict[str, float | int]:
-    """Return mean, RMS, largest [mm] and number of errors [m]."""
-    mm = 1e3 * errors
+def statistics(errors: Array) -> dict[str, Any]:
+    """Return mean, RMS, largest [mm] and number of errors [m]; None for the errors of measurements without a length."""
+    mm = 1e3 * errors[np.isfinite(errors)]
+    if not len(mm):
+        return {"mean_mm": None, "rms_mm": None, "max_mm": None, "count": 0}
     rms = float((mm**2).mean() ** 0.5)
     return {"mean_mm": float(mm.mean()), "rms_mm": rms, "max_mm": float(mm.max()), "count": len(mm)}
 

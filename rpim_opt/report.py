@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +15,7 @@ import numpy as np
 
 from rpim_opt.calibration import Calibration
 from rpim_opt.dataset import Dataset
-from rpim_opt.exceptions import InputError
+from rpim_opt.exceptions import InputError, NoSolutionFound, RpimError
 from rpim_opt.files import write_text
 from rpim_opt.markup import Element, html, table, tag
 from rpim_opt.observability import combination, observe
@@ -29,7 +30,6 @@ from rpim_opt.units import display
 HERE = Path(__file__).resolve().parent
 FEW, MANY, MOST = 30, 100, 2000
 """Rows up to which labels stand below the bars; from which errors are points; that are drawn in space at most."""
-SETS = ("validation", "identification")
 
 
 def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
@@ -51,7 +51,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     Raises
     ------
     InputError
-        For validation data that do not belong to the problem.
+        For validation data that do not belong to the problem, or measurements without a length.
     """
     record = calibration.record.dated()
     record = record if validation is None else replace(record, validation=validation)
@@ -127,6 +127,13 @@ def _sets(result: Calibration) -> dict[str, Dataset]:
     return ({"validation": validation} if validation else {}) | {"identification": result.problem.data}
 
 
+def _repeated(result: Calibration) -> int:
+    """Return how many validation rows were measured where an identification row was too."""
+    validation = result.record.validation
+    known = {q.tobytes() for q in result.problem.data.q}
+    return sum(q.tobytes() in known for q in validation.q) if validation else 0
+
+
 def _quantity(result: Calibration) -> str:
     kinds = {block.measurement.name for data in _sets(result).values() for block in data.blocks}
     return "position error" if kinds <= {"position", "pose"} else "error"
@@ -139,6 +146,8 @@ def _summary(result: Calibration) -> list[Element]:
     name, data = next(iter(_sets(result).items()))
     before, after = statistics(result.nominal_errors(data)), statistics(result.errors(data))
     n, what = after["count"], _quantity(result)
+    if not n:
+        raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     factor = f"{ratio:.1f}" if ratio < 10 else f"{ratio:.0f}"
     moves, times = ("falls", f", by a factor of {factor}") if ratio > 1 else ("rises", "")
@@ -165,6 +174,8 @@ def _summary(result: Calibration) -> list[Element]:
     alarms = [line for line in result.remarks() if line != result.message or not result.converged]
     if name == "identification":
         alarms.append("Without validation data the errors elsewhere in the workspace are not known to be as small.")
+    if repeated := _repeated(result):
+        alarms.append(f"{repeated} validation rows repeat configurations of the identification: they are no check.")
     return [
         tag("p", sentence, class_="lead" if result.converged else "lead alarm"),
         tag("dl", *cards, class_="cards"),
@@ -177,10 +188,13 @@ def _errors(result: Calibration) -> list[Element]:
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     for name, data in _sets(result).items():
         sets = {"before": 1e3 * result.nominal_errors(data), "after": 1e3 * result.errors(data)}
+        lengths = np.isfinite(sets["after"])
+        sets = {when: errors[lengths] for when, errors in sets.items()}
+        labels = [data.label[i] for i in np.flatnonzero(lengths)]
         for when, errors in sets.items():
             s, high = statistics(errors / 1e3), float(np.percentile(errors, 95))
             rows.append([f"{name}, {when}", str(s["count"]), *map(_mm, (s["mean_mm"], s["rms_mm"], high, s["max_mm"]))])
-        figures = [_bars(result, name, data, sets), _histogram(name, sets)]
+        figures = [_bars(result, name, labels, sets), _histogram(name, sets)]
         vectors = [1e3 * result.error_vectors(data, nominal=nominal) for nominal in (True, False)]
         seen = np.isfinite(vectors[0]).all(axis=1)
         if seen.any():
@@ -206,24 +220,24 @@ def _errors(result: Calibration) -> list[Element]:
 BEFORE_AFTER = (("before", "before"), ("after", "after"))
 
 
-def _bars(result: Calibration, name: str, data: Dataset, sets: Mapping[str, Array]) -> Element:
-    n, every = len(data), np.concatenate(list(sets.values()))
+def _bars(result: Calibration, name: str, labels: Sequence[str], sets: Mapping[str, Array]) -> Element:
+    n, every = len(labels), np.concatenate(list(sets.values()))
     ends = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7), max(float(every.max()), 1e-6)
-    few = n <= FEW and max(map(len, data.label)) <= 12
-    x = Axis("" if few else "row", (0.5, n + 0.5), names=data.label if few else ())
+    few = n <= FEW and max(map(len, labels)) <= 12
+    x = Axis("" if few else "row", (0.5, n + 0.5), names=labels if few else ())
     chart = Chart(f"Error of every {name} row before and after", x, Axis("error [mm]", ends, log=True))
-    flagged = {flag.label for flag in result.flagged} if name == "identification" else set()
     place = np.arange(n) + (0.0 if few else 1.0)
     for (when, errors), shift in zip(sets.items(), (-0.4, 0.0), strict=True):
-        hints = [f"{label}, {when}: {_mm(e)} mm" for label, e in zip(data.label, errors, strict=True)]
         if n > MANY:
             chart.cloud(place, errors, when)
         else:
+            hints = [f"{label}, {when}: {_mm(e)} mm" for label, e in zip(labels, errors, strict=True)]
             chart.bars(place + shift, place + shift + 0.4, errors, when, hints)
-    wrong = np.array([i for i, label in enumerate(data.label) if label in flagged], dtype=int)
-    hints = [f"{data.label[i]}: distrusted" for i in wrong]
+    flagged = {flag.label for flag in result.flagged} if name == "identification" else set()
+    wrong = [i for i, label in enumerate(labels) if label in flagged]
+    hints = [f"{labels[i]}: distrusted" for i in wrong]
     chart.dots(place[wrong] + 0.2, 1.15 * sets["after"][wrong], "mark", hints)
-    legend = [*BEFORE_AFTER, *([("mark", "distrusted")] if len(wrong) else [])]
+    legend = [*BEFORE_AFTER, *([("mark", "distrusted")] if wrong else [])]
     return _figure(chart, "Every row, on a logarithmic scale.", *legend)
 
 
@@ -312,26 +326,27 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
     said = tag("p", result.weight_sentence())
     if formulation.penalty is None or not formulation.solvable or result.weight <= 0:
         return _section("Weight of the penalty", said)
-    chosen = compare(program)
-    mine = {result.selector: result.selection or Selection(result.weight, "given", np.array([]), np.array([]), True)}
+    given = Selection(result.weight, "given", np.array([]), np.array([]), True)
+    chosen = {**compare(program), result.selector: result.selection or given}
     grid = weight_grid(program, 80 if program.closed_form else 30)
-    chosen = {**chosen, **mine}
-    every = np.unique([*grid, *(s.weight for s in chosen.values() if s.weight > 0)])
-    estimates, scale = program.path(every), result.problem.parameters.free.scale
+    estimates, scale = [], result.problem.parameters.free.scale
+    for weight in np.unique([*grid, *(s.weight for s in chosen.values() if s.weight > 0)]):
+        with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
+            estimates += program.path([weight])
+    every = np.array([e.weight for e in estimates])
     residual = np.sqrt([e.loss for e in estimates])
     solution = np.sqrt([e.penalty for e in estimates])
     name, data = next(iter(_sets(result).items()))
     problem = result.problem.on(data)
-    error = [1e3 * float(problem.errors(scale * e.z).mean()) for e in estimates]
-    tiny = 1e-12 * max(float(solution.max()), 1e-300)
+    error = [1e3 * float(np.nanmean(problem.errors(scale * e.z))) for e in estimates]
     x = Axis("root of the loss (residual norm) [sigmas]", (max(residual.min(), 1e-9), residual.max()), log=True)
-    shown = solution > max(tiny, 1e-4 * float(np.median(solution)))
+    shown = solution > 1e-4 * float(np.median(solution))  # not where a lasso has nothing left
     y = Axis("root of the penalty [scales]", (solution[shown].min(), solution.max()), log=True)
     chart = Chart("L-curve: misfit against size of the deviations", x, y, 330)
     chart.line(residual[shown], solution[shown], "ink")
     at = {n: int(np.argmin(np.abs(np.log(every / s.weight)))) for n, s in chosen.items() if s.weight > 0}
     others = [k for n, k in at.items() if n != result.selector]
-    chart.dots(residual[others], solution[others], "other", [f"{n}" for n in at if n != result.selector])
+    chart.dots(residual[others], solution[others], "other", [n for n in at if n != result.selector])
     k = at[result.selector]
     chart.dots(residual[[k]], solution[[k]], "mark", [f"chosen, {result.selector}"], r=6)
     cursor = {"cx": f"{float(x(residual[k])):g}", "cy": f"{float(y(solution[k])):g}"}
@@ -344,7 +359,7 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
         "of": name, "takers": {str(place): ", ".join(names) for place, names in takers.items()}, "chosen": k,
         "x": x(residual).tolist(), "y": y(solution).tolist(),
     }  # fmt: skip
-    slider = tag("input", type="range", id="weight", min=0, max=len(every) - 1, value=k, aria_label="weight")
+    slider = tag("input", type="range", id="weight", min=0, max=len(every) - 1, value=k)
     figure = _figure(
         chart, "Each point is the solution at one weight: little penalty above left, much below right.",
         ("mark", "chosen"), ("other", "other selectors"),
@@ -412,13 +427,13 @@ def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
     )
     axis = Axis(f"deviation [{unit}]", (-reach, reach))
     chart = Chart(f"Deviations of the {dimension} parameters", axis, Axis("", names=names), 60 + 17 * len(own))
-    chart.line(np.zeros(2), np.array([-0.5, len(own) - 0.5]), "zero")
+    chart.line([0, 0], [-0.5, len(own) - 0.5], "zero")
     for k, name in enumerate(names):
-        chart.line(np.array([x[k] - spread[k], x[k] + spread[k]]), np.array([k, k]), "after")
+        chart.line([x[k] - spread[k], x[k] + spread[k]], [k, k], "after")
         if np.isfinite(bound[k]):
             for end in (-bound[k], bound[k]):
-                chart.line(np.array([end, end]), np.array([k - 0.35, k + 0.35]), "mark")
-        chart.dots(x[[k]], np.array([k]), "after", [f"{name}: {x[k]:+.4f} ± {spread[k]:.4f} {unit}"])
+                chart.line([end, end], [k - 0.35, k + 0.35], "mark")
+        chart.dots(x[[k]], [k], "after", [f"{name}: {x[k]:+.4f} ± {spread[k]:.4f} {unit}"])
     legend = [("after", "deviation and interval"), *([("mark", "tolerance")] if len(stated) else [])]
     return _figure(
         chart,
@@ -431,7 +446,7 @@ def _identifiability(result: Calibration) -> list[Element]:
     found = observe(result.problem)
     n, rank = len(found.names), found.rank
     text = f"{found.configurations} configurations, {len(result.program.model.b)} equations for {n} parameters, "
-    text += f"of which the data determine {rank} combinations."
+    text += f"of which the data determine {rank} combinations at nominal."
     if rank < n:
         text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."
     told = [f"No measurement depends on {', '.join(found.unseen)}."] if found.unseen else []
@@ -449,11 +464,9 @@ def _identifiability(result: Calibration) -> list[Element]:
     )
     legend = [("ink", "singular value s"), ("after", "data |u'b|")]
     if weight > 0:
-        chart.line(np.array([1.0, max(len(k), 2)]), np.full(2, np.sqrt(weight)), "mark")
+        chart.line([1, max(len(k), 2)], [np.sqrt(weight)] * 2, "mark")
         legend.append(("mark", "root of the weight"))
-    caption = (
-        "Picard's condition: directions below the line are held near nominal by the penalty; data near 1 are noise."
-    )
+    caption = "At the solution (Picard's condition): directions below the line are held by the penalty; data near 1 are noise."
     return _section(
         "What the data can tell",
         tag("p", text), *_list(told),
@@ -485,8 +498,8 @@ def _convergence(result: Calibration) -> list[Element]:
             f"constraints missed by {c.violation:.1e}",
         ]
         said = f"Checked anew at the solution: {', '.join(lines)} (in units of the scales)."
-    except InputError:
-        said = "The solution cannot be checked anew: the formulation's functions are not in the file."
+    except RpimError as error:
+        said = f"The solution cannot be checked anew. {error}"
     return _section(
         "Convergence", tag("p", f"{result.message} {said}"),
         _table("Passes of the loop", ["pass", "objective", "step [scales]", "weight"], rows),

@@ -38,7 +38,7 @@ ORDER = {
     "results": set(),
     "baselines": set(),
     "design": set(),
-    "plots": set(),
+    "plots": {"matplotlib"},
     "svg": set(),
     "report": set(),
     "inspection": set(),

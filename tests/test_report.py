@@ -141,6 +141,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     result = ro.calibrate(stopped.problem, ro.tikhonov, 1.0, max_iterations=1)
     text = page(result)
     assert "This calibration did not converge and should not be used." in text
+    assert "40 validation rows repeat" in page(replace(result, record=ro.Record(validation=result.problem.data)))
     assert "(none were kept apart to check it)" in text
     assert "Without validation data" in text
     text = page(result_of("blunders", ro.robust))

@@ -16,7 +16,7 @@ from tests.test_cli import run
 
 
 def saved(tmp_path: Path, result: ro.Calibration, record: ro.Record | None = None) -> ro.Calibration:
-    result.save(tmp_path / "result.json", record)
+    result.save(tmp_path, record)
     return ro.load_result(tmp_path)
 
 
@@ -213,3 +213,17 @@ def test_a_notebook_shows_labels_as_text() -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script" not in page
     assert page.count("<tr>") == 1 + len(result.x)
+
+
+def test_measurements_without_a_length_are_kept_too(tmp_path: Path) -> None:
+    tilt = ro.Measurement("tilt", model=lambda T: T[2, 2], columns={"c": "angle"}, noise={"angle": "angle"})
+    arm = ro.load("paper_arm").problem
+    T = ro.forward_kinematics(arm.robot, arm.data.q)
+    data = ro.Dataset.of(arm.data.q, T[:, 2:3, 2], 1e-4, measurement=tilt)
+    problem = ro.CalibrationProblem(arm.robot, arm.parameters.identify(["alpha2"]), data)
+    ro.calibrate(problem, ro.tikhonov, 1.0).save(tmp_path)
+    result = ro.load_result(tmp_path, [tilt])
+    assert json.loads((tmp_path / "result.json").read_text())["identification"]["count"] == 0
+    with pytest.raises(ro.InputError, match="no measurement of a length"):
+        ro.write_report(result, tmp_path / "report.html")
+    assert not (tmp_path / "report.html").exists()
