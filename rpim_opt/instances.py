@@ -214,7 +214,8 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
             problem.on(data["validation"])
     except InputError as error:
         raise error.within(path) from None
-    used = [path, find_robot(table.robot, folder), *(folder / file for role in ROLES for file in files[role])]
+    drawing = find_robot(table.robot, folder)
+    used = {path.name: path, drawing.name: drawing, **{file: folder / file for role in ROLES for file in files[role]}}
     formulation = lookup(FORMULATIONS, table.formulation, "formulation", path)
     formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
     try:
@@ -238,7 +239,7 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         published={role: table.published.get(files[role][0], {}) for role in ROLES if files[role]},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         simulation=table.simulation,
-        files={p.name: sha256(p.read_bytes()).hexdigest() for p in used},
+        files={name: sha256(file.read_bytes()).hexdigest() for name, file in used.items()},
         excluded=table.exclude,
     )
 

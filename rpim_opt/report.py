@@ -466,7 +466,9 @@ def _identifiability(result: Calibration) -> list[Element]:
     if weight > 0:
         chart.line([1, max(len(k), 2)], [np.sqrt(weight)] * 2, "mark")
         legend.append(("mark", "root of the weight"))
-    caption = "At the solution (Picard's condition): directions below the line are held by the penalty; data near 1 are noise."
+    caption = (
+        "At the solution: the penalty holds directions below the line; data near 1 are noise (Picard's condition)."
+    )
     return _section(
         "What the data can tell",
         tag("p", text), *_list(told),

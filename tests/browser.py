@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from select import select
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -24,7 +25,7 @@ class Browser:
     """One page; ``events`` collects what the browser reports of it."""
 
     def __init__(self, write: int, read: int):
-        self.write, self.read, self.number, self.rest, self.events = write, os.fdopen(read, "rb"), 0, b"", []
+        self.write, self.read, self.number, self.rest, self.events = write, read, 0, b"", []
         self.session: dict[str, str] = {}
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self.session = {"sessionId": self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
@@ -44,7 +45,8 @@ class Browser:
 
     def message(self) -> dict[str, Any]:
         while b"\0" not in self.rest:
-            part = os.read(self.read.fileno(), 1 << 20)
+            assert select([self.read], [], [], 60)[0], "the browser does not answer"
+            part = os.read(self.read, 1 << 20)
             assert part, "the browser ended"
             self.rest += part
         message, _, self.rest = self.rest.partition(b"\0")
@@ -117,5 +119,5 @@ def browser() -> Iterator[Browser]:
             page.session = {}
             page.call("Browser.close")
             process.wait(timeout=20)
-            page.read.close()
+            os.close(ours_read)
             os.close(ours_write)

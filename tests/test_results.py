@@ -61,6 +61,21 @@ def test_a_file_says_when_and_from_what_it_was_made(monkeypatch, tmp_path) -> No
     assert record["simulated"] is False
 
 
+@pytest.mark.parametrize(
+    "selector", [ro.corner, ro.gcv, lambda program: ro.Selection(1.0, "mine", np.ones(1), np.ones(1), True)]
+)
+def test_the_evidence_for_the_weight_is_kept(tmp_path: Path, selector) -> None:
+    problem, _ = simulated(noise=5e-5)
+    result = ro.calibrate(problem, ro.tikhonov, selector)
+    again = saved(tmp_path, result).selection
+    assert result.selection is not None
+    assert again is not None
+    assert np.array_equal(again.weights, result.selection.weights)
+    assert np.array_equal(again.score, result.selection.score)
+    assert (again.name, again.weight, again.note) == (result.selector, result.weight, result.selection.note)
+    assert again.interior is bool(result.selection.interior)
+
+
 FORMULATIONS = [
     ro.Formulation("own numbers", ro.huber(1.5), cp.sum_squares, (ro.at_nominal("alpha[34]"), ro.in_ball(9.0, "a?"))),
     ro.Formulation("differences", penalty=cp.sum, penalty_over=ro.differences("a?"), largest=1e3),
