@@ -66,14 +66,24 @@ if TYPE_CHECKING:
     from rpim_opt.observability import observe as observe
     from rpim_opt.parameters import Parameters as Parameters
     from rpim_opt.parameters import model_parameters as model_parameters
+    from rpim_opt.plots import plot_error_axes as plot_error_axes
+    from rpim_opt.plots import plot_error_histogram as plot_error_histogram
+    from rpim_opt.plots import plot_error_vectors as plot_error_vectors
     from rpim_opt.plots import plot_errors as plot_errors
     from rpim_opt.plots import plot_l_curve as plot_l_curve
+    from rpim_opt.plots import plot_parameters as plot_parameters
+    from rpim_opt.plots import plot_picard as plot_picard
     from rpim_opt.plots import plot_selection as plot_selection
+    from rpim_opt.plots import plot_selectors as plot_selectors
     from rpim_opt.problem import CalibrationProblem as CalibrationProblem
     from rpim_opt.problem import LinearModel as LinearModel
+    from rpim_opt.record import Record as Record
+    from rpim_opt.report import write_report as write_report
+    from rpim_opt.results import load_result as load_result
     from rpim_opt.robot import Robot as Robot
     from rpim_opt.robot import read_robot as read_robot
     from rpim_opt.selection import Selection as Selection
+    from rpim_opt.selection import compare as compare
     from rpim_opt.selection import corner as corner
     from rpim_opt.selection import discrepancy as discrepancy
     from rpim_opt.selection import gcv as gcv
@@ -134,9 +144,13 @@ _HOME = {
     "parameters": ("Parameters", "model_parameters"),
     "frames": ("hand_eye", "register", "starting_parameters", "tool_from_distances"),
     "problem": ("CalibrationProblem", "LinearModel"),
+    "record": ("Record",),
+    "report": ("write_report",),
+    "results": ("load_result",),
     "robot": ("Robot", "read_robot"),
     "selection": (
         "Selection",
+        "compare",
         "corner",
         "discrepancy",
         "gcv",
@@ -150,7 +164,17 @@ _HOME = {
         "two_step",
     ),
     "design": ("Design", "choose", "random_candidates"),
-    "plots": ("plot_errors", "plot_l_curve", "plot_selection"),
+    "plots": (
+        "plot_error_axes",
+        "plot_error_histogram",
+        "plot_error_vectors",
+        "plot_errors",
+        "plot_l_curve",
+        "plot_parameters",
+        "plot_picard",
+        "plot_selection",
+        "plot_selectors",
+    ),
     "uncertainty": ("Uncertainty", "monte_carlo"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import casadi as ca
 import cvxpy as cp
 import numpy as np
 from scipy.stats import chi2
 
 from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError, NoSolutionFound
+from rpim_opt.files import write_json
 from rpim_opt.formulation import FEASIBLE, ConvexProgram, Estimate, Formulation, outlying, tikhonov
 from rpim_opt.frames import relocated
+from rpim_opt.markup import html_table
+from rpim_opt.measurement import Measurement, position
 from rpim_opt.problem import CalibrationProblem, LinearModel
+from rpim_opt.record import Record, content
 from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.selection import SELECTORS, Selection, Selector, disagreement
 from rpim_opt.text import table
@@ -43,6 +49,30 @@ class Flag(NamedTuple):
     label: str
     sigmas: float
     error_mm: float
+
+
+class Prediction(NamedTuple):
+    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals."""
+
+    position: Array
+    covariance: Array
+    coverage_factor: float = 1.0
+
+    @property
+    def standard(self) -> Array:
+        """Standard uncertainties (N, 3) [m] of the coordinates."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+    @property
+    def expanded(self) -> Array:
+        """Half widths (N, 3) [m] of the intervals of the coordinates."""
+        return self.coverage_factor * self.standard
+
+
+_TRANSFORM = Measurement(
+    "transform", lambda T: ca.vec(T.T), {f"t{i}{j}": "" for i in range(4) for j in range(4)}, noise={"entry": ""}
+)
+"""What `Calibration.forward` evaluates: the reflector's transform, row by row."""
 
 
 class Held(NamedTuple):
@@ -80,6 +110,8 @@ class Calibration:
         One entry a pass.
     program
         The convex program at the last linearization.
+    record
+        Where the data come from, for files and reports.
     """
 
     problem: CalibrationProblem
@@ -91,6 +123,85 @@ class Calibration:
     message: str
     history: tuple[Iteration, ...]
     program: ConvexProgram
+    record: Record = field(default_factory=Record)
+
+    def save(self, path: str | Path, record: Record | None = None) -> None:
+        """Write everything to one JSON file, which `load_result` reads; the file is whole or not written at all.
+
+        Parameters
+        ----------
+        path
+            The file, or a folder for ``result.json``.
+        record
+            Title, validation data and input files, as in ``load(...).record``; the calibration's own by default.
+        """
+        path = Path(path) / "result.json" if Path(path).is_dir() else Path(path)
+        write_json(path, content(self if record is None else replace(self, record=record)))
+
+    def forward(self, q: Array, marker: str = "", torque: Array | None = None) -> Array:
+        """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
+
+        Base, robot and tool, gears and joints' elasticity included; of `robot` alone: `forward_kinematics`.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m].
+        marker
+            The reflector; the only one by default.
+        torque
+            (N, dof) joint torques [Nm], where the compliance of joints is identified.
+        """
+        return self._at(q, _TRANSFORM, marker, torque).modelled(self.x)[0].reshape(-1, 4, 4)
+
+    def predict(self, q: Array, marker: str = "", torque: Array | None = None) -> Prediction:
+        """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
+
+        Positions in the instrument's frame; their covariance J C J', without the noise of a new measurement, at
+        coverage factor 1. `Uncertainty.predict` states the factor of a confidence.
+
+        Raises
+        ------
+        InputError
+            For a penalty without covariance (lasso).
+        """
+        if not self.linear_penalty:
+            accepted = "a squared penalty or none; `forward` gives the positions alone"
+            raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
+        problem = self._at(q, position, marker, torque)
+        J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
+        return Prediction(problem.modelled(self.x)[0], np.einsum("nij,jk,nlk->nil", J, self.covariance, J))
+
+    def _at(self, q: Array, measurement: Measurement, marker: str, torque: Array | None) -> CalibrationProblem:
+        """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
+        torques = None if torque is None else np.reshape(np.asarray(torque, dtype=float), (len(q), 1, -1))
+        return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,), torque=torques),)))
+
+    def error_vectors(self, data: Dataset | None = None, nominal: bool = False) -> Array:
+        """Return measured minus modelled position of every row, (N, 3) [m]; NaN where no position was measured."""
+        problem, x = self._nominal if nominal else (self.problem, self.x)
+        problem, start = problem.on(data) if data else problem, 0
+        vectors, residual = np.full((len(problem.data), 3), np.nan), problem.residual(x)
+        for block in problem.data.blocks:
+            names = list(block.measurement.components)
+            part = residual[start : start + len(block.row) * len(names)].reshape(-1, len(names))
+            start += part.size
+            if {"x", "y", "z"} <= set(names):
+                vectors[block.row] = part[:, [names.index(axis) for axis in "xyz"]]
+        return vectors
+
+    def measured_positions(self, data: Dataset | None = None) -> Array:
+        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
+        data, points = data or self.problem.data, np.empty((len(data or self.problem.data), 3))
+        for block in data.blocks:
+            names = list(block.measurement.columns)
+            torque = None if block.torque is None else block.torque[:, 0]
+            modelled = self.forward(block.q[:, 0], block.markers[0], torque)[:, :3, 3]
+            seen = {"x", "y", "z"} <= set(names)
+            points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]] if seen else modelled
+        return points
 
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the position error of every row, (N,) [m]; of the identification data by default.
@@ -99,14 +210,14 @@ class Calibration:
         """
         return (self.problem.on(data) if data else self.problem).errors(self.x, dimension)
 
-    def nominal_errors(self, data: Dataset | None = None) -> Array:
-        """Return the position error of every row before calibration, (N,) [m].
+    def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
+        """Return the position error of every row before calibration, (N,) [m]; with ``"angle"`` as in `errors`.
 
         The robot is as its drawing says. Frames (base, reflectors, anchors, ...) that the calibration identifies
         are fitted to the identification data first: before that they say nothing about the robot.
         """
         problem, x = self._nominal
-        return (problem.on(data) if data else problem).errors(x)
+        return (problem.on(data) if data else problem).errors(x, dimension)
 
     @cached_property
     def _nominal(self) -> tuple[CalibrationProblem, Array]:
@@ -194,7 +305,9 @@ class Calibration:
         """Return the calibration without the flagged rows, with the same formulation and selector."""
         data = self.problem.data.without({flag.label for flag in self.flagged})
         weight = SELECTORS.get(self.selection.name, self.weight) if self.selection else self.weight
-        return calibrate(self.problem.on(data), self.formulation, weight)
+        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in self.flagged}
+        record = replace(self.record, excluded={**self.record.excluded, **reasons})
+        return replace(calibrate(self.problem.on(data), self.formulation, weight), record=record)
 
     @cached_property
     def linear(self) -> LinearModel:
@@ -286,19 +399,29 @@ class Calibration:
 
     def parameter_table(self) -> str:
         """Return the identified parameters as a table of text."""
+        return table(*self._table())
+
+    def _table(self) -> tuple[list[str], list[list[str]]]:
         head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
         rows = []
         for r in self.parameter_rows():
             std = "-" if r["std"] is None else f"{r['std']:.4f}"
             figures = [f"{r['nominal']:.4f}", f"{r['identified']:.4f}", f"{r['deviation']:+.4f}", std]
             rows.append([r["name"], r["unit"], *figures])
-        return table(head, rows)
+        return head, rows
 
     def __str__(self) -> str:
         """Return the parameters and errors as a person reads them."""
+        return "\n".join([self.parameter_table(), "", *self._sentences()])
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook."""
+        return html_table(*self._table(), notes=self._sentences())
+
+    def _sentences(self) -> list[str]:
         before, after = (1e3 * e.mean() for e in (self.nominal_errors(), self.errors()))
         errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
-        return "\n".join([self.parameter_table(), "", errors, self.weight_sentence(), *self.remarks()])
+        return [errors, self.weight_sentence(), *self.remarks()]
 
     @property
     def selector(self) -> str:
@@ -331,6 +454,8 @@ class Calibration:
                 f"{h.name} is held at {h.bound / si:+.3g} {unit}: loosening its tolerance by {tenth} would lower the "
                 f"whitened RMS by {h.gain:.2g}."
             )
+        if not self.formulation.solvable:
+            lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")
         return [*lines, self.message]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Annotated, Any
@@ -48,7 +49,6 @@ def calibrate(
     """
     with _progress() as say:
         from rpim_opt.calibration import calibrate
-        from rpim_opt.files import write_json
         from rpim_opt.instances import load, parse_formulation, parse_weight
 
         say("reading the problem")
@@ -59,6 +59,7 @@ def calibrate(
             instance.problem, instance.formulation if formulation is None else parse_formulation(formulation), weight,
             progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
         )  # fmt: skip
+        result = replace(result, record=instance.record)
         if refit and result.flagged:
             say("calibrating without the distrusted rows")
             print("Refitted without " + ", ".join(flag.label for flag in result.flagged) + ".\n")  # noqa: T201
@@ -67,12 +68,33 @@ def calibrate(
     print(describe(instance, result))  # noqa: T201
     if out is not None:
         try:
-            write_json(out / "result.json", result_json(instance, result))
+            result.save(out / "result.json")
         except OSError as error:
             raise RpimError(f"{out / 'result.json'}: cannot be written: {error}.") from None
         print(f"\nWritten: {out / 'result.json'}")  # noqa: T201
     if not result.converged:
         raise typer.Exit(1)
+
+
+@app.command()
+def report(
+    result: Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the result by default.")] = None,
+) -> None:
+    """Write a result as one HTML page that works offline, for whoever has to believe it."""
+    with _progress() as say:
+        from rpim_opt.report import write_report
+        from rpim_opt.results import load_result
+
+        say("reading the result")
+        loaded = load_result(result)
+        say("writing the report")
+        out = out or (result if result.is_dir() else result.parent) / "report.html"
+        try:
+            write_report(loaded, out)
+        except OSError as error:
+            raise RpimError(f"{out}: cannot be written: {error}.") from None
+    print(f"Written: {out}")  # noqa: T201
 
 
 @app.command()
@@ -194,6 +216,7 @@ def describe(instance: Instance, result: Calibration) -> str:
     """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
     import numpy as np
 
+    from rpim_opt.record import statistics
     from rpim_opt.text import table
 
     errors = []
@@ -202,12 +225,12 @@ def describe(instance: Instance, result: Calibration) -> str:
         for kind, rows in _kinds(data).items():
             which = f"{name}, {kind}" if len(_kinds(instance.problem.data)) > 1 else name
             for method, each in (("nominal", result.nominal_errors(data)), ("identified", result.errors(data))):
-                stats = _statistics(each[rows])
+                stats = statistics(each[rows])
                 figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
                 errors.append([f"{which}, {method}", str(stats["count"]), *figures])
         if name == "identification" and result.flagged:
             distrusted = {flag.label for flag in result.flagged}
-            stats = _statistics(result.errors(data)[[label not in distrusted for label in data.label]])
+            stats = statistics(result.errors(data)[[label not in distrusted for label in data.label]])
             figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
             errors.append(["identification, trusted rows", str(stats["count"]), *figures])
         errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
@@ -236,27 +259,6 @@ def describe(instance: Instance, result: Calibration) -> str:
     return "\n".join(lines)
 
 
-def result_json(instance: Instance, result: Calibration) -> dict[str, Any]:
-    """Return what ``result.json`` holds; its keys are relied upon by others."""
-    data = _data(instance)
-    validation = data.get("validation")
-    return {
-        "title": instance.title,
-        "nominal": {name: _statistics(result.nominal_errors(part)) for name, part in data.items()},
-        "identification": _statistics(result.errors()),
-        "validation": _statistics(result.errors(validation)) if validation else None,
-        "weight": result.weight,
-        "selector": result.selector,
-        "corner": result.selection.interior if result.selection else None,
-        "formulation": result.formulation.name,
-        "converged": result.converged,
-        "iterations": len(result.history),
-        "flagged": [flag.label for flag in result.flagged],
-        "parameters": result.parameter_rows(),
-        "rows": {name: _rows(result, part) for name, part in data.items()},
-    }
-
-
 def _data(instance: Instance) -> dict[str, Dataset]:
     sets = {"identification": instance.problem.data}
     return {**sets, "validation": instance.validation} if instance.validation else sets
@@ -268,18 +270,6 @@ def _kinds(data: Dataset) -> dict[str, list[int]]:
     for block in data.blocks:
         kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
     return kinds
-
-
-def _rows(result: Calibration, data: Dataset) -> list[dict[str, Any]]:
-    """Return label, nominal and identified error of every row."""
-    before, after = 1e3 * result.nominal_errors(data), 1e3 * result.errors(data)
-    rows = zip(data.label, before, after, strict=True)
-    return [{"label": label, "nominal_mm": float(b), "identified_mm": float(a)} for label, b, a in rows]
-
-
-def _statistics(errors: Any) -> dict[str, float | int]:
-    mm = 1e3 * errors
-    return {"mean_mm": float(mm.mean()), "rms_mm": _rms(mm), "max_mm": float(mm.max()), "count": len(mm)}
 
 
 def _rms(values: Any) -> float:

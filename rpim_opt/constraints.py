@@ -6,7 +6,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any
+from functools import wraps
+from inspect import signature
+from typing import Any, ParamSpec, TypeVar
 
 import cvxpy as cp
 import numpy as np
@@ -17,6 +19,22 @@ from rpim_opt.robot import Array
 
 Constraint = Callable[[Any, Parameters], Any]
 """From z and the identified parameters to a CVXPY constraint, or several."""
+
+Arguments = ParamSpec("Arguments")
+Made = TypeVar("Made")
+
+
+def stated(make: Callable[Arguments, Made]) -> Callable[Arguments, Made]:
+    """Let what a function makes keep ``stated``, the function's name and arguments, so that a file can hold it."""
+
+    @wraps(make)
+    def remembering(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Made:
+        given, made = signature(make).bind(*args, **kwargs), make(*args, **kwargs)
+        given.apply_defaults()
+        object.__setattr__(made, "stated", [make.__name__, *given.args])  # made may be frozen
+        return made
+
+    return remembering
 
 
 @dataclass(frozen=True)
@@ -59,6 +77,7 @@ within_tolerance = Box("within tolerance", _tolerances)
 """|x_i| <= tolerance_i, where a tolerance is stated."""
 
 
+@stated
 def at_nominal(*patterns: str) -> Box:
     """Keep the parameters that match a pattern at their nominal values: z_i = 0."""
 
@@ -69,6 +88,7 @@ def at_nominal(*patterns: str) -> Box:
     return Box("at nominal", limits)
 
 
+@stated
 def signed(sign: int, *patterns: str) -> Box:
     """Keep the deviations that match a pattern on one side: sign z_i >= 0."""
 
@@ -79,6 +99,7 @@ def signed(sign: int, *patterns: str) -> Box:
     return Box("signed", limits)
 
 
+@stated
 def equal(*names: str) -> Constraint:
     """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel."""
 
@@ -97,6 +118,7 @@ def equal(*names: str) -> Constraint:
     return constraint
 
 
+@stated
 def in_ball(radius: float, *patterns: str) -> Constraint:
     """Keep the deviations that match a pattern in a ball: |z| <= radius, in units of the scales."""
 
@@ -138,6 +160,7 @@ def by_kind(parameters: Parameters) -> list[Array]:
     return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
 
 
+@stated
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
 import tomllib
 from pathlib import Path
@@ -118,8 +119,32 @@ def _where(loc: tuple[int | str, ...]) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
-    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    """Write JSON so that ``path`` holds either the whole new content or what it held before.
+
+    A row of numbers stands on one line; a text cannot be taken for one, since JSON escapes its line breaks.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False)
+    text = re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text)
+    write_text(path, text + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Return a JSON file's content.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is no JSON (with line and column).
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob("*.json")) if path.parent.is_dir() else []
+        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.stats import chi2
 
 from rpim_opt.conic import Conic, Term
-from rpim_opt.constraints import Box, Constraint, by_link, within_tolerance
+from rpim_opt.constraints import Box, Constraint, by_link, stated, within_tolerance
 from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
@@ -61,6 +61,8 @@ class Formulation:
         |D_k z| (K,), and has to be nondecreasing. `by_link`, `by_kind`, `differences`.
     largest
         Largest whitened norm that a configuration may keep; infinite by default.
+    solvable
+        False for one that was read from a file, which cannot hold a script's functions.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Formulation:
     loss_over: str = "equation"
     penalty_over: Callable[[Parameters], Sequence[Array]] | None = None
     largest: float = float("inf")
+    solvable: bool = True
 
     def __post_init__(self) -> None:
         if self.loss_over not in ("equation", "configuration"):
@@ -77,7 +80,7 @@ class Formulation:
 
     def compile(self, model: LinearModel) -> ConvexProgram:
         """Pose the program in CVXPY, or take the one that was posed for the same shape before."""
-        return ConvexProgram(self, model, _posed(self, model))
+        return ConvexProgram(self, model, _posed(self, model) if self.solvable else _Unposed(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +104,7 @@ class ConvexProgram:
 
     formulation: Formulation
     model: LinearModel
-    _posed: _Posed
+    _posed: _Posed | _Unposed
 
     def on(self, model: LinearModel) -> ConvexProgram:
         """Return the program for another model of the same shape, without posing it anew."""
@@ -481,6 +484,27 @@ class _Posed:
         return found
 
 
+class _Unposed:
+    """In the place of `_Posed` for a formulation that is not solvable."""
+
+    quadratic, limited, constrained, box = False, False, True, None
+
+    def __init__(self, formulation: Formulation):
+        self.solve = self.violation = self.penalized = self.loss = self.penalty = self.loss_term = lost(
+            formulation.name
+        )
+
+
+def lost(name: str) -> Callable[..., Any]:
+    """Return what stands for the functions of a formulation that a file could not hold: it raises InputError."""
+
+    def function(*_: Any) -> Any:
+        accepted = "the script that holds them, to calibrate again"
+        raise InputError(f"formulation '{name}'", "functions that the file of a result cannot hold", accepted)
+
+    return function
+
+
 def _listed(constraints: Any) -> list[Any]:
     return list(constraints) if isinstance(constraints, list | tuple) else [constraints]
 
@@ -530,6 +554,7 @@ HUBER = 2.0
 """Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
 
 
+@stated
 def huber(threshold: float = HUBER) -> Function:
     """Return Huber's loss: v^2 up to the threshold, 2 threshold v - threshold^2 beyond, summed."""
     bound: Any = threshold  # CVXPY's annotation says int

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,6 +28,7 @@ from rpim_opt.measurement import MEASUREMENTS, Measurement, of_fixture
 from rpim_opt.observability import near_parallel
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import CalibrationProblem
+from rpim_opt.record import Record
 from rpim_opt.robot import Robot
 from rpim_opt.selection import SELECTORS, Selector
 from rpim_opt.tables import robodk_columns
@@ -57,6 +59,10 @@ class Instance:
         Figures that a run must reproduce, by name: (value, tolerance).
     simulation
         How the tables were simulated; empty for real measurements.
+    files
+        SHA-256 of the files that were read, by name.
+    excluded
+        Rows that the folder leaves out, label to reason.
     """
 
     title: str
@@ -68,6 +74,13 @@ class Instance:
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     simulation: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def record(self) -> Record:
+        """What a saved result and its report say of the data."""
+        return Record(self.title, self.source, self.validation, self.files, self.excluded, bool(self.simulation))
 
 
 class _FrameTable(Table):
@@ -207,6 +220,8 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
             problem.on(data["validation"])
     except InputError as error:
         raise error.within(path) from None
+    drawing = find_robot(table.robot, folder)
+    used = {path.name: path, drawing.name: drawing, **{file: folder / file for role in ROLES for file in files[role]}}
     formulation = lookup(FORMULATIONS, table.formulation, "formulation", path)
     formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
     try:
@@ -230,6 +245,8 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         published={role: table.published.get(files[role][0], {}) for role in ROLES if files[role]},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         simulation=table.simulation,
+        files={name: sha256(file.read_bytes()).hexdigest() for name, file in used.items()},
+        excluded=table.exclude,
     )
 
 

@@ -1,30 +1,44 @@
-"""Figures on matplotlib axes, for papers and reports."""
+"""Figures on matplotlib axes, for papers and notebooks: each draws on ``ax`` or on new axes, and returns them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.calibration import Calibration
+from rpim_opt.dataset import Dataset
 from rpim_opt.formulation import ConvexProgram
-from rpim_opt.selection import Selection, weight_grid
+from rpim_opt.robot import Array
+from rpim_opt.selection import Selection, compare, weight_grid
+from rpim_opt.uncertainty import Uncertainty
+from rpim_opt.units import display
 
 Axes = Any  # matplotlib's, which is imported by whoever makes the axes
+BEFORE, AFTER, MARK = "0.75", "C0", "C3"
 
 
-def plot_l_curve(ax: Axes, program: ConvexProgram, selections: dict[str, Selection] | None = None) -> Axes:
-    """Draw loss against penalty of the solutions over the weights, with the selectors' choices.
+def _axes(ax: Axes, **kwargs: Any) -> Axes:
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
 
-    Parameters
-    ----------
-    ax
-        Axes to draw on.
-    program
-        Solved at 200 weights where it has a closed form, else at 40.
-    selections
-        Choices to mark, by name.
+    return pyplot.subplots(layout="constrained", subplot_kw=kwargs)[1]
+
+
+def _legend(ax: Axes) -> Axes:
+    """Put the legend above the axes, where it hides nothing."""
+    ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8)
+    return ax
+
+
+def plot_l_curve(program: ConvexProgram, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
+    """Draw the root of loss against that of penalty of the solutions over the weights, with selectors' choices by name.
+
+    The program is solved at 200 weights where it has a closed form, else at 40.
     """
+    ax = _axes(ax)
     weights = weight_grid(program, 200 if program.closed_form else 40)
     points = np.array([[e.loss, e.penalty] for e in program.path(weights)])
     ax.loglog(np.sqrt(points[:, 0]), np.sqrt(points[:, 1]), color="0.3", lw=1.5)
@@ -39,30 +53,148 @@ def plot_l_curve(ax: Axes, program: ConvexProgram, selections: dict[str, Selecti
     return ax
 
 
-def plot_selection(ax: Axes, selection: Selection) -> Axes:
+def plot_selection(selection: Selection, ax: Axes = None) -> Axes:
     """Draw what a selector compared over the weights, and its choice."""
+    ax = _axes(ax)
     finite = np.isfinite(selection.score)
     ax.semilogx(selection.weights[finite], selection.score[finite], color="0.3", lw=1.5)
-    ax.axvline(selection.weight, color="C3", ls="-" if selection.interior else "--", lw=1.2)
+    ax.axvline(selection.weight, color=MARK, ls="-" if selection.interior else "--", lw=1.2)
     ax.set_xlabel("weight")
     ax.set_ylabel(f"score of {selection.name}")
     ax.set_title(selection.note, fontsize=9)
     return ax
 
 
-def plot_errors(ax: Axes, result: Calibration) -> Axes:
-    """Draw every row's error before and after, distrusted rows marked."""
-    labels = result.problem.data.label
-    place, before, after = np.arange(len(labels)), 1e3 * result.nominal_errors(), 1e3 * result.errors()
-    ax.bar(place - 0.2, before, 0.4, color="0.75", label="nominal")
-    ax.bar(place + 0.2, after, 0.4, color="C0", label="identified")
-    wrong = [i for i, label in enumerate(labels) if label in {flag.label for flag in result.flagged}]
+def plot_selectors(program: ConvexProgram, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
+    """Draw the weights that selectors choose, all that serve the program by default; hollow: at an edge."""
+    ax, chosen = _axes(ax), compare(program) if selections is None else selections
+    ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
+    for place, (_, selection) in enumerate(ordered):
+        ax.plot(selection.weight, place, "o", color=AFTER, ms=7, mfc=AFTER if selection.interior else "none")
+    ax.set_xscale("log")
+    ax.set_yticks(range(len(ordered)), [name for name, _ in ordered])
+    ax.grid(axis="y", color="0.9")
+    ax.set_xlabel("weight")
+    return ax
+
+
+def plot_picard(program: ConvexProgram, weight: float = 0.0, ax: Axes = None) -> Axes:
+    """Draw Picard's condition: singular values, what the data say along them, and the solution's coefficients.
+
+    Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
+    noise; the weight takes out the directions with s below its root.
+    """
+    ax = _axes(ax)
+    beta, s, _ = program.model.svd
+    k, seen = np.arange(1, len(s) + 1), s > 0
+    ax.semilogy(k[seen], s[seen], "o-", color="0.3", ms=4, label="singular value s")
+    ax.semilogy(k[seen], np.abs(beta[seen]), "x", color=AFTER, label="data |u'b|")
+    ax.semilogy(k[seen], np.abs(beta[seen]) / s[seen], "^", color="C1", ms=4, label="coefficient |u'b| / s")
+    if weight > 0:
+        ax.axhline(np.sqrt(weight), color=MARK, lw=1, ls="--", label="root of the weight")
+    ax.set_xlabel("direction")
+    ax.set_ylabel("size [sigmas, scales]")
+    return _legend(ax)
+
+
+def plot_errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
+    """Draw every row's error before and after, distrusted rows marked; of the identification data by default."""
+    ax, labels = _axes(ax), (data or result.problem.data).label
+    place, before, after = np.arange(len(labels)), 1e3 * result.nominal_errors(data), 1e3 * result.errors(data)
+    ax.bar(place - 0.2, before, 0.4, color=BEFORE, label="nominal")
+    ax.bar(place + 0.2, after, 0.4, color=AFTER, label="identified")
+    flagged = {flag.label for flag in result.flagged} if data is None else set()
+    wrong = [i for i, label in enumerate(labels) if label in flagged]
     if wrong:
-        ax.plot(place[wrong] + 0.2, after[wrong], "v", color="C3", label="distrusted")
+        ax.plot(place[wrong] + 0.2, after[wrong], "v", color=MARK, label="distrusted")
     ax.set_yscale("log")
     ax.set_ylim(bottom=max(0.5 * min(before.min(), after.min()), 1e-4))  # a row that a norm fits exactly is below
     ax.set_ylabel("error [mm]")
     if len(labels) <= 60:
         ax.set_xticks(place, labels, rotation=90, fontsize=7)
-    ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    else:
+        ax.set_xlabel("row")
+    return _legend(ax)
+
+
+def plot_error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
+    """Draw how many rows have which error before and after, over the error's logarithm."""
+    ax, sets = _axes(ax), (1e3 * result.nominal_errors(data), 1e3 * result.errors(data))
+    edges = error_bins(*sets)
+    for errors, color, label in zip(sets, (BEFORE, AFTER), ("nominal", "identified"), strict=True):
+        ax.hist(np.maximum(errors, edges[0]), edges, color=color, alpha=0.85, label=label)
+    ax.set_xscale("log")
+    ax.set_xlabel("error [mm]")
+    ax.set_ylabel("rows")
+    return _legend(ax)
+
+
+def error_bins(*errors: Array) -> Array:
+    """Return edges of a histogram's bins, equal in the logarithm, four decades at most."""
+    every = np.concatenate(errors)
+    high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
+    low = max(float(every.min(initial=high)), 1e-4 * high)
+    return np.geomspace(low, high, 25 if high > 1.01 * low else 2)
+
+
+def plot_error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
+    """Draw mean (dot) and spread (95 % of the rows) of the errors along x, y, z, before and after."""
+    ax = _axes(ax)
+    for nominal, color, label, shift in ((True, "0.55", "nominal", -0.1), (False, AFTER, "identified", 0.1)):
+        vectors = 1e3 * result.error_vectors(data, nominal=nominal)
+        vectors = vectors[np.isfinite(vectors).all(axis=1)]
+        mean, (low, high) = vectors.mean(axis=0), np.percentile(vectors, [2.5, 97.5], axis=0)
+        ax.errorbar(np.arange(3) + shift, mean, [mean - low, high - mean], fmt="o", color=color, capsize=4, label=label)
+    ax.axhline(0, color="0.8", lw=1)
+    ax.set_xticks(range(3), ["x", "y", "z"])
+    ax.set_xlim(-0.5, 2.5)
+    ax.set_xlabel("axis of the instrument")
+    ax.set_yscale("symlog", linthresh=0.1)
+    ax.set_ylabel("measured minus modelled [mm]")
+    return _legend(ax)
+
+
+def plot_error_vectors(
+    result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None
+) -> Axes:
+    """Draw measured positions in space with their errors, enlarged as the title says; ``ax`` has to be a 3D one."""
+    ax = _axes(ax, projection="3d")
+    points, vectors = result.measured_positions(data), result.error_vectors(data, nominal=nominal)
+    points, vectors = (a[np.isfinite(vectors).all(axis=1)] for a in (points, vectors))
+    times = magnification(points, vectors)
+    ax.scatter(*points.T, s=6, color="0.3")
+    ax.quiver(*points.T, *(times * vectors).T, color=BEFORE if nominal else AFTER, arrow_length_ratio=0.2)
+    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
+    ax.set_title(f"{'nominal' if nominal else 'identified'} errors, enlarged {times:,.0f} times", fontsize=9)
     return ax
+
+
+def magnification(points: Array, vectors: Array) -> float:
+    """Return by how much to enlarge errors, the longest to a sixth of the points' extent: 1, 2 or 5 times 10^k."""
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
+    decade = 10.0 ** np.floor(exponent)
+    return float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
+
+
+def plot_parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
+    """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances."""
+    ax, free = _axes(ax), result.problem.parameters.free
+    own = ~free.of_frames & (np.array(free.dimensions) == dimension)
+    unit, si = display(dimension)
+    place, x = np.arange(own.sum()), result.x[own] / si
+    half = np.full(len(x), np.nan)
+    if result.linear_penalty:
+        low, high = Uncertainty(result, confidence).intervals()[own].T / si
+        half = (high - low) / 2
+    bound = free.tolerance[own] / si
+    ax.errorbar(
+        x, place, xerr=half, fmt="o", color=AFTER, ms=4, capsize=3, label=f"deviation, {confidence:.0%} interval"
+    )
+    if np.isfinite(bound).any():
+        ax.plot(np.r_[-bound, bound], np.r_[place, place], "|", color=MARK, ms=9, label="tolerance")
+    ax.axvline(0, color="0.8", lw=1)
+    ax.set_yticks(place, [name for name, is_own in zip(free.names, own, strict=True) if is_own])
+    ax.invert_yaxis()
+    ax.set_xlabel(f"deviation from nominal [{unit}]")
+    return _legend(ax)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,7 +10,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from rpim_opt.exceptions import InputError
+from rpim_opt.exceptions import InputError, NoSolutionFound
 from rpim_opt.formulation import ConvexProgram
 from rpim_opt.problem import RANK_TOLERANCE, LinearModel
 from rpim_opt.robot import Array
@@ -499,6 +500,21 @@ def disagreement(program: ConvexProgram) -> str:
     return (
         f"The selectors disagree by {decades:.1f} decades: " + ", ".join(f"{k} {v:.2g}" for k, v in found.items()) + "."
     )
+
+
+def compare(program: ConvexProgram) -> dict[str, Selection]:
+    """Return what every selector chooses that serves a program, by name.
+
+    Those that hold configurations out are left out where that would take long: without a closed form, or more than 200.
+    """
+    quick = program.closed_form and len(np.unique(program.model.group)) <= 200
+    slow = () if quick else (leave_one_out, k_fold, two_step)
+    chosen = {}
+    for name, rule in SELECTORS.items():
+        if rule not in slow:
+            with contextlib.suppress(InputError, NoSolutionFound):  # it does not serve this formulation or these data
+                chosen[name] = rule(program)
+    return chosen
 
 
 SELECTORS: dict[str, Selector] = {

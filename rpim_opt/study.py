@@ -17,8 +17,7 @@ from typing import Any
 
 from rpim_opt.exceptions import InputError, RpimError, choices
 from rpim_opt.files import write_json, write_text
-
-PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
+from rpim_opt.record import PACKAGES
 
 
 @dataclass(frozen=True)

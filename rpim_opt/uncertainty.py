@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,26 +10,11 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from rpim_opt.calibration import Calibration
-from rpim_opt.dataset import Dataset
+from rpim_opt.calibration import Calibration, Prediction
 from rpim_opt.exceptions import InputError
-from rpim_opt.measurement import position
 from rpim_opt.robot import Array
 from rpim_opt.text import table
 from rpim_opt.units import display
-
-
-class Prediction(NamedTuple):
-    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals."""
-
-    position: Array
-    covariance: Array
-    coverage_factor: float
-
-    @property
-    def expanded(self) -> Array:
-        """Half widths (N, 3) [m] of the intervals of the coordinates."""
-        return self.coverage_factor * np.sqrt(np.einsum("nii->ni", self.covariance))
 
 
 class NoiseTest(NamedTuple):
@@ -148,27 +133,9 @@ class Uncertainty:
             )
         return NoiseTest(self.noise_level, probability, verdict)
 
-    def predict(self, q: Array, marker: str = "") -> Prediction:
-        """Return the positions that a reflector will have, with their uncertainty, anywhere in the workspace.
-
-        Parameters
-        ----------
-        q
-            (N, dof) joint values of the controller [rad or m].
-        marker
-            The reflector; the only one by default.
-
-        Returns
-        -------
-        Positions in the instrument's frame; their covariance J C J', without the noise of a new measurement.
-        """
-        q = np.atleast_2d(np.asarray(q, dtype=float))
-        data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
-        data = replace(data, blocks=tuple(replace(block, markers=(marker,)) for block in data.blocks))
-        problem = self.result.problem.on(data)
-        J = problem.jacobian(self.result.x).reshape(len(q), 3, -1)
-        covariance = np.einsum("nij,jk,nlk->nil", J, self.total, J)
-        return Prediction(problem.modelled(self.result.x)[0], covariance, self.coverage_factor)
+    def predict(self, q: Array, marker: str = "", torque: Array | None = None) -> Prediction:
+        """Return what `Calibration.predict` does, with the coverage factor of the confidence."""
+        return self.result.predict(q, marker, torque)._replace(coverage_factor=self.coverage_factor)
 
     def budget(self) -> str:
         """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty)."""
