@@ -35,6 +35,7 @@ ORDER = {
     "uncertainty": set(),
     "baselines": set(),
     "design": set(),
+    "compensation": {"casadi"},
     "plots": set(),
     "inspection": set(),
     "instances": {"pydantic", "cvxpy"},
