@@ -30,8 +30,8 @@ from rpim_opt.units import display, split_unit
 
 REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
-FIRST = 1e3
-"""With fewer than six joints a metre counts like this many radians, so that position comes first; else like one."""
+KEPT = 1e-10
+"""Weight of a correction that moves nothing, relative to the largest squared singular value."""
 SETTLED, PASSES = 1e-10, 50
 """A row is done when its step is shorter than this [rad or m]; and the most steps that it may take."""
 BLOCK = 8192
@@ -70,9 +70,9 @@ class Compensation:
         C: sqrt(tr J C J'), with the Jacobian J of the position in the instrument's frame, base included. Infinite
         where the calibration has no covariance.
     status
-        For every row ``"ok"`` (at most 0.1 um and 0.1 urad left; with fewer than six joints the position decides),
-        ``"limited"`` (a joint limit prevents that), ``"near singular"`` (the correction would be too large, and was
-        damped) or ``"unreachable"`` (no joint values found that are nearer).
+        For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
+        prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
+        ``"near singular"`` (the correction would be too large, and was damped).
     """
 
     robot: Robot
@@ -145,20 +145,21 @@ def compensate(
     """Correct joint commands so that the calibrated robot goes where the nominal one would.
 
     A target is the pose of the tool in the robot's base: that of the nominal robot at a command q, or one given.
-    The corrected command minimizes, within the joint limits and with no joint moved by more than ``largest``,
+    The corrected command q + D minimizes, within the joint limits and with no joint moved by more than ``largest``,
 
-        (1000 p)^2 + w^2 + D' P D
+        |p|^2 + |w|^2 + D' P D
 
-    where p [m] and w [rad] are the identified robot's errors of position and orientation and D the correction. P is
-    zero but for two kinds of directions, from the singular values s of the Jacobian at q. Where the exact correction
-    e / s of an error e would be longer than ``largest``, P is (e / largest)^2 - s^2, so that
-    e s / (e / largest)^2 of it is made: less, the nearer the singularity. Where nothing moves (more joints than needed)
-    P keeps the command, so that the correction is the shortest to first order, in units of the joints' ranges.
+    where p [m] and w [rad] are the identified robot's errors of position and orientation. With fewer than six joints
+    only those rotations count that need not move the point. P is zero but for two kinds of directions, from
+    the singular values s of the Jacobian at q. Where the exact correction e / s of an error e would be longer than
+    ``largest`` (near singular), P is (e / largest)^2 - s^2, so that the part (s largest / e)^2 of it is made: the less,
+    the nearer the singularity. Where nothing moves (more joints than needed), a slight P keeps the command, so that
+    the correction is the shortest to first order, in units of the joints' ranges.
 
     **Which frame.** The base is where the instrument stands and no fault of the robot: what a calibration identified
     of it is not compensated, and targets hold in the base as identified. A turn of joint 1 and one of the base are the
     same to the data; what the scales ascribe to the base stays. With ``base=True`` targets hold in the base as
-    stated, and the robot corrects for its place, too (base = "auto" states none: it is where registration
+    stated, and the robot corrects for its place, too (``base = "auto"`` states none: then it is where registration
     puts it).
 
     Parameters
@@ -409,14 +410,16 @@ class _Cell(NamedTuple):
         target = believed if poses is None else poses
         missed = self.nominal.at(nominal, tau, target)[1]
         _, before, J = self.real.at(nominal, tau, target)
-        weight = self._weight(self._first)
-        unit = _units(self.robot, len(weight))
-        P = _pinned(weight[:, None] * J * unit, weight * (before - missed), largest)
+        W = _attainable(J)
+        unit = _units(self.robot, J.shape[1])
+        reached = self._reached(missed, W)
+        due = np.where(reached[:, None], before - missed, 0.0)
+        P = _pinned(W @ J * unit, _times(W, due), largest)
         inside = np.clip(nominal, *limits.T)
         low, high = np.maximum(limits[:, 0], inside - largest), np.minimum(limits[:, 1], inside + largest)
-        found, left, held = _descend(self.real, tau, target, nominal, low, high, weight, unit, P)
+        found, left, held = _descend(self.real, tau, target, nominal, low, high, unit, W, P)
         at_limit = (held & ((found <= limits[:, 0]) | (found >= limits[:, 1]))).any(axis=1)
-        cases = {"ok": self._reached(left), "limited": at_limit, "unreachable": ~self._reached(missed)}
+        cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
         errors = zip(("position_before", "orientation_before", "position_error", "orientation_error"),
                      (*self._norms(before), *self._norms(left)), strict=True)  # fmt: skip
         return {
@@ -429,21 +432,22 @@ class _Cell(NamedTuple):
 
     def _commands(self, poses: Array, q: Array | None, tau: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
-        low, high = self.robot.limits.T
         starts = self._starts(poses, tau.shape[1]) if q is None else q[:, None]
-        weight = self._weight(1.0)
-        unit = _units(self.robot, len(weight))
-        found, left, _ = _descend(self.nominal, tau, poses, starts[:, 0], low, high, weight, unit)
+        found, left, _ = self._nearest(poses, tau, starts[:, 0])
         for k in range(1, starts.shape[1]):
             again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
             if not len(again):
                 break
-            other, error, _ = _descend(
-                self.nominal, tau[again], poses[again], starts[again, k], low, high, weight, unit
-            )
+            other, error, _ = self._nearest(poses[again], tau[again], starts[again, k])
             better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
             found[again[better]], left[again[better]] = other[better], error[better]
-        return _descend(self.nominal, tau, poses, found, low, high, self._weight(self._first), unit)[0]
+        if poses.shape[1] == 3 or self.robot.dof >= 6:
+            return found
+        return self._nearest(poses, tau, found, _attainable(self.nominal.at(found, tau, poses)[2]))[0]
+
+    def _nearest(self, poses: Array, tau: Array, start: Array, W: Array | None = None) -> tuple:
+        low, high = self.robot.limits.T
+        return _descend(self.nominal, tau, poses, start, low, high, np.ones(self.robot.dof), W)
 
     def _starts(self, poses: Array, torques: int) -> Array:
         """Return the nearest of many configurations within limits, or a turn, for every pose, (N, TRIALS, dof)."""
@@ -460,13 +464,6 @@ class _Cell(NamedTuple):
         return bank[np.take_along_axis(nearest, order, axis=1)]
 
     @property
-    def _first(self) -> float:
-        return FIRST if self.robot.dof < 6 else 1.0
-
-    def _weight(self, metre: float) -> Array:
-        return np.where(self._lengths, metre, 1.0)
-
-    @property
     def _lengths(self) -> np.ndarray:
         return np.array([dimension == "length" for dimension in self.kind.components.values()])
 
@@ -476,9 +473,9 @@ class _Cell(NamedTuple):
         angle = np.linalg.norm(turn, axis=1) if turn.shape[1] else np.full(len(error), np.nan)
         return np.linalg.norm(error[:, self._lengths], axis=1), angle
 
-    def _reached(self, error: Array) -> np.ndarray:
-        place, turn = self._norms(error)
-        return (place <= REACHED) & ((self.robot.dof < 6) | ~(turn > REACHED))
+    def _reached(self, error: Array, W: Array) -> np.ndarray:
+        place, turn = self._norms(_times(W, error))
+        return (place <= REACHED) & ~(turn > REACHED)
 
 
 def _covariance(result: Calibration) -> Array | None:
@@ -495,8 +492,29 @@ def _units(robot: Robot, equations: int) -> Array:
         span[~np.isfinite(span)] = 2 * np.pi
         for kind in set(robot.joint_types):
             alike = np.array([k == kind for k in robot.joint_types])
-            unit[alike] = span[alike] / span[alike].max()
+            unit[alike] = span[alike] / span[alike].min()
     return unit
+
+
+def _attainable(J: Array) -> Array:
+    """Return matrices W (N or 1, k, k) that project errors on those that count, from Jacobians (N, k, n).
+
+    With six joints or more, or positions alone, all do. With fewer position comes first: of the orientation counts what
+    can be turned without moving the point, which makes as many equations as joints.
+    """
+    k, n = J.shape[1:]
+    if n >= k or k == 3:
+        return np.eye(k)[None]
+    still = np.linalg.svd(J[:, :3])[2][:, 3:]
+    U, s, _ = np.linalg.svd(J[:, 3:] @ still.transpose(0, 2, 1), full_matrices=False)
+    U = U * (s > 1e-6)[:, None]
+    W = np.tile(np.eye(k), (len(J), 1, 1))
+    W[:, 3:, 3:] = U @ U.transpose(0, 2, 1)
+    return W
+
+
+def _times(W: Array, vectors: Array) -> Array:
+    return (W @ vectors[:, :, None])[:, :, 0]
 
 
 def _pinned(A: Array, due: Array, largest: float) -> Array:
@@ -510,15 +528,15 @@ def _pinned(A: Array, due: Array, largest: float) -> Array:
     e[:, :some] = np.einsum("nij,ni->nj", U, due)[:, :some]
     s = np.pad(s, ((0, 0), (0, n - some)))
     p = np.maximum((e / largest) ** 2 - s**2, 0.0)
-    p[s <= 1e-9 * s[:, :1]] += 1.0
+    p += KEPT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
     return np.einsum("nki,nk,nkj->nij", Vt, p, Vt)
 
 
 def _descend(
-    arm: _Arm, tau: Array, y: Array, start: Array, low: Array, high: Array, weight: Array, unit: Array,
+    arm: _Arm, tau: Array, y: Array, start: Array, low: Array, high: Array, unit: Array, W: Array | None = None,
     P: Array | None = None,
 ) -> tuple[Array, Array, np.ndarray]:  # fmt: skip
-    """Minimize |weight * error|^2 + D' P D from ``start``, q = start + unit D, within low and high, row by row.
+    """Minimize |W error|^2 + D' P D from ``start``, q = start + unit D, within low and high, row by row.
 
     Gauss-Newton steps in the box, damped (Levenberg-Marquardt) in rows whose step does not lower the sum.
 
@@ -532,17 +550,18 @@ def _descend(
     to_low, to_high = (low - start) / unit, (high - start) / unit
     D, damping, left = np.clip(0.0, to_low, to_high), np.zeros(N), np.arange(N)
 
-    def at(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array]:
+    def at(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array, Array]:
         q = np.clip(start[rows] + unit * D, low[rows], high[rows])
         _, error, J = arm.at(q, tau[rows], y[rows])
-        r = weight * error
-        pull = np.einsum("nij,nj->ni", P[rows], D)
-        return r, weight[:, None] * J * unit, np.sum(r**2, axis=1) + np.sum(D * pull, axis=1)
+        r, A = error, J * unit
+        if W is not None and len(W) == N:
+            r, A = _times(W[rows], r), W[rows] @ A
+        return error, r, A, np.sum(r**2, axis=1) + np.sum(D * _times(P[rows], D), axis=1)
 
     def slope(rows: np.ndarray) -> Array:
-        return np.einsum("nki,nk->ni", A[rows], r[rows]) - np.einsum("nij,nj->ni", P[rows], D[rows])
+        return np.einsum("nki,nk->ni", A[rows], r[rows]) - _times(P[rows], D[rows])
 
-    r, A, cost = at(left, D)
+    error, r, A, cost = at(left, D)
     for _ in range(PASSES):
         if not len(left):
             break
@@ -551,18 +570,19 @@ def _descend(
         diagonal += damping[left, None] * diagonal + 1e-14 * diagonal.mean(axis=1, keepdims=True) + 1e-300
         g = slope(left)
         step = _boxed(H, g, to_low[left] - D[left], to_high[left] - D[left])
-        new_r, new_A, new_cost = at(left, D[left] + step)
-        better = new_cost <= cost[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
+        tried = at(left, D[left] + step)
+        better = tried[3] <= cost[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
         rows = left[better]
         D[rows] += step[better]
-        r[rows], A[rows], cost[rows] = new_r[better], new_A[better], new_cost[better]
+        for kept, new in zip((error, r, A, cost), tried, strict=True):
+            kept[rows] = new[better]
         damping[rows] = np.where(damping[rows] > 1e-6, damping[rows] / 10, 0.0)
         damping[left[~better]] = np.maximum(10 * damping[left[~better]], 1e-3)
         far = (np.abs(step).max(axis=1) > SETTLED) & (np.sum(step * g, axis=1) > 1e-8 * cost[left])
-        left = left[far & (cost[left] > SETTLED**2)]
+        left = left[far & (cost[left] > 1e-24)]
     g = slope(np.arange(N))
     held = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))
-    return np.clip(start + unit * D, low, high), r / weight, held
+    return np.clip(start + unit * D, low, high), error, held
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
