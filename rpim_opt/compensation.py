@@ -32,8 +32,8 @@ REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
 KEPT = 1e-10
 """Weight of a correction that moves nothing, relative to the largest squared singular value."""
-SETTLED, PASSES = 1e-10, 50
-"""A row is done when its step is shorter than this [rad or m]; and the most steps that it may take."""
+SETTLED, SLIGHT, PASSES = 1e-10, 1e-6, 50
+"""A row is done when its step is shorter [rad or m], or lowers the sum by a smaller part; and its most steps."""
 BLOCK = 8192
 """Rows that are worked on together, so that what they need stays in the processor's cache."""
 BANK, TRIALS = 2000, 12
@@ -406,9 +406,9 @@ class _Cell(NamedTuple):
         limits, N = self.robot.limits, len(np.asarray(q if poses is None else poses))
         tau = np.empty((N, 0)) if torque is None else torque @ np.linalg.inv(self.robot.joint_map)  # of the model's
         nominal = np.asarray(q) if poses is None else self._commands(poses, q, tau)
-        believed = self.nominal.at(nominal, tau, np.zeros((N, len(self.kind.columns))))[0]
-        target = believed if poses is None else poses
-        missed = self.nominal.at(nominal, tau, target)[1]
+        asked = np.zeros((N, len(self.kind.columns))) if poses is None else poses
+        believed, missed, _ = self.nominal.at(nominal, tau, asked)
+        target, missed = (believed, np.zeros_like(missed)) if poses is None else (poses, missed)
         _, before, J = self.real.at(nominal, tau, target)
         W = _attainable(J)
         unit = _units(self.robot, J.shape[1])
@@ -420,12 +420,14 @@ class _Cell(NamedTuple):
         found, left, held = _descend(self.real, tau, target, nominal, low, high, unit, W, P)
         at_limit = (held & ((found <= limits[:, 0]) | (found >= limits[:, 1]))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
-        errors = zip(("position_before", "orientation_before", "position_error", "orientation_error"),
-                     (*self._norms(before), *self._norms(left)), strict=True)  # fmt: skip
+        (place_before, turn_before), (place, turn) = self._norms(before), self._norms(left)
         return {
             "nominal": nominal,
             "q": found,
-            **dict(errors),
+            "position_before": place_before,
+            "orientation_before": turn_before,
+            "position_error": place,
+            "orientation_error": turn,
             "std": self.spread.at(found, torque),
             "status": np.select(list(cases.values()), list(cases), "near singular"),
         }
@@ -578,7 +580,7 @@ def _descend(
             kept[rows] = new[better]
         damping[rows] = np.where(damping[rows] > 1e-6, damping[rows] / 10, 0.0)
         damping[left[~better]] = np.maximum(10 * damping[left[~better]], 1e-3)
-        far = (np.abs(step).max(axis=1) > SETTLED) & (np.sum(step * g, axis=1) > 1e-8 * cost[left])
+        far = (np.abs(step).max(axis=1) > SETTLED) & (np.sum(step * g, axis=1) > SLIGHT * cost[left])
         left = left[far & (cost[left] > 1e-24)]
     g = slope(np.arange(N))
     held = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))

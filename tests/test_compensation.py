@@ -72,6 +72,11 @@ def ok(found: ro.Compensation) -> np.ndarray:
     return np.array(found.status) == "ok"
 
 
+def exact(found: ro.Compensation) -> np.ndarray:
+    """Rows that reach their target by a small correction: what keeps a command weighs 1e-10, not nothing."""
+    return ok(found) & (np.abs(found.q - found.nominal) < 0.1).all(axis=1)
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_true_robot_misses_by_no_more_than_the_calibration(name: str) -> None:
     result, truth = calibrated(name)
@@ -95,8 +100,9 @@ def test_a_robot_that_is_known_exactly_goes_exactly_there(name: str) -> None:
     result, q = known(name), commands(ROBOTS[name])
     found = ro.compensate(result, q, largest=0.5)
     place, turn = misses(reading(result, result.x, found.q), wanted(result, q))
-    good = ok(found)
-    assert good.mean() > 0.75
+    good = exact(found)
+    assert good.mean() > 0.4
+    assert found.position_error[ok(found)].max() <= 1e-7
     assert place[good].max() < 1e-10
     assert place == pytest.approx(found.position_error, abs=1e-12)
     # Rotation.magnitude takes the root of a rounding error
@@ -112,11 +118,13 @@ def test_positions_alone_need_smaller_corrections(name: str) -> None:
     result, q = known(name), commands(ROBOTS[name])
     both, place = ro.compensate(result, q), ro.compensate(result, q, orientation=False)
     assert np.isnan(place.orientation_error).all()
-    good = ok(place)
-    assert good.mean() > 0.75
-    free = good & (np.abs(place.q - q).max(axis=1) < 0.2)  # a bound takes what keeps the command with it
-    assert misses(reading(result, result.x, place.q), wanted(result, q))[0][free].max() < 1e-10
-    assert np.abs(place.q - q).mean() < np.abs(both.q - q).mean()
+    good = exact(place)
+    assert good.mean() > 0.4
+    assert misses(reading(result, result.x, place.q), wanted(result, q))[0][good].max() < 1e-10
+    good &= exact(both)
+    spans = ranges(ROBOTS[name])
+    short, long = (np.linalg.norm((each.q - q)[good] / spans, axis=1) for each in (place, both))
+    assert (short <= 1.1 * long).all()  # the shortest, to first order
 
 
 @pytest.mark.parametrize(("name", "orientation"), [("seven axes", True), ("six axes", False)])
@@ -124,12 +132,19 @@ def test_a_redundant_robot_makes_the_shortest_correction(name: str, orientation:
     """Its part along the directions that move nothing is of second order."""
     result, robot = known(name), ROBOTS[name]
     found = ro.compensate(result, commands(robot), orientation=orientation)
-    ranges = np.ptp(robot.limits, axis=1) if np.isfinite(robot.limits).all() else np.ones(robot.dof)
+    spans = ranges(robot)
     for q, corrected in zip(found.nominal[ok(found)], found.q[ok(found)], strict=True):
-        J = numeric_jacobian(result, q)[: 6 if orientation else 3] * ranges
-        D = (corrected - q) / ranges
+        J = numeric_jacobian(result, q)[: 6 if orientation else 3] * spans
+        D = (corrected - q) / spans
         still = np.linalg.svd(J)[2][len(J) :]
         assert np.linalg.norm(still @ D) < 10 * np.linalg.norm(D) * np.abs(corrected - q).max()
+
+
+def ranges(robot: ro.Robot) -> np.ndarray:
+    """Return the joints' ranges, in units of the smallest among revolute and among prismatic ones."""
+    turns = np.array(robot.joint_types) == "revolute"
+    spans = np.where(np.isfinite(robot.limits).all(axis=1), np.ptp(robot.limits, axis=1), 2 * np.pi)
+    return np.where(turns, spans / spans[turns].min(), 1.0)  # of prismatic ones there is at most one
 
 
 def numeric_jacobian(result: ro.Calibration, q: np.ndarray) -> np.ndarray:
@@ -252,7 +267,7 @@ def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
         def error(q: np.ndarray, i: int = i) -> np.ndarray:
             return far[i] - base_position(result, q)
 
-        nearest = min(least_squares(error, start).cost for start in commands(ARM, 20))
+        nearest = min(least_squares(error, start, max_nfev=60).cost for start in commands(ARM, 4))
         assert found.position_error[i] == pytest.approx(
             np.sqrt(2 * nearest), abs=3e-4
         )  # the outstretched arm: a flat valley
