@@ -32,6 +32,18 @@ if TYPE_CHECKING:
     from rpim_opt.exceptions import InputError as InputError
     from rpim_opt.exceptions import NoSolutionFound as NoSolutionFound
     from rpim_opt.exceptions import RpimError as RpimError
+    from rpim_opt.exchange.chain import Described as Described
+    from rpim_opt.exchange.chain import identified as identified
+    from rpim_opt.exchange.chain import without_beta as without_beta
+    from rpim_opt.exchange.plain import read_mdh as read_mdh
+    from rpim_opt.exchange.plain import write_robodk as write_robodk
+    from rpim_opt.exchange.plain import write_robot as write_robot
+    from rpim_opt.exchange.universal_robots import read_ur_calibration as read_ur_calibration
+    from rpim_opt.exchange.universal_robots import read_ur_kinematics as read_ur_kinematics
+    from rpim_opt.exchange.universal_robots import write_ur_calibration as write_ur_calibration
+    from rpim_opt.exchange.universal_robots import write_ur_kinematics as write_ur_kinematics
+    from rpim_opt.exchange.urdf import read_urdf as read_urdf
+    from rpim_opt.exchange.urdf import write_urdf as write_urdf
     from rpim_opt.formulation import Formulation as Formulation
     from rpim_opt.formulation import bounded as bounded
     from rpim_opt.formulation import group_lasso as group_lasso
@@ -110,6 +122,15 @@ _HOME = {
         "sum_of_norms",
         "tikhonov",
     ),
+    "exchange.chain": ("Described", "identified", "without_beta"),
+    "exchange.plain": ("read_mdh", "write_robodk", "write_robot"),
+    "exchange.universal_robots": (
+        "read_ur_calibration",
+        "read_ur_kinematics",
+        "write_ur_calibration",
+        "write_ur_kinematics",
+    ),
+    "exchange.urdf": ("read_urdf", "write_urdf"),
     "inspection": ("Inspection", "inspect"),
     "instances": ("Instance", "load", "robots"),
     "kinematics": ("forward_kinematics",),

@@ -149,6 +149,7 @@ def study(
     workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on where an interrupted run was.")] = False,
+    redraw: Annotated[bool, typer.Option(help="Only write the report anew, from the last run's replicates.")] = False,
     gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than studies/baselines.json allows.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
 ) -> None:
@@ -165,7 +166,7 @@ def study(
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name)
         report, folder = run_study(
-            name, quick, workers, scheduler, resume, out,
+            name, quick, workers, scheduler, resume, redraw, out,
             progress=lambda done, every: bar.update(task, completed=done, total=every),
         )  # fmt: skip
     print(report.text)  # noqa: T201

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError
-from rpim_opt.kinematics import FRAME, forward_kinematics, numeric_frame, roll_pitch_yaw
+from rpim_opt.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.measurement import of_fixture
 from rpim_opt.parameters import Parameters, model_parameters, tool_prefix
 from rpim_opt.problem import CalibrationProblem
@@ -164,8 +164,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
             except InputError:
                 pass  # too few turns: positions and the stated tool have to do
             else:
-                places[marker] = _six(tool)
-                return _six(base), places
+                places[marker] = frame_numbers(tool)
+                return frame_numbers(base), places
         if len(flange) > 3:
             places[marker][:3] = tool_from_distances(flange, block.y[:, :3], places[marker][:3], TOOL_ERROR)
         source.append(flange[:, :3, :3] @ places[marker][:3] + flange[:, :3, 3])
@@ -173,7 +173,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
         weight.append(1 / np.broadcast_to(variance, len(flange)))
     q = np.concatenate(weight)
-    return _six(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
+    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
 
 
 def _transforms(y: Array) -> Array:
@@ -182,10 +182,6 @@ def _transforms(y: Array) -> Array:
     T[:, :3, :3] = Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
     T[:, :3, 3] = y[:, :3]
     return T
-
-
-def _six(T: Array) -> Array:
-    return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
 def starting_parameters(

@@ -10,11 +10,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import cvxpy as cp
+import numpy as np
 from pydantic import Field
 
 from rpim_opt.constraints import Constraint, at_nominal, equal, signed
 from rpim_opt.dataset import Dataset, read_data
 from rpim_opt.exceptions import InputError, choices
+from rpim_opt.exchange.chain import Described
+from rpim_opt.exchange.plain import read_mdh
+from rpim_opt.exchange.urdf import read_urdf
 from rpim_opt.files import Angle, Length, Table, read_toml, validate
 from rpim_opt.formulation import FORMULATIONS, Formulation
 from rpim_opt.frames import starting_parameters
@@ -23,7 +27,7 @@ from rpim_opt.measurement import MEASUREMENTS, Measurement, of_fixture
 from rpim_opt.observability import near_parallel
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import CalibrationProblem
-from rpim_opt.robot import Robot, read_robot
+from rpim_opt.robot import Robot
 from rpim_opt.selection import SELECTORS, Selector
 from rpim_opt.tables import robodk_columns
 from rpim_opt.units import quantities, split_unit
@@ -102,6 +106,8 @@ class _ProblemTable(Table):
     title: str
     source: str = ""
     robot: str = "robot.toml"
+    urdf_base: str | None = None
+    urdf_tip: str | None = None
     measurement: str = "position"
     layout: Literal["named", "robodk"] = "named"
     identification: str | None = None
@@ -273,16 +279,27 @@ def read_problem(name: str | Path, variant: str | None = None, measurements: Seq
     parse_weight(table.selector, path)
     several = bool(table.tool) and not any(split_unit(key)[0] in FRAME for key in table.tool)
     tools = {m: _frame(t, f"tool.{m}", path) for m, t in table.tool.items()} if several else {}
+    arm = _arm(table, path)
     return Stated(
         path=path,
         table=table,
         placed=placed,
-        robot=read_robot(find_robot(table.robot, path.parent)),
+        robot=arm.robot,
         kinds=kinds,
         observations=tuple(observations),
-        tools=tools or {"": _frame(table.tool, "tool", path)},
-        base=None if isinstance(table.base, str) else _frame(table.base, "base", path),
+        tools=tools or {"": _frame(table.tool, "tool", path) if table.tool else tuple(arm.tool)},
+        base=None if table.base == "auto" else _frame(table.base, "base", path) if table.base else tuple(arm.base),
     )
+
+
+def _arm(table: _ProblemTable, path: Path) -> Described:
+    """Return the problem's robot, with its base and tool where its file states them."""
+    file = find_robot(table.robot, path.parent)
+    if file.suffix == ".urdf":
+        return read_urdf(file, table.urdf_base, table.urdf_tip)
+    if table.urdf_base or table.urdf_tip:
+        raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    return Described(read_mdh(file), np.zeros(6), np.zeros(6))
 
 
 def _split(content: dict[str, Any], fixtures: set[str], path: Path) -> tuple[_ProblemTable, dict[str, Any]]:
@@ -347,11 +364,11 @@ def robots() -> list[str]:
 
 def find_robot(name: str, folder: Path | None = None) -> Path:
     """Return the file of a robot: one in ``folder``, or a ready robot by name."""
-    if folder is not None and name.endswith(".toml"):
+    if folder is not None and name.endswith((".toml", ".urdf", ".csv", ".json")):
         return folder / name
     if name in robots():
         return HERE / "robots" / f"{name}.toml"
-    accepted = "a file .toml, or a ready robot: " + choices(name, robots())
+    accepted = "a file .toml, .urdf, .csv or .json, or a ready robot: " + choices(name, robots())
     raise InputError("key robot", f"'{name}'", accepted, folder / "problem.toml" if folder else None)
 
 

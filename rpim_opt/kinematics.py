@@ -68,12 +68,15 @@ def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx; at a pitch of 90 degrees, where roll is arbitrary, roll 0."""
-    horizontal = np.hypot(R[0, 0], R[1, 0])
-    pitch = np.arctan2(-R[2, 0], horizontal)
-    if horizontal < 1e-12:
-        return np.array([0.0, pitch, np.arctan2(-R[0, 1], R[1, 1])])
-    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
+    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx.
+
+    Roll is read off what yaw leaves, so that the three give R back near a pitch of 90 degrees too, where they lose
+    their meaning one by one.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0]) if np.hypot(R[1, 0], R[0, 0]) > 1e-12 else np.arctan2(-R[0, 1], R[1, 1])
+    c, s = np.cos(yaw), np.sin(yaw)
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])), yaw])
 
 
 def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> ca.SX:
@@ -94,6 +97,11 @@ def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> 
 def numeric_frame(place: Sequence[float] | Array) -> Array:
     """Return the transform (4, 4) of a frame's six numbers."""
     return ca.DM(frame([float(v) for v in place])).full()
+
+
+def frame_numbers(T: Array) -> Array:
+    """Return the six numbers of a transform (4, 4), the inverse of `numeric_frame`."""
+    return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
 def motion(kind: str, i: int, q: Symbol, torque: Symbol, value: Callable[[str], Symbol]) -> Symbol:

@@ -130,7 +130,12 @@ def read_robot(path: str | Path) -> Robot:
         Naming the file, the key, what was found and what is accepted.
     """
     path = Path(path)
-    table = validate(_RobotTable, read_toml(path), path)
+    return robot_of(read_toml(path), path)
+
+
+def robot_of(content: dict[str, Any], path: Path) -> Robot:
+    """Return the robot that the keys of a ``robot.toml`` state, whatever file they come from."""
+    table = validate(_RobotTable, content, path)
     dof = len(table.joint)
     coupling = np.eye(dof)
     if table.coupling is not None:

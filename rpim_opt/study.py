@@ -48,7 +48,10 @@ def studies_folder() -> Path:
 
 @lru_cache(maxsize=8)
 def load_study(path: Path) -> ModuleType:
-    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case) and report(rows)."""
+    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case), report(rows).
+
+    If it has prepare(quick), that is called once before the first case.
+    """
     spec = importlib.util.spec_from_file_location(f"study_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise InputError("the study", str(path), "a Python file")
@@ -75,6 +78,7 @@ def run_study(
     workers: int = 1,
     scheduler: str | None = None,
     resume: bool = False,
+    redraw: bool = False,
     out: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, all_: None,
 ) -> tuple[Report, Path]:
@@ -95,6 +99,8 @@ def run_study(
         Address of a Dask scheduler to compute on instead.
     resume
         Go on where an interrupted run was; otherwise everything is computed anew.
+    redraw
+        Compute nothing: write the report anew from the replicates of the last run, which say what made them.
     out
         Where results go; ``studies/results/NAME`` or ``NAME-quick`` by default.
     progress
@@ -108,7 +114,15 @@ def run_study(
     study = load_study(path)
     folder = out or path.parent / "results" / (f"{name}-quick" if quick else name)
     folder.mkdir(parents=True, exist_ok=True)
+    replicates = folder / "replicates.parquet"
+    if redraw:
+        rows, made = _kept(replicates)
+        report = study.report(rows)
+        _write(folder, study, report, made)
+        return report, folder
     journal = folder / "replicates.jsonl"
+    if hasattr(study, "prepare"):
+        study.prepare(quick)
     cases = study.cases(quick)
     keys = [json.dumps(case, sort_keys=True) for case in cases]
     done = _finished(journal, set(keys)) if resume else {}
@@ -124,7 +138,12 @@ def run_study(
             progress(len(done), len(cases))
     rows = [{**case, **done[key]} for key, case in zip(keys, cases, strict=True)]
     report = study.report(rows)
-    _write(folder, name, quick, study, rows, report)
+    command = f"rpim-opt study {name}{' --quick' if quick else ''}"
+    packages = ", ".join(f"{p} {version(p)}" for p in PACKAGES)
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    made = f"Made by `{command}` from commit {_commit()}: {len(rows)} replicates, {python}, {packages}."
+    _keep(rows, made, replicates)
+    _write(folder, study, report, made)
     journal.unlink()
     return report, folder
 
@@ -178,30 +197,61 @@ def _finished(journal: Path, keys: set[str]) -> dict[str, dict[str, Any]]:
     return done
 
 
-def _write(folder: Path, name: str, quick: bool, study: ModuleType, rows: list[dict], report: Report) -> None:
+def _keep(rows: list[dict], made: str, path: Path) -> None:
+    """Write the replicates, with what made them."""
     import pyarrow as pa
     from pyarrow import parquet
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = pa.table({key: [row.get(key) for row in rows] for key in columns})
-    parquet.write_table(table, folder / "replicates.parquet")
+    parquet.write_table(table.replace_schema_metadata({"made": made}), path)
+
+
+def _kept(path: Path) -> tuple[list[dict], str]:
+    """Return the replicates of an earlier run, without what a replicate does not have, and what made them."""
+    from pyarrow import parquet
+
+    if not path.is_file():
+        raise InputError("redraw", "no replicates", "a study that was run before", path)
+    table = parquet.read_table(path)
+    made = (table.schema.metadata or {}).get(b"made", b"").decode()
+    return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made
+
+
+def _write(folder: Path, study: ModuleType, report: Report, made: str) -> None:
     pictures = []
     for title, figure in report.figures.items():
-        for ending in ("svg", "png"):
-            figure.savefig(folder / f"{title}.{ending}", metadata={"Date": None} if ending == "svg" else None)
+        from matplotlib import rc_context
+
+        with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
+            figure.savefig(folder / f"{title}.svg", metadata={"Date": None})
+        figure.savefig(folder / f"{title}.png")
         pictures.append(f"![{title}]({title}.svg)\n")
-    command = f"rpim-opt study {name}{' --quick' if quick else ''}"
-    lines = [
-        f"# {study.QUESTION}",
-        "",
-        report.text.strip(),
-        "",
-        *pictures,
-        f"Made by `{command}` from commit {_commit()}: {len(rows)} replicates, {platform.python_implementation()} "
-        f"{platform.python_version()}, {', '.join(f'{p} {version(p)}' for p in PACKAGES)}.",
-    ]
-    write_text(folder / "README.md", "\n".join(lines) + "\n")
+    text = "\n".join([f"# {study.QUESTION}", "", report.text.strip(), "", *pictures, made])
+    write_text(folder / "README.md", text + "\n")
     write_json(folder / "metrics.json", dict(report.metrics))
+
+
+def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
+    """Return a figure with one line of dots a name, logarithmic, its median marked; names from top to bottom."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    figure = Figure(figsize=(7, 0.32 * len(values) + 0.9), layout="constrained")
+    ax = figure.add_subplot()
+    for y, (name, found) in enumerate(reversed(list(values.items()))):
+        ax.semilogx(found, [y] * len(found), "o", ms=3, alpha=min(1.0, 5 / len(found) ** 0.5), color="C0", mew=0)
+        middle = sorted(found)[len(found) // 2]
+        ax.semilogx([middle], [y], "|", ms=11, mew=2, color="C3")
+        ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
+        ax.annotate(name, (-0.01, y), xycoords=("axes fraction", "data"), ha="right", va="center", fontsize=8)
+    ax.set_yticks([])
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.grid(axis="x", alpha=0.3)
+    ax.set_xlabel(label)
+    return figure
 
 
 def _commit() -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.baselines import levenberg_marquardt
-from rpim_opt.study import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 from rpim_opt.text import markdown
 
 QUESTION = "How near do formulations come to the truth: 52 configurations, ten, or four blunders?"
@@ -91,4 +91,11 @@ def report(rows: list[dict[str, Any]]) -> Report:
         "Root mean square position error on 500 points without noise [mm], mean over the seeds; in brackets how often "
         f"the method was the best of {len(rows) // len(lines)} seeds. Simulated; weights by REML.\n\n"
     )
-    return Report(text + markdown(["situation", *METHODS], lines), metrics)
+    figures = {
+        situation: distributions(
+            {method: [row[method] for row in rows if row["situation"] == situation] for method in METHODS},
+            f"{situation}: RMS position error [mm], both scales",
+        )
+        for situation in SITUATIONS
+    }
+    return Report(text + markdown(["situation", *METHODS], lines), metrics, figures)

@@ -14,7 +14,7 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
-from rpim_opt.study import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 from rpim_opt.text import markdown
 
 NOISES = (1e-1, 1e-2, 1e-3, 1e-4)
@@ -123,4 +123,6 @@ def report(rows: list[dict[str, Any]]) -> Report:
         "which these smooth solutions are not: it is the default for robots, not for them.\n\n"
     )
     head = ["selector", "median", "95th percentile", "worse than 2", *PROBLEMS]
-    return Report(text + markdown(head, lines), metrics)
+    ratios = {rule.__name__: [min(row[rule.__name__], 1e3) for row in rows] for rule in SELECTORS}
+    figure = distributions(ratios, "error over that at the best weight (beyond 1000 drawn at 1000)")
+    return Report(text + markdown(head, lines), metrics, {"ill_posed": figure})

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.study import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 from rpim_opt.text import markdown
 
 QUESTION = "How accurate is a calibration on real measurements, with all configurations and with ten?"
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
+METHODS = ("nominal", "least squares", "rpim-opt")
 METRICS = {"rms_over_least_squares": Metric("lower", 0.02)}
 
 
@@ -48,9 +49,15 @@ def report(rows: list[dict[str, Any]]) -> Report:
     lines, ratios = [], []
     for name, count in dict.fromkeys((row["name"], row["count"]) for row in rows):
         part = [row for row in rows if (row["name"], row["count"]) == (name, count)]
-        figures = [float(np.mean([row[m] for row in part])) for m in ("nominal", "least squares", "rpim-opt")]
+        figures = [float(np.mean([row[m] for row in part])) for m in METHODS]
         ratios.append(figures[2] / figures[1])
         lines.append([name, str(count) if count else "all", str(len(part)), *(f"{f:.3f}" for f in figures)])
     text = "Root mean square error on the validation rows [mm], mean over random draws of configurations.\n\n"
     head = ["set", "configurations", "draws", "nominal, frames fitted", "least squares", "rpim-opt"]
-    return Report(text + markdown(head, lines), {"rms_over_least_squares": float(np.exp(np.mean(np.log(ratios))))})
+    ten = [row for row in rows if row["count"] == 10]
+    figure = distributions(
+        {f"{row['name']}, {m}": [r[m] for r in ten if r["name"] == row["name"]] for row in ten for m in METHODS},
+        "ten configurations: RMS error on the validation rows [mm]",
+    )
+    metrics = {"rms_over_least_squares": float(np.exp(np.mean(np.log(ratios))))}
+    return Report(text + markdown(head, lines), metrics, {"ten_configurations": figure})

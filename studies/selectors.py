@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.study import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 from rpim_opt.text import markdown
 
 QUESTION = "Which selector comes nearest to the best weight on a robot?"
@@ -75,4 +75,7 @@ def report(rows: list[dict[str, Any]]) -> Report:
         "on the right the 95th percentile by situation.\n\n"
     )
     head = ["selector", "median", "95th percentile", "worse than 2", *SITUATIONS]
-    return Report(text + markdown(head, lines), metrics)
+    figure = distributions(
+        {rule.__name__: [row[rule.__name__] for row in rows] for rule in RULES}, "error over that at the best weight"
+    )
+    return Report(text + markdown(head, lines), metrics, {"selectors": figure})

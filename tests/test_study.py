@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rpim_opt as ro
@@ -74,7 +78,6 @@ def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
 
 
 def test_a_dask_cluster_gives_the_same(toy, tmp_path: Path) -> None:
-    import warnings
 
     toy()
     here, _ = study.run_study("toy", out=tmp_path / "here")
@@ -129,3 +132,95 @@ def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
     (folder / "broken.py").write_text("QUESTION = 1\n")
     assert run(monkeypatch, "study", "broken") == 2
     assert "no 'METRICS'" in capsys.readouterr().err
+
+
+BENCH = Path(__file__).parents[2] / "shared" / "bench"
+
+
+@pytest.mark.skipif(not BENCH.is_dir(), reason="the peers' benchmark ../shared/bench is not here")
+@pytest.mark.parametrize("situation", ["clean52", "few10", "blunders52"])
+def test_peers_study_draws_the_shared_benchmark(situation: str, tmp_path: Path):
+    peers = study.load_study(study.find_study("peers"))
+    peers.write_problem(tmp_path, situation, 0)
+    for name in ("calib", "valid"):
+        ours, theirs = (folder / f"{name}.csv" for folder in (tmp_path, BENCH / situation))
+        assert ours.read_text().splitlines()[0] == theirs.read_text().splitlines()[0]
+        rows = [np.loadtxt(path, delimiter=",", skiprows=1) for path in (ours, theirs)]
+        np.testing.assert_allclose(*rows, rtol=0, atol=1.5e-9)  # nine decimals, the last one rounded
+
+
+def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
+    folder = toy()
+    path = folder / "toy.py"
+    path.write_text(
+        path.read_text()
+        + f"\n\ndef prepare(quick):\n    with open({str(tmp_path / 'p')!r}, 'a') as f:\n        f.write('x')\n"
+    )
+    study.run_study("toy", quick=True, out=tmp_path / "out")
+    assert (tmp_path / "p").read_text() == "x"
+
+
+MONTE_CARLO = """
+import numpy as np
+import rpim_opt as ro
+from rpim_opt.study import Metric, Report
+
+QUESTION = "How do 1000 calibrations of the paper's arm scatter?"
+METRICS = {"mean": Metric("lower", 0.0)}
+
+
+def cases(quick):
+    return [{"seed": seed} for seed in range(1000)]
+
+
+def run(seed):
+    instance = ro.load("paper_arm")
+    data = instance.problem.data
+    y = data.blocks[0].y + 3e-5 * np.random.default_rng(seed).normal(size=data.blocks[0].y.shape)
+    result = ro.calibrate(instance.problem.on(ro.Dataset.of(data.q, y, 3e-5)), ro.tikhonov, ro.reml)
+    return {"value": float(1e3 * result.errors(instance.validation).mean())}
+
+
+def report(rows):
+    return Report(f"{len(rows)} calibrations", {"mean": float(np.mean([row["value"] for row in rows]))})
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "studies_folder", lambda: tmp_path)
+    (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
+    here, _ = study.run_study("monte_carlo", out=tmp_path / "here")
+    killed: list[int] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports, event loops and the worker that dies
+        from distributed import Client, LocalCluster
+
+        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+            with Client(cluster) as client:
+                workers = list(client.run(os.getpid).values())
+
+            def progress(done: int, of: int) -> None:
+                if done == 300:
+                    os.kill(workers[0], signal.SIGKILL)
+                    killed.append(done)
+
+            address = cluster.scheduler_address
+            there, _ = study.run_study("monte_carlo", scheduler=address, out=tmp_path / "there", progress=progress)
+    assert killed == [300]
+    assert values(tmp_path / "there") == values(tmp_path / "here")
+    assert len(values(tmp_path / "there")) == 1000
+    assert there.metrics == here.metrics
+
+
+def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
+    folder, out = toy(), tmp_path / "out"
+    report, _ = study.run_study("toy", out=out)
+    before = (out / "README.md").read_text()
+    (folder / "log.txt").unlink()
+    again, _ = study.run_study("toy", out=out, redraw=True)
+    assert again.metrics == report.metrics
+    assert (out / "README.md").read_text() == before
+    assert not (folder / "log.txt").exists()  # nothing was computed
+    with pytest.raises(ro.InputError, match="no replicates"):
+        study.run_study("toy", out=tmp_path / "empty", redraw=True)

@@ -1,0 +1,178 @@
+"""MDH tables for other tools: TOML, JSON, CSV, and RoboDK's four columns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.exceptions import InputError
+from rpim_opt.exchange.chain import read_bytes, without_beta
+from rpim_opt.files import write_json, write_text
+from rpim_opt.parameters import MDH_DIMENSION
+from rpim_opt.robot import MDH, Robot, read_robot, robot_of
+from rpim_opt.tables import read_columns
+from rpim_opt.units import UNITS, display
+
+LIMITS = ("lower", "upper")
+
+
+def read_mdh(path: str | Path) -> Robot:
+    """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
+
+    JSON has the keys of ``robot.toml`` (README, "Your own robot"). CSV has a row a joint and the keys of a
+    ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
+    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints); an empty cell is left out.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key or column, what was found and what is accepted.
+    """
+    path = Path(path)
+    readers = {".toml": read_robot, ".json": _read_json, ".csv": _read_csv}
+    return _by_ending(readers, path)(path)
+
+
+def write_robot(robot: Robot, path: str | Path) -> None:
+    """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_mdh` gives back exactly the same numbers.
+
+    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere.
+
+    Raises
+    ------
+    InputError
+        For another ending, one of two limits infinite, or a coupling of joints in CSV, which has no place for it.
+    """
+    path = Path(path)
+    _by_ending({".toml": _write_toml, ".json": _write_json, ".csv": _write_csv}, path)(robot, path)
+
+
+def write_robodk(robot: Robot, path: str | Path) -> None:
+    """Write the four modified DH numbers of every joint as CSV, ``joint,alpha_deg,a_mm,theta_deg,d_mm``.
+
+    For RoboDK's robot parameters, which are a modified DH table (Craig's, "DHM") in mm and degrees. Hayati's betas
+    are turned into common normals. Its API takes such a table with base and tool
+    (``SetRobotParams(robot, dhm, poseBase, poseTool)``, RoboDK/RoboDK-API, C#), but documents neither the columns'
+    order nor a file that can be read: transfer the numbers by name, and compare a pose before you rely on them.
+    """
+    table = without_beta(robot).mdh
+    if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
+        raise InputError("robot", "signs or couplings of joints", "joints that count as RoboDK's", robot.name)
+    units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
+    lines = [",".join(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())])]
+    for number, row in enumerate(table, start=1):
+        values = (repr(float(v / si)) for v, (_, si) in zip(row, units.values(), strict=False))
+        lines.append(",".join([str(number), *values]))
+    write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _by_ending(known: dict[str, Any], path: Path) -> Any:
+    if path.suffix.lower() not in known:
+        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(known), path)
+    return known[path.suffix.lower()]
+
+
+def _read_json(path: Path) -> Robot:
+    try:
+        content = json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError("the JSON text", str(error), "JSON", path) from None
+    if not isinstance(content, dict):
+        raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
+    return robot_of(content, path)
+
+
+def _read_csv(path: Path) -> Robot:
+    try:
+        columns = read_columns(path)
+    except InputError as error:
+        raise error.within(path) from None
+    joints: list[dict[str, Any]] = []
+    for i in range(len(next(iter(columns.values())))):
+        cells = {name: cells[i] for name, cells in columns.items() if cells[i] and name != "joint"}
+        joint = {name: _cell(text) for name, text in cells.items()}
+        for unit in UNITS:
+            pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
+            if any(value is not None for value in pair):
+                joint[f"limits_{unit}"] = pair
+        joints.append(joint)
+    return robot_of({"name": path.stem, "joint": joints}, path)
+
+
+def _cell(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+def _content(robot: Robot) -> dict[str, Any]:
+    """Return the keys of ``robot.toml`` with which it reads back the same, zeros left out."""
+    signs = np.diag(robot.joint_map)
+    plain = np.array_equal(robot.joint_map, np.diag(signs)) and set(np.abs(signs)) == {1.0}
+    joints = []
+    for row, kind, limits, sign in zip(robot.mdh, robot.joint_types, robot.limits, signs, strict=True):
+        joint: dict[str, Any] = {}
+        for column, value in zip(MDH, row, strict=True):
+            if value:
+                unit, (number,) = _exact(MDH_DIMENSION[column], [value])
+                joint[f"{column}_{unit}"] = number
+        if kind != "revolute":
+            joint["type"] = kind
+        if plain and sign < 0:
+            joint["sign"] = -1
+        if np.isfinite(limits).any():
+            unit, pair = _exact("angle" if kind == "revolute" else "length", limits)
+            joint[f"limits_{unit}"] = pair
+        joints.append(joint)
+    head = {"name": robot.name, "source": robot.source} if robot.source else {"name": robot.name}
+    return head | ({} if plain else {"coupling": robot.joint_map.tolist()}) | {"joint": joints}
+
+
+def _exact(dimension: str, values: Any) -> tuple[str, list[float]]:
+    """Return values in the unit that is shown, or in SI where that would not read back the same."""
+    if not np.isfinite(values).all():
+        raise InputError("limits of the robot", f"{[float(v) for v in values]}", "finite numbers, or no limits")
+    unit, si = display(dimension)
+    numbers = [float(f"{v / si:.15g}") for v in values]
+    if all(n * si == v for n, v in zip(numbers, values, strict=True)):
+        return unit, numbers
+    return {"angle": "rad", "length": "m"}[dimension], [float(v) for v in values]
+
+
+def _write_json(robot: Robot, path: Path) -> None:
+    write_json(path, _content(robot))
+
+
+def _write_toml(robot: Robot, path: Path) -> None:
+    content = _content(robot)
+    joints = content.pop("joint")
+    blocks = [[f"{key} = {_toml(value)}" for key, value in content.items()]]
+    blocks += [["[[joint]]", *(f"{key} = {_toml(value)}" for key, value in joint.items())] for joint in joints]
+    write_text(path, "\n\n".join("\n".join(block) for block in blocks) + "\n")
+
+
+def _toml(value: Any) -> str:
+    """Return a text, number or list of lists as TOML, which writes them as JSON does."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _write_csv(robot: Robot, path: Path) -> None:
+    content = _content(robot)
+    if "coupling" in content:
+        raise InputError("robot", "a coupling of joints", "a name ending in .toml or .json", path)
+    rows = []
+    for joint in content["joint"]:
+        row = dict(joint)
+        for key in [k for k in row if k.startswith("limits_")]:
+            row |= {f"{which}_{key.removeprefix('limits_')}": v for which, v in zip(LIMITS, row.pop(key), strict=True)}
+        rows.append(row)
+    header = [f"{c}_{display(MDH_DIMENSION[c])[0]}" for c in MDH]
+    header += sorted({key for row in rows for key in row} - set(header))
+    lines = [",".join(header), *(",".join(str(row.get(key, "")) for key in header) for row in rows)]
+    write_text(path, "\n".join(lines) + "\n")

@@ -1,0 +1,216 @@
+"""Universal Robots' two files: the ROS driver's kinematics.yaml, and the controller's calibration.conf."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from rpim_opt.exceptions import InputError, choices
+from rpim_opt.exchange.chain import (
+    Chain,
+    Described,
+    corrected,
+    describe,
+    link_of,
+    origin_numbers,
+    read_bytes,
+    require_same_arm,
+    spliced,
+    without_beta,
+)
+from rpim_opt.files import write_bytes
+from rpim_opt.kinematics import frame_numbers, numeric_frame
+from rpim_opt.robot import MDH, Array, Robot
+
+JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+REVOLUTE = ("revolute",) * 6
+SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
+DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
+
+
+def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Described:
+    """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
+
+    Under ``kinematics`` stand shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its
+    joint in the frame of the one before, x y z [m] and roll pitch yaw [rad], and ``hash``, which names the robot
+    (UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration; read by ros-industrial/universal_robot,
+    ur_description). ur_description puts the angles into a URDF, so that they mean R = Rz Ry Rx, as here.
+    ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
+    the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
+
+    Parameters
+    ----------
+    path
+        The file: plain keys, two spaces or more a level, one a line.
+    limits
+        (6, 2) joint limits [rad], which the file does not hold.
+    """
+    path = Path(path)
+    chain, _ = _yaml_chain(read_bytes(path), path)
+    table, base, tool, _ = describe(chain)
+    robot = Robot("Universal Robots", table, limits=np.empty((0, 0)) if limits is None else limits, source=path.name)
+    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+
+
+def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> None:
+    """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
+
+    The driver compares the hash with the controller's own calibration; it is that of the robot, not of the numbers.
+
+    Parameters
+    ----------
+    source
+        The original, or ur_description's default_kinematics.yaml of the model. Its `read_ur_kinematics` has to be
+        the robot whose parameters were identified.
+    robot
+        The identified robot.
+    target
+        Where to write; may be ``source``.
+    """
+    path = Path(source)
+    data = read_bytes(path)
+    chain, places = _yaml_chain(data, path)
+    table, base, tool, G = describe(chain)
+    require_same_arm(robot, table, REVOLUTE, path)
+    origins, _ = corrected(G, robot.mdh, base, tool)
+    if robot.mdh[-1, 4]:
+        raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0", path)
+    edits = {}
+    for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
+        texts = origin_numbers(T, old)
+        numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
+        edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
+    write_bytes(Path(target), spliced(data, edits))
+
+
+def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:
+    """Return the six joints, and by joint and key where its number stands."""
+    values: dict[tuple[str, str], float] = {}
+    places: dict[tuple[str, str], tuple[int, int]] = {}
+    at, joint = 0, ""
+    for number, line in enumerate(data.split(b"\n"), start=1):
+        start, at = at, at + len(line) + 1
+        if not line.strip() or line.lstrip().startswith((b"#", b"---")):
+            continue
+        match = LINE.match(line)
+        if match is None:
+            found = repr(line.decode(errors="replace").strip()[:40])
+            raise InputError(f"line {number}", found, "one 'key: value' a line", path)
+        key, text = match[2].decode(), match[3].decode(errors="replace")
+        if not text:
+            joint = key
+            if key not in ("kinematics", *JOINTS):
+                raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS), path)
+        elif key in SIX:
+            if joint not in JOINTS or (joint, key) in values:
+                raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once", path)
+            values[joint, key] = _finite(text, f"line {number}, {joint}.{key}", path)
+            places[joint, key] = (start + match.start(3), start + match.end(3))
+    missing = [f"{j}.{key}" for j in JOINTS for key in SIX if (j, key) not in values]
+    if missing:
+        raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]", path)
+    return Chain.about_z([numeric_frame([values[j, key] for key in SIX]) for j in JOINTS], np.eye(4)), places
+
+
+def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
+    """Return the robot that a controller's ``calibration.conf`` describes, in the controller's Base.
+
+    Its section ``[mounting]`` lists ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, from the base
+    joint to wrist 3, in rad and m. They are added to the model's standard DH parameters, all of them::
+
+        T = prod_i Rot(z, q_i + theta_i) Trans(z, d_i) Trans(x, a_i) Rot(x, alpha_i)
+
+    Order, sign and units: UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration (which adds such deltas in its
+    tests), and forum.universal-robots.com, thread 1638, "UR10 Calibration.conf DH model generation". Along
+    the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
+    beta3 take the tilt and every number is near nominal.
+
+    Parameters
+    ----------
+    path
+        The file.
+    nominal
+        The model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
+    """
+    path = Path(path)
+    deltas, _ = _deltas(read_bytes(path), path)
+    require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
+    table = nominal.mdh.copy()
+    table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
+    table[1:, :2] += np.column_stack([deltas["alpha"], deltas["a"]])[:-1]
+    tail = link_of(alpha=deltas["alpha"][-1], a=deltas["a"][-1])
+    plain, base, tool, _ = describe(Chain.about_z([link_of(*row) for row in table], tail), nominal.mdh)
+    robot = Robot(nominal.name, plain, nominal.joint_types, nominal.joint_map, nominal.limits, path.name)
+    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+
+
+def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
+    """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
+
+    The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
+    what else it checks (the file has checksums of the joints) is not documented. Keep the original.
+
+    Parameters
+    ----------
+    source
+        The robot's own file.
+    robot
+        The identified robot, in the controller's Base.
+    nominal
+        The model, as for `read_ur_calibration`.
+    target
+        Where to write; may be ``source``.
+
+    Raises
+    ------
+    InputError
+        For alpha1 or a1 that deviate (the base has to hold them), beta6, or axes too nearly parallel.
+    """
+    path = Path(source)
+    data = read_bytes(path)
+    old, places = _deltas(data, path)
+    require_same_arm(robot, nominal.mdh, REVOLUTE, path)
+    if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
+        raise InputError("robot", "alpha1 or a1 that deviate", "a base that holds where axis 1 is", path)
+    change = without_beta(robot).mdh - nominal.mdh
+    shifted = {"theta": change[:, 2], "d": change[:, 3], "a": np.append(change[1:, 1], 0.0)}
+    shifted["alpha"] = np.append(change[1:, 0], 0.0)
+    edits = {
+        places[name]: ", ".join(repr(float(v)) for v in values)
+        for name, values in shifted.items()
+        if not np.array_equal(values, old[name])
+    }
+    write_bytes(Path(target), spliced(data, edits))
+
+
+def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
+    """Return the four lists, and by name where in the file their numbers stand."""
+    values, places = {}, {}
+    section = re.search(rb"^\s*\[mounting\](.*?)(?=^\s*\[\w+\]|\Z)", data, re.MULTILINE | re.DOTALL)
+    if section is None:
+        raise InputError("section [mounting]", "nothing", "a controller's calibration.conf", path)
+    for name in (c for c in MDH if c in DELTAS):
+        key = DELTAS[name]
+        found = list(
+            re.finditer(rb"^[ \t]*" + key.encode() + rb"[ \t]*=[ \t]*\[([^\]\n]*)\]", section[1], re.MULTILINE)
+        )
+        parts = found[0][1].decode(errors="replace").split(",") if len(found) == 1 else []
+        if len(parts) != 6:
+            what = f"{len(found)} lists" if len(found) != 1 else f"{len(parts)} numbers"
+            raise InputError(f"key {key}", what, "one list of six numbers", path)
+        values[name] = np.array([_finite(part.strip(), f"key {key}", path) for part in parts])
+        places[name] = tuple(section.start(1) + edge for edge in found[0].span(1))
+    return values, places
+
+
+def _finite(text: str, where: str, path: Path) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or "_" in text:
+        raise InputError(where, f"'{text[:40]}'", "a finite number", path)
+    return value
