@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rpim_opt.calibration import Calibration as Calibration
     from rpim_opt.calibration import calibrate as calibrate
+    from rpim_opt.compensation import Compensation as Compensation
+    from rpim_opt.compensation import compensate as compensate
+    from rpim_opt.compensation import compensate_file as compensate_file
+    from rpim_opt.compensation import read_targets as read_targets
     from rpim_opt.constraints import Box as Box
     from rpim_opt.constraints import at_nominal as at_nominal
     from rpim_opt.constraints import by_kind as by_kind
@@ -102,6 +106,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "calibration": ("Calibration", "calibrate"),
+    "compensation": ("Compensation", "compensate", "compensate_file", "read_targets"),
     "dataset": ("Dataset", "read_data"),
     "exceptions": ("InputError", "NoSolutionFound", "RpimError"),
     "constraints": (

@@ -6,6 +6,7 @@ Every function takes and returns CasADi ``SX`` (numbers are welcome) and builds 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -20,6 +21,9 @@ FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True)
 
 JOINT_EXTRAS = {"ratio": "ratio", "ecc_cos": "angle", "ecc_sin": "angle", "compliance": "compliance"}
 """Parameters of a joint beyond its MDH row, with their dimensions; all are zero in a nominal robot."""
+
+CHUNK = 256
+"""Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
 
 Symbol = Any  # ca.SX or a number: CasADi ships no types
 
@@ -100,29 +104,45 @@ def frame_numbers(T: Array) -> Array:
     return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
-def chain(
-    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
-) -> ca.SX:
-    """Return the transform from the robot's base to its flange.
+def motion(kind: str, i: int, q: Symbol, torque: Symbol, value: Callable[[str], Symbol]) -> Symbol:
+    """Return by how much joint i has moved [rad or m].
 
-    ``value("alpha2")`` gives the parameters. Joint i moves by
+    ``value("ratio2")`` gives the parameters::
 
         (1 + ratio) q + ecc_cos cos q + ecc_sin sin q + compliance torque        revolute
         (1 + ratio) q                                                            prismatic
 
-    with the model's joint value q [rad or m] and the joint's torque [Nm].
+    for the model's joint value q [rad or m] and the joint's torque [Nm].
     """
-    T = ca.SX.eye(4)
+    moved = (1 + value(f"ratio{i}")) * q
+    if kind == "revolute":
+        moved += value(f"ecc_cos{i}") * ca.cos(q) + value(f"ecc_sin{i}") * ca.sin(q) + value(f"compliance{i}") * torque
+    return moved
+
+
+def transforms(
+    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
+) -> list[ca.SX]:
+    """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
+
+    ``value("alpha2")`` gives the parameters; joints move by `motion`.
+    """
+    T, after = ca.SX.eye(4), []
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
-        motion = (1 + value(f"ratio{i}")) * q[i - 1]
-        if kind == "revolute":
-            motion += value(f"ecc_cos{i}") * ca.cos(q[i - 1]) + value(f"ecc_sin{i}") * ca.sin(q[i - 1])
-            motion += value(f"compliance{i}") * torque[i - 1]
-            T = T @ link(alpha, a, theta + motion, d, beta)
-        else:
-            T = T @ link(alpha, a, theta, d + motion, beta)
-    return T
+        moved = motion(kind, i, q[i - 1], torque[i - 1], value)
+        T = T @ (
+            link(alpha, a, theta + moved, d, beta) if kind == "revolute" else link(alpha, a, theta, d + moved, beta)
+        )
+        after.append(T)
+    return after
+
+
+def chain(
+    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
+) -> ca.SX:
+    """Return the transform from the robot's base to its flange; arguments as for `transforms`."""
+    return transforms(joint_types, q, torque, value)[-1]
 
 
 def forward_kinematics(robot: Robot, q: Array) -> Array:
@@ -142,7 +162,7 @@ def forward_kinematics(robot: Robot, q: Array) -> Array:
 
 
 def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
-    """Evaluate a CasADi function on every row of a table in one call, without copies.
+    """Evaluate a CasADi function on every row of a table, many in one call, without copies.
 
     Parameters
     ----------
@@ -157,15 +177,25 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     -------
     For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
     """
-    N = len(rows)
-    mapped = ca.Function.map(function, "rows", "serial", N, list(range(len(shared))), [], {})
-    results = [np.zeros((N, *reversed(function.size_out(i)))) for i in range(function.n_out())]
-    buffer: Any
-    buffer, trigger = mapped.buffer()
+    results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
-    for i, values in enumerate(arguments):
-        buffer.set_arg(i, values.data)
-    for i, values in enumerate(results):
-        buffer.set_res(i, values.data)
-    trigger()
+    buffers: dict[int, Any] = {}
+    for start in range(0, len(rows), CHUNK):
+        part = slice(start, start + CHUNK)
+        N = len(rows[part])
+        if N not in buffers:
+            buffers[N] = _mapped(function, len(shared), N).buffer()
+            for i, values in enumerate(arguments[:-1]):
+                buffers[N][0].set_arg(i, values.data)
+        buffer, trigger = buffers[N]
+        buffer.set_arg(len(shared), arguments[-1][part].data)
+        for i, values in enumerate(results):
+            buffer.set_res(i, values[part].data)
+        trigger()
     return results
+
+
+@lru_cache(maxsize=512)
+def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
+    """Return the function of N rows."""
+    return ca.Function.map(function, "rows", "serial", N, list(range(shared)), [], {})

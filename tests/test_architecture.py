@@ -39,6 +39,7 @@ ORDER = {
     "results": set(),
     "baselines": set(),
     "design": set(),
+    "compensation": {"casadi"},
     "plots": {"matplotlib"},
     "svg": set(),
     "report": set(),

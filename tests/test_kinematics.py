@@ -62,6 +62,12 @@ def test_signs_and_couplings_act_on_the_controllers_joint_values() -> None:
     assert np.array_equal(ro.forward_kinematics(coupled, q), ro.forward_kinematics(ARM, q @ joint_map.T))
 
 
+def test_many_rows_are_the_single_rows() -> None:
+    q = np.random.default_rng(0).normal(size=(600, 6))
+    T = ro.forward_kinematics(ARM, q)
+    assert all(np.array_equal(T[i], ro.forward_kinematics(ARM, q[i])[0]) for i in (0, 255, 256, 511, 512, 599))
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_jacobian_equals_central_differences(seed: int) -> None:
