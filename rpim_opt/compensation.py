@@ -73,6 +73,17 @@ class Compensation:
         For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
         prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
         ``"near singular"`` (the correction would be too large, and was damped).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
+    >>> found = ro.compensate(result, np.radians([[10, -80, 60, 20, 30, 0]]), label=["P1"])
+    >>> np.degrees(found.q - found.nominal).round(2), found.status
+    (array([[ 0.08,  0.86, -2.02,  1.21, -0.09, -0.04]]), ('ok',))
+    >>> print(found.csv().splitlines()[0])
+    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
     """
 
     robot: Robot
@@ -174,8 +185,8 @@ def compensate(
     orientation
         Whether orientations count.
     tool
-        A tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad], that the controller knows as it is. By default
-        the reflector of the calibration, which the controller knows as stated and the robot has as identified.
+        (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad], that the controller knows as it is. By
+        default the reflector of the calibration, which the controller knows as stated and the robot has as identified.
     marker
         Which reflector, when there are several.
     base
@@ -195,6 +206,15 @@ def compensate(
     ------
     InputError
         For shapes that do not fit, numbers that are not finite, a reflector that is not known.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
+    >>> found = ro.compensate(result, instance.validation.q)
+    >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
+    2.64 mm, 0.0000 mm left
     """
     robot = result.problem.robot
     targets = _checked(robot, Targets(tuple(label), q, poses, torque), orientation)
@@ -220,7 +240,8 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     Parameters
     ----------
     source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), or a pandas or polars data frame.
+        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column names
+        to cells.
     robot
         Its joints' number and types decide the joint columns.
 
@@ -228,6 +249,14 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     ------
     InputError
         Naming the file, the row or column, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> targets = ro.read_targets({"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]}, robot)
+    >>> targets.label, targets.q, targets.poses
+    (('P1',), None, array([[0.4, 0. , 0.5]]))
     """
     try:
         columns = dict(read_columns(source))
@@ -258,7 +287,27 @@ def read_targets(source: Any, robot: Robot) -> Targets:
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
     """Compensate the targets of a table (`read_targets`) and write `Compensation.csv`, whole or not at all.
 
-    ``options`` are those of `compensate`.
+    Parameters
+    ----------
+    result
+        The calibration.
+    targets, out
+        The table to read, and the CSV file to write.
+    options
+        Those of `compensate`.
+
+    Raises
+    ------
+    InputError
+        As `read_targets` and `compensate` do.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
+    >>> found = ro.compensate_file(result, "targets.csv", "commands.csv")
+    >>> len(found.q), set(found.status)
+    (18, {'ok'})
     """
     read = read_targets(targets, result.problem.robot)
     found = compensate(result, read.q, read.poses, torque=read.torque, label=read.label, **options)

@@ -47,6 +47,17 @@ class Box:
         What reports call it.
     limits
         From the identified `Parameters` to lower and upper bounds (n,) of z, infinite where there is none.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> half = ro.Box("half a scale", lambda p: (np.full(len(p), -0.5), np.full(len(p), 0.5)))
+    >>> within = ro.Formulation("Tikhonov in a box", penalty=cp.sum_squares, constraints=(half,))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, within, weight=1e-3)
+    >>> round(float(abs(result.x / result.problem.parameters.free.scale).max()), 9)
+    0.5
     """
 
     name: str
@@ -74,12 +85,27 @@ def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
 
 
 within_tolerance = Box("within tolerance", _tolerances)
-"""|x_i| <= tolerance_i, where a tolerance is stated."""
+"""|x_i| <= tolerance_i, where a tolerance is stated; InputError where none is.
+
+>>> import rpim_opt as ro
+>>> parameters = ro.load("paper_arm").problem.parameters.free
+>>> lower, upper = ro.within_tolerance.limits(parameters)
+>>> sorted(set(upper.round(9).tolist()))  # in units of the scales
+[5.0, 10.0]
+"""
 
 
 @stated
 def at_nominal(*patterns: str) -> Box:
-    """Keep the parameters that match a pattern at their nominal values: z_i = 0."""
+    """Keep the parameters that match one of the patterns at their nominal values: z_i = 0.
+
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> parallel = ro.Formulation("parallel axes", penalty=cp.sum_squares, constraints=(ro.at_nominal("alpha[34]"),))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, parallel, weight=1e-3)
+    >>> dict(zip(result.problem.parameters.free.names, result.x.tolist()))["alpha3"]
+    0.0
+    """
 
     def limits(parameters: Parameters) -> tuple[Array, Array]:
         chosen = _matching(parameters, patterns, "at_nominal")
@@ -90,7 +116,24 @@ def at_nominal(*patterns: str) -> Box:
 
 @stated
 def signed(sign: int, *patterns: str) -> Box:
-    """Keep the deviations that match a pattern on one side: sign z_i >= 0."""
+    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0.
+
+    Parameters
+    ----------
+    sign
+        +1 or -1.
+    patterns
+        Names of identified parameters, with ``*``, ``?`` and ``[...]``.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> longer = ro.Formulation("no link is shorter", penalty=cp.sum_squares, constraints=(ro.signed(+1, "a?"),))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, longer, weight=1e-3)
+    >>> bool((result.robot.mdh[:, 1] >= result.problem.robot.mdh[:, 1]).all())
+    True
+    """
 
     def limits(parameters: Parameters) -> tuple[Array, Array]:
         chosen = _matching(parameters, patterns, "signed")
@@ -101,7 +144,15 @@ def signed(sign: int, *patterns: str) -> Box:
 
 @stated
 def equal(*names: str) -> Constraint:
-    """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel."""
+    """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel.
+
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> level = ro.Formulation("a4 = a5", penalty=cp.sum_squares, constraints=(ro.equal("a4", "a5"),))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, level, weight=1e-3)
+    >>> (1e3 * result.robot.mdh[3:5, 1]).round(3)  # [mm]
+    array([489.544, 489.544])
+    """
 
     def constraint(z: Any, parameters: Parameters) -> Any:
         k = [parameters.names.index(n) for n in names if n in parameters.names]
@@ -120,7 +171,23 @@ def equal(*names: str) -> Constraint:
 
 @stated
 def in_ball(radius: float, *patterns: str) -> Constraint:
-    """Keep the deviations that match a pattern in a ball: |z| <= radius, in units of the scales."""
+    """Keep the deviations that match one of the patterns in a ball: |z| <= radius.
+
+    Parameters
+    ----------
+    radius
+        In units of the scales.
+    patterns
+        Names of identified parameters, with ``*``, ``?`` and ``[...]``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),)))
+    >>> round(float(np.linalg.norm(result.x / result.problem.parameters.free.scale)), 6)
+    2.0
+    """
 
     def constraint(z: Any, parameters: Parameters) -> Any:
         return cp.norm(z[np.flatnonzero(_matching(parameters, patterns, "in_ball"))]) <= radius
@@ -129,6 +196,8 @@ def in_ball(radius: float, *patterns: str) -> Constraint:
 
 
 def _matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.ndarray:
+    if not patterns:
+        raise InputError(what, "no pattern", "names or patterns of identified parameters")
     chosen = np.zeros(len(parameters), dtype=bool)
     for pattern in patterns:
         hits = np.array([fnmatchcase(name, pattern) for name in parameters.names])
@@ -149,14 +218,28 @@ def _grouped(parameters: Parameters, key: Callable[[str], str]) -> list[Array]:
 
 
 def by_link(parameters: Parameters) -> list[Array]:
-    """Group the parameters by link (``alpha3, a3, theta3, d3``) and by frame (``base``, ``tool``)."""
+    """Group the parameters by link (``alpha3, a3, theta3, d3``) and by frame (``base``, ``tool``).
+
+    Returns matrices D_k (n_k, n) that pick the groups, for ``penalty_over`` of a `Formulation`.
+
+    >>> import rpim_opt as ro
+    >>> parameters = ro.load("position").problem.parameters.free
+    >>> [len(D) for D in ro.by_link(parameters)]  # six links, base, tool
+    [4, 5, 4, 4, 4, 4, 6, 3]
+    """
     return _grouped(
         parameters, lambda name: re.sub(r"^[a-z_]+?(\d+)$", r"\1", name) if name[-1].isdigit() else name.split("_")[0]
     )
 
 
 def by_kind(parameters: Parameters) -> list[Array]:
-    """Group the parameters by kind (all ``alpha``, all ``a``, ...)."""
+    """Group the parameters by kind (all ``alpha``, all ``a``, ...), as `by_link` does by link: D_k (n_k, n).
+
+    >>> import rpim_opt as ro
+    >>> parameters = ro.load("position").problem.parameters.free
+    >>> [len(D) for D in ro.by_kind(parameters)]  # alpha, a, theta, d, beta, base, tool
+    [6, 6, 6, 6, 1, 6, 3]
+    """
     return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
 
 
@@ -164,7 +247,16 @@ def by_kind(parameters: Parameters) -> list[Array]:
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
 
-    For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders.
+    For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders. The
+    function that it returns gives rows D_k (1, n), for ``penalty_over`` of a `Formulation`.
+
+    >>> import rpim_opt as ro
+    >>> parameters = ro.load("position").problem.parameters.identify(["d[12]", "ratio?"]).free
+    >>> for D in ro.differences("ratio[123]")(parameters)[:3]:
+    ...     print(D.astype(int))
+    [[ 0  0 -1  1  0  0  0  0]]
+    [[ 0  0  0 -1  1  0  0  0]]
+    [[1 0 0 0 0 0 0 0]]
     """
 
     def rows(parameters: Parameters) -> list[Array]:

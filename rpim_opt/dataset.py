@@ -74,6 +74,15 @@ class Dataset:
     configuration
         (N,) number of the configuration a row belongs to: rows of one configuration stay together
         in cross-validation.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> data = ro.load("paper_arm").problem.data
+    >>> len(data), data.q.shape, data.label[:3]
+    (9, (9, 6), ('T2-1', 'T2-2', 'T2-3'))
+    >>> data.take([2, 0]).label, data.without({"T2-1"}).label[:2]
+    (('T2-3', 'T2-1'), ('T2-2', 'T2-3'))
     """
 
     blocks: tuple[Block, ...]
@@ -92,7 +101,7 @@ class Dataset:
         return q
 
     def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
-        """Return the rows at ``index``, in that order; a row may be taken more than once."""
+        """Return the rows at ``index`` (K,), in that order; a row may be taken more than once."""
         index = np.asarray(index, dtype=int)
         owner, place = np.empty(len(self), dtype=int), np.empty(len(self), dtype=int)
         for i, block in enumerate(self.blocks):
@@ -109,7 +118,27 @@ class Dataset:
         return self.take([i for i, label in enumerate(self.label) if label not in labels])
 
     def configurations(self, count: int, seed: int) -> Dataset:
-        """Return the rows of ``count`` configurations drawn at random."""
+        """Return the rows of some configurations drawn at random.
+
+        Parameters
+        ----------
+        count
+            How many configurations.
+        seed
+            Of the draw: the same seed gives the same rows.
+
+        Raises
+        ------
+        InputError
+            For a count below 1 or above the number of configurations.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("markers").problem.data  # three reflectors: three rows a configuration
+        >>> len(data), len(data.configurations(5, seed=0))
+        (75, 15)
+        """
         known = np.unique(self.configuration)
         if not 0 < count <= len(known):
             raise InputError("count", f"{count}", f"1 to {len(known)} configurations")
@@ -134,6 +163,19 @@ class Dataset:
             N row labels; numbers from 1 by default.
         measurement
             What the instrument sees.
+
+        Raises
+        ------
+        InputError
+            For shapes that do not fit together, numbers that are not finite, or a deviation that is not positive.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> data = ro.Dataset.of(np.zeros((2, 6)), [[0.3, 0.0, 0.6], [0.3, 0.1, 0.6]], sigma=3e-5)
+        >>> len(data), data.label
+        (2, ('1', '2'))
         """
         q, y = np.asarray(q, float), np.asarray(y, float)
         q = q[:, None] if q.ndim == 2 else q
@@ -157,9 +199,24 @@ class Dataset:
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
-        """Return several datasets as one; where labels occur twice, the part's name precedes all of them.
+        """Return several datasets as one.
 
         Rows of different parts belong to the same configuration when their joint values are equal.
+
+        Parameters
+        ----------
+        parts
+            The datasets, of a robot.
+        names
+            What precedes the labels of each part, ``name:label``, where labels occur twice.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("paper_arm").problem.data
+        >>> twice = ro.Dataset.together([data, data], ["morning", "evening"])
+        >>> len(twice), twice.label[0], len(set(twice.configuration))
+        (18, 'morning:T2-1', 9)
         """
         labels = [label for part in parts for label in part.label]
         if len(set(labels)) < len(labels):
@@ -196,7 +253,8 @@ def read_data(
     Parameters
     ----------
     source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), or a pandas or polars data frame.
+        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column names
+        to cells.
     robot
         Its joints' number and types decide the joint columns.
     noise
@@ -209,6 +267,16 @@ def read_data(
     ------
     InputError
         Naming the file, the row or column, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> table = {"q1_deg": [0, 90], "q2_deg": [0, 30], "x_mm": [401, 2], "y_mm": [0, 400], "z_mm": [0, 1]}
+    >>> data = ro.read_data(table, arm, {"position_mm": 0.05})
+    >>> data.q.round(3).tolist(), data.blocks[0].y[0].tolist()  # [rad], [m]
+    ([[0.0, 0.0], [1.571, 0.524]], [0.401, 0.0, 0.0])
     """
     declared = _declared(noise or {}, measurement)  # outside: a mistake there is not the table's
     try:

@@ -31,16 +31,25 @@ class Design:
     Parameters
     ----------
     chosen
-        Indices of the candidates.
+        (count,) indices of the candidates.
     weights
         (M,) what the relaxation gives every candidate, from 0 to 1.
     criterion
         ``D``, ``A``, ``E`` or ``V``.
     value, bound
-        The criterion of the chosen set, and what no set of that size can exceed (fall below, for A and V).
+        The criterion of the chosen set (ln det M for D), and what no set of that size can exceed (fall below, for A
+        and V).
     gap
         bound over value as efficiencies, minus 1: 0.01 means that no set is more than 1 % better. D counts per
         parameter, det^(1/n).
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> design = ro.choose(problem, ro.random_candidates(problem.robot, 60), count=30, criterion="D")
+    >>> len(design.chosen), design.gap < 0.02, design.value < design.bound
+    (30, True, True)
     """
 
     chosen: np.ndarray
@@ -61,7 +70,27 @@ class Design:
 
 
 def random_candidates(robot: Robot, count: int, seed: int = 0, share: float = 1.0) -> Array:
-    """Return joint values (count, dof) uniform in a share of the limits, which have to be finite."""
+    """Return joint values (count, dof) [rad or m], uniform in the middle of the limits.
+
+    Parameters
+    ----------
+    robot
+        Its limits have to be finite: InputError otherwise.
+    count
+        How many configurations.
+    seed
+        Of the draws.
+    share
+        Which part of every joint's range is used, from 0 to 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> q = ro.random_candidates(ro.load("position").problem.robot, 1000, share=0.5)
+    >>> np.degrees(q.max(axis=0)).round()
+    array([ 82.,  55.,  25.,  80.,  60., 200.])
+    """
     if not np.isfinite(robot.limits).all():
         raise InputError("limits", "a joint without limits", "limits for every joint, or candidates of your own")
     middle, half = robot.limits.mean(axis=1), share * np.ptp(robot.limits, axis=1) / 2
@@ -125,6 +154,19 @@ def choose(
         (K, dof) where positions are to be predicted (V); the candidates by default.
     progress
         Told what goes on.
+
+    Raises
+    ------
+    InputError
+        For another criterion, a count that the candidates do not allow, or measurements between two points.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> design = ro.choose(problem, ro.random_candidates(problem.robot, 60), count=30)
+    >>> print(str(design).partition(":")[0])
+    30 of 60 configurations, V-optimal (predicted variance)
     """
     if criterion not in CRITERIA:
         raise InputError("criterion", f"'{criterion}'", choices(criterion, CRITERIA))

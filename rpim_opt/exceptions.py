@@ -8,14 +8,37 @@ from typing import Any, NamedTuple
 
 
 class RpimError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose.
+
+    >>> import rpim_opt as ro
+    >>> try:
+    ...     ro.load("paper_arm", variant="bound")
+    ... except ro.RpimError as error:
+    ...     print(type(error).__name__)
+    InputError
+    """
 
 
 class InputError(RpimError):
     """Something a user wrote cannot be used.
 
-    Reads as one sentence: ``file, where: found ..., accepted ...``. The parts stay
-    available as attributes ``file``, ``where``, ``found`` and ``accepted``.
+    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes.
+
+    Parameters
+    ----------
+    where
+        The key, column, row or argument.
+    found, accepted
+        What stands there, and what could.
+    file
+        The file it stands in; None where there is none.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> error = ro.InputError("key joint 2.d_mm", "'long'", "a finite number")
+    >>> print(error.within("robot.toml"))
+    robot.toml, key joint 2.d_mm: found 'long', accepted: a finite number.
     """
 
     def __init__(self, where: str, found: str, accepted: str, file: object = None):
@@ -24,7 +47,7 @@ class InputError(RpimError):
         super().__init__(f"{place}: found {found}, accepted: {accepted}.")
 
     def within(self, file: object) -> InputError:
-        """Return the same error with the file it occurred in."""
+        """Return the same error with the file it occurred in, unless it names one already."""
         return self if self.file else InputError(self.where, self.found, self.accepted, file)
 
 
@@ -39,7 +62,31 @@ class Conflict(NamedTuple):
 
 
 class NoSolutionFound(RpimError):
-    """A convex program was not solved; ``program``, ``weight``, ``status`` and ``conflict`` are the evidence."""
+    """A convex program was not solved; its parameters, kept as attributes, are the evidence.
+
+    Parameters
+    ----------
+    program
+        The `ConvexProgram`.
+    weight
+        At which it was to be solved.
+    status
+        How the solver ended, ``"infeasible"`` for instance.
+    conflict
+        What contradicts what; None where that is not known.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> tight = problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5})
+    >>> exact = ro.Formulation("all within a sigma", largest=1.0, constraints=(ro.within_tolerance,))
+    >>> try:
+    ...     ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), exact)
+    ... except ro.NoSolutionFound as error:
+    ...     print(error.status, *error.conflict.parameters)  # whose tolerances contradict the measurements
+    infeasible a3 a4 d5 d6
+    """
 
     def __init__(self, program: Any, weight: float, status: str, conflict: Conflict | None = None):
         self.program, self.weight, self.status, self.conflict = program, weight, status, conflict
@@ -56,7 +103,15 @@ class NoSolutionFound(RpimError):
         super().__init__(text)
 
     def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
-        """Return the same error with names for the configurations' numbers."""
+        """Return the same error with names for the configurations' numbers.
+
+        >>> import rpim_opt as ro
+        >>> from rpim_opt.exceptions import Conflict
+        >>> program = ro.calibrate(ro.load("paper_arm").problem, weight=1e-3).program
+        >>> error = ro.NoSolutionFound(program, 1e-3, "infeasible", Conflict({}, {3: 1.5}))
+        >>> error.naming({3: "P4"}).conflict.configurations
+        {'P4': 1.5}
+        """
         if not self.conflict:
             return self
         rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}

@@ -41,6 +41,17 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     ------
     InputError
         For fewer than three points, points that coincide, or points on a line: their rotation is arbitrary.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> seen = np.array([[2, 0, 0], [2, 1, 0], [1, 0, 0]])  # turned by 90 degrees about z, moved by 2 along x
+    >>> ro.register(corners, seen).round(9)[:3] + 0.0
+    array([[ 0., -1.,  0.,  2.],
+           [ 1.,  0.,  0.,  0.],
+           [ 0.,  0.,  1.,  0.]])
     """
     source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
     q = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=float)
@@ -76,8 +87,23 @@ def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), 
     points
         (N, 3) measured positions [m], in any frame.
     start, spread
-        Where the offset is expected, and its standard deviation [m] against errors of the distances of 5 mm:
+        (3,) where the offset is expected [m], and its standard deviation [m] against errors of the distances of 5 mm:
         a direction that the configurations do not show stays there.
+
+    Raises
+    ------
+    InputError
+        For fewer than two configurations.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.forward_kinematics(arm.robot, arm.data.q)
+    >>> points = flange[:, :3, :3] @ [0.02, 0.0, 0.06] + flange[:, :3, 3]
+    >>> ro.tool_from_distances(flange, points + [5.0, 0.0, 1.0]).round(9) + 0.0  # wherever the instrument stands
+    array([0.02, 0.  , 0.06])
     """
     N = len(points)
     if N < 2:
@@ -113,6 +139,18 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     ------
     InputError
         For fewer than three poses, or rotations about one axis only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.forward_kinematics(arm.robot, arm.data.q)
+    >>> base, tool = np.eye(4), np.eye(4)
+    >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
+    >>> Z, X = ro.hand_eye(flange, base @ flange @ tool)
+    >>> bool(np.abs(Z - base).max() < 1e-9), bool(np.abs(X - tool).max() < 1e-9)
+    (True, True)
     """
     N = len(flange)
     if N < 3:
@@ -198,12 +236,26 @@ def starting_parameters(
     robot, data
         The nominal robot and what was measured.
     base
-        The robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
     tools
-        Reflectors in the flange frame by marker; ``{"": frame}`` for the only one.
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
     own
         Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
         parameters is stated is located from the nominal robot.
+
+    Raises
+    ------
+    InputError
+        For a marker of the data without a reflector, and data that do not determine what they have to.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> tools = {"": [0.02, 0, 0.06, 0, 0, 0]}
+    >>> parameters = ro.starting_parameters(problem.robot, problem.data, base=None, tools=tools)
+    >>> parameters.identify(["base_[xyz]"]).free.nominal.round(2)  # [m]; it stands at 1.8, -0.7, 0.35
+    array([ 1.8 , -0.7 ,  0.35])
     """
     tools = tools or {"": (0.0,) * 6}
     place: Place = (0.0,) * 6 if base is None else base

@@ -48,7 +48,19 @@ class Inspection:
     proposals
         One sentence each: what the problem file could say.
     observability
-        What the configurations can show; None where the data are fewer than one.
+        What the configurations can show.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.inspect(ro.load("paper_arm", variant="misprints").problem)
+    >>> found.standing_out, found.observability.rank, len(found.warnings)
+    (('T8-6', 'T8-7'), 20, 0)
+    >>> lines = str(found).splitlines()
+    >>> print(lines[0])
+     joint   unit      from        to     span   limits   of them
+    >>> print(lines[2])
+     q1       deg    -39.95     40.00    79.95        -         -
     """
 
     problem: CalibrationProblem
@@ -126,7 +138,18 @@ class Inspection:
 
 
 def inspect(problem: CalibrationProblem) -> Inspection:
-    """Look at a problem's data: ranges, coverage, repeated rows, likely mistakes, what can be identified."""
+    """Look at a problem's data: ranges, coverage, repeated rows, likely mistakes, what can be identified.
+
+    Mistakes are units, signs and zeros of joints, and left-handed frames: another reading of the data that leaves less
+    than a fifth of the position error is named.
+
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> wrong = replace(problem.data.blocks[0], q=problem.data.blocks[0].q * [1, 1, -1, 1, 1, 1])
+    >>> print(ro.inspect(problem.on(replace(problem.data, blocks=(wrong,)))).warnings[-1])
+    the data fit 515 times better (error over extent) with joint 3 counted the other way.
+    """
     data = problem.data
     residual = calibrate(problem, tikhonov, 1.0, max_iterations=1).nominal_errors()
     middle = np.nanmedian(residual)

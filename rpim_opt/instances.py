@@ -63,6 +63,14 @@ class Instance:
         SHA-256 of the files that were read, by name.
     excluded
         Rows that the folder leaves out, label to reason.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    >>> instance.record.title, instance.excluded["T8-7"], instance.published["validation"]["RPIM"]
+    ("The paper's cooperative manipulator", 'z misprinted, off by 15.0 mm', 0.468)
     """
 
     title: str
@@ -79,7 +87,7 @@ class Instance:
 
     @property
     def record(self) -> Record:
-        """What a saved result and its report say of the data."""
+        """What a saved result and its report say of the data: title, source, validation data, files, excluded rows."""
         return Record(self.title, self.source, self.validation, self.files, self.excluded, bool(self.simulation))
 
 
@@ -178,6 +186,13 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
     ------
     InputError
         Naming the file, the row or key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm", variant="swap")  # the 16 points for the 9, and the other way round
+    >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
+    (16, 9, 'Tikhonov')
     """
     stated = read_problem(name, variant, measurements)
     table, path, robot, folder = stated.table, stated.path, stated.robot, stated.path.parent
@@ -375,7 +390,12 @@ def _proposed(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
 
 
 def robots() -> list[str]:
-    """Return the names of the ready robots."""
+    """Return the names of the ready robots, which a problem file may name: ``robot = "ur5e"``.
+
+    >>> import rpim_opt as ro
+    >>> ro.robots()[-3:]
+    ['ur3e', 'ur5', 'ur5e']
+    """
     return sorted(p.stem for p in (HERE / "robots").glob("*.toml"))
 
 

@@ -146,12 +146,23 @@ def chain(
 
 
 def forward_kinematics(robot: Robot, q: Array) -> Array:
-    """Return the flange's transforms (N, 4, 4) for the controller's joint values q (N, dof) [rad or m].
+    """Return the transforms (N, 4, 4) from the robot's base to its flange, the product of the links of `Robot`.
 
-    >>> from rpim_opt.robot import Robot
-    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
-    >>> forward_kinematics(arm, np.zeros((1, 2)))[0, :3, 3].tolist()
-    [0.4, 0.0, 0.0]
+    Parameters
+    ----------
+    robot
+        The arm; base and tool are no part of it.
+    q
+        (N, dof) joint values of the controller [rad or m].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> ro.forward_kinematics(arm, np.array([[0, 0], [np.pi / 2, 0]]))[:, :3, 3].round(9)
+    array([[0.4, 0. , 0. ],
+           [0. , 0.4, 0. ]])
     """
     configurations = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
     symbol = ca.SX.sym("q", robot.dof)

@@ -11,6 +11,7 @@ Element = ElementTree.Element
 def tag(name: str, /, *children: str | Element, **attributes: object) -> Element:
     """Return an element; ``class_`` stands for ``class``, ``aria_label`` for ``aria-label``.
 
+    >>> from rpim_opt.markup import html, tag
     >>> html(tag("p", "a < b ", tag("b", "c"), class_="note"))
     '<p class="note">a &lt; b <b>c</b></p>'
     """

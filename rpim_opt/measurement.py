@@ -59,6 +59,18 @@ class Measurement:
         Other columns in which a table may state the values, each with the function to y (N, c).
     prepare
         Checks and normalizes y (N, c); raises InputError with the row's number as ``where``.
+
+    Examples
+    --------
+    A probe that reads heights alone. On the nominal robot, residuals of such readings are zero.
+
+    >>> import rpim_opt as ro
+    >>> height = ro.Measurement("height", model=lambda T: T[2, 3], columns={"z": "length"})
+    >>> arm = ro.load("paper_arm").problem
+    >>> z = ro.forward_kinematics(arm.robot, arm.data.q)[:, 2, 3]
+    >>> probed = arm.on(ro.Dataset.of(arm.data.q, z[:, None], sigma=1e-5, measurement=height))
+    >>> bool(abs(probed.residual(0 * arm.parameters.free.nominal)).max() < 1e-12)
+    True
     """
 
     name: str
@@ -282,11 +294,20 @@ class LaserTracker:
     range, transverse
         Standard deviations along and across the beam at zero distance [m].
     range_ppm
-        Growth along the beam per metre [1].
+        Growth along the beam per metre [1]: 1e-6 for 1 ppm.
     angle
         Growth across the beam [rad].
     x, y, z
         The tracker's place in the instrument's frame [m]; its origin by default.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> tracker = ro.LaserTracker(range=10e-6, range_ppm=1e-6, transverse=15e-6, angle=6e-6)
+    >>> covariance = tracker.covariance(np.array([[3.0, 0.0, 0.0]]))
+    >>> (1e6 * np.sqrt(np.diag(covariance[0]))).round(3)  # along x the beam, [um]
+    array([13., 33., 33.])
     """
 
     range: float = 0.0
@@ -298,7 +319,7 @@ class LaserTracker:
     z: float = 0.0
 
     def covariance(self, points: Array) -> Array:
-        """Return (N, 3, 3) [m^2] for points (N, 3) [m]."""
+        """Return the covariances (N, 3, 3) [m^2] of points (N, 3) [m] in the instrument's frame."""
         beam = points - np.array([self.x, self.y, self.z])
         D = np.linalg.norm(beam, axis=1)
         u = beam / np.maximum(D, 1e-9)[:, None]

@@ -43,6 +43,16 @@ class Observability:
     raw_condition
         |U| |U^-1| of the Jacobian in millimetres and radians, neither whitened nor scaled (paper, Eq. 24);
         infinite or above 1e15 where it is singular.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.observe(ro.load("rank_deficient").problem)
+    >>> len(found.names), found.rank, len(found.redundant), found.unseen
+    (45, 30, 12, ('beta5', 'theta6', 'ratio6'))
+    >>> found = ro.observe(ro.load("scara").problem)
+    >>> {name: f"{value:.2g}" for name, value in found.indices.items()}
+    {'O1': '1.4e+02', 'O2': '0.00017', 'O3': '11', 'O4': '0.002', 'O5': '4.5'}
     """
 
     names: tuple[str, ...]
@@ -82,6 +92,13 @@ def observe(problem: CalibrationProblem, x: Array | None = None) -> Observabilit
         Measured values do not matter, configurations, scales and covariance do.
     x
         (n,) deviations [SI] to linearize at; nominal by default, where redundancies are exact.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.observe(ro.load("paper_arm").problem)
+    >>> f"{found.rank} of {len(found.names)} directions are seen, condition {found.condition:.3g}"
+    '20 of 26 directions are seen, condition 2.87e+03'
     """
     x = np.zeros(len(problem.parameters.free)) if x is None else x
     model, free = problem.linearize(x), problem.parameters.free

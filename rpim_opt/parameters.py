@@ -51,6 +51,18 @@ class Parameters:
         (P,) largest deviation that a bounded calibration allows [SI]; infinite where there is none.
     identified
         (P,) which parameters a calibration may change.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> parameters = ro.load("position").problem.parameters
+    >>> len(parameters), len(parameters.free), parameters.dimension_of("tool_x")
+    (66, 34, 'length')
+    >>> parameters.take(np.array([0, 5])).names
+    ('alpha1', 'alpha2')
+    >>> [name for name, places in zip(parameters.names, parameters.of_frames) if places][:4]
+    ['base_x', 'base_y', 'base_z', 'base_rx']
     """
 
     names: tuple[str, ...]
@@ -64,7 +76,7 @@ class Parameters:
         return len(self.names)
 
     def take(self, index: np.ndarray) -> Parameters:
-        """Return the entries at ``index``."""
+        """Return the entries at ``index`` (K,), in that order."""
         return Parameters(
             tuple(self.names[i] for i in index),
             tuple(self.dimensions[i] for i in index),
@@ -85,13 +97,25 @@ class Parameters:
         return np.array([not _ON_THE_ROBOT.fullmatch(name) for name in self.names])
 
     def dimension_of(self, name: str) -> str:
-        """Return the dimension of a parameter."""
+        """Return the dimension of a parameter: ``length``, ``angle``, ``ratio`` or ``compliance``."""
         return self.dimensions[self.names.index(name)]
 
     def identify(self, patterns: Iterable[str]) -> Parameters:
         """Return the same table with just the parameters identified that match one of the patterns.
 
         A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``.
+
+        Raises
+        ------
+        InputError
+            For a pattern that matches no parameter.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> parameters = ro.load("position").problem.parameters
+        >>> parameters.identify(["a[12]", "tool_[xyz]"]).free.names
+        ('a1', 'a2', 'tool_x', 'tool_y', 'tool_z')
         """
         chosen = np.zeros(len(self), dtype=bool)
         for pattern in patterns:
@@ -102,10 +126,16 @@ class Parameters:
         return self._with(identified=chosen)
 
     def values(self, x: Array) -> Array:
-        """Return the parameters' values (n,) at the deviations x (n,) of a table that holds just these.
+        """Return the parameters' values (n,) [SI] at deviations x (n,) [SI], one for every entry of the table.
 
         A sum, except for the roll, pitch and yaw of a frame, whose deviation is a rotation about the
         parent's axes (`kinematics.frame`): there the angles of the composed rotation.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> frame = ro.load("position").problem.parameters.identify(["base_r?"]).free
+        >>> frame.nominal.round(3), frame.values(np.array([0.1, 0, 0])).round(3)
+        (array([ 0.02 , -0.035,  1.901]), array([-0.012, -0.129,  1.904]))
         """
         result = self.nominal + x
         index = {name: i for i, name in enumerate(self.names)}
@@ -119,13 +149,38 @@ class Parameters:
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
         """Return the same table with other scales, given as in a problem file's ``[scale]``.
 
-        Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, or a single
-        parameter's name or pattern with a unit, ``d5_mm``.
+        Parameters
+        ----------
+        table
+            Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, or a pattern or a
+            parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a pattern, a pattern before a group.
+        file
+            What an error names as the place of the table.
+
+        Raises
+        ------
+        InputError
+            For unknown keys, missing or wrong units, and values that are not greater than zero.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> parameters = ro.load("position").problem.parameters.scaled({"length_mm": 0.2, "a3_mm": 2.0})
+        >>> parameters.identify(["a[23]"]).free.scale  # [m]
+        array([0.0002, 0.002 ])
         """
         return self._with(scale=self._overlay(self.scale, table, "scale", file))
 
     def toleranced(self, table: Mapping[str, float], file: object = None) -> Parameters:
-        """Return the same table with other tolerances, given as in a problem file's ``[tolerance]``."""
+        """Return the same table with other tolerances, given as in a problem file's ``[tolerance]``.
+
+        Arguments and errors as for `scaled`.
+
+        >>> import rpim_opt as ro
+        >>> parameters = ro.load("position").problem.parameters.toleranced({"length_mm": 0.5})
+        >>> parameters.identify(["alpha2", "a2"]).free.tolerance  # [rad], [m]
+        array([   inf, 0.0005])
+        """
         return self._with(tolerance=self._overlay(self.tolerance, table, "tolerance", file))
 
     def _with(self, **changes: np.ndarray) -> Parameters:
@@ -177,18 +232,26 @@ def model_parameters(
     tools: Mapping[str, Sequence[float] | Array] | None = None,
     own: Mapping[str, tuple[str, float]] | None = None,
 ) -> Parameters:
-    """Return every parameter of a model, none of them identified yet.
+    """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
     Parameters
     ----------
     robot
         Gives the MDH parameters' nominal values.
     base
-        The robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
     tools
-        Reflectors in the flange frame by marker; ``{"": frame}`` for the only one.
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
     own
-        Further parameters, those of the measurement: name to (dimension, nominal value).
+        Further parameters, those of the measurement: name to (dimension, nominal value [SI]).
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parameters = ro.model_parameters(robot, tools={"A": (0, 0, 0.06, 0, 0, 0)})
+    >>> parameters.identify(["d1", "tool_A_z"]).free.nominal
+    array([0.099927, 0.06    ])
     """
     entries: list[tuple[str, str, float]] = []
     for i in range(robot.dof):

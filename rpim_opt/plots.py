@@ -37,6 +37,24 @@ def plot_l_curve(program: ConvexProgram, selections: Mapping[str, Selection] | N
     """Draw the root of loss against that of penalty of the solutions over the weights, with selectors' choices by name.
 
     The program is solved at 200 weights where it has a closed form, else at 40.
+
+    Parameters
+    ----------
+    program
+        Its penalty has to be something: InputError otherwise.
+    selections
+        Choices to mark, by name.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_l_curve(result.program, {"REML": result.selection})
+    >>> ax.get_xlabel()
+    'whitened residual norm'
+    >>> ax.figure.savefig("l_curve.pdf")
     """
     ax = _axes(ax)
     weights = weight_grid(program, 200 if program.closed_form else 40)
@@ -54,7 +72,22 @@ def plot_l_curve(program: ConvexProgram, selections: Mapping[str, Selection] | N
 
 
 def plot_selection(selection: Selection, ax: Axes = None) -> Axes:
-    """Draw what a selector compared over the weights, and its choice."""
+    """Draw what a selector compared over the weights, and its choice, dashed where it is at an edge.
+
+    Parameters
+    ----------
+    selection
+        The choice with its evidence.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ro.plot_selection(result.selection).get_title()
+    'largest restricted likelihood'
+    """
     ax = _axes(ax)
     finite = np.isfinite(selection.score)
     ax.semilogx(selection.weights[finite], selection.score[finite], color="0.3", lw=1.5)
@@ -66,7 +99,25 @@ def plot_selection(selection: Selection, ax: Axes = None) -> Axes:
 
 
 def plot_selectors(program: ConvexProgram, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the weights that selectors choose, all that serve the program by default; hollow: at an edge."""
+    """Draw the weights that selectors choose; hollow: at an edge.
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    selections
+        Choices by name; by default those of all selectors that serve the program (`compare`).
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_selectors(result.program)
+    >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
+    ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
+    """
     ax, chosen = _axes(ax), compare(program) if selections is None else selections
     ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
     for place, (_, selection) in enumerate(ordered):
@@ -82,7 +133,24 @@ def plot_picard(program: ConvexProgram, weight: float = 0.0, ax: Axes = None) ->
     """Draw Picard's condition: singular values, what the data say along them, and the solution's coefficients.
 
     Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
-    noise; the weight takes out the directions with s below its root.
+    noise; the weight takes out the directions with s below its root (Hansen 1990, BIT 30:658).
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    weight
+        Whose root is drawn, if it is not zero.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_picard(result.program, result.weight)
+    >>> [text.get_text() for text in ax.get_legend().get_texts()]
+    ['singular value s', "data |u'b|", "coefficient |u'b| / s", 'root of the weight']
     """
     ax = _axes(ax)
     beta, s, _ = program.model.svd
@@ -98,7 +166,26 @@ def plot_picard(program: ConvexProgram, weight: float = 0.0, ax: Axes = None) ->
 
 
 def plot_errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw every row's error before and after, distrusted rows marked; of the identification data by default."""
+    """Draw every row's error [mm] before and after, distrusted rows of the identification data marked.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    data
+        The rows; the identification data by default.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
+    >>> ax = ro.plot_errors(result, instance.validation)
+    >>> ax.get_ylabel(), len(ax.patches)  # two bars a row
+    ('error [mm]', 32)
+    """
     ax, labels = _axes(ax), (data or result.problem.data).label
     place, before, after = np.arange(len(labels)), 1e3 * result.nominal_errors(data), 1e3 * result.errors(data)
     ax.bar(place - 0.2, before, 0.4, color=BEFORE, label="nominal")
@@ -118,7 +205,25 @@ def plot_errors(result: Calibration, data: Dataset | None = None, ax: Axes = Non
 
 
 def plot_error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw how many rows have which error before and after, over the error's logarithm."""
+    """Draw how many rows have which error [mm] before and after, over the error's logarithm.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    data
+        The rows; the identification data by default.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_error_histogram(result)
+    >>> ax.get_xlabel(), ax.get_xscale()
+    ('error [mm]', 'log')
+    """
     ax, sets = _axes(ax), (1e3 * result.nominal_errors(data), 1e3 * result.errors(data))
     edges = error_bins(*sets)
     for errors, color, label in zip(sets, (BEFORE, AFTER), ("nominal", "identified"), strict=True):
@@ -138,7 +243,25 @@ def error_bins(*errors: Array) -> Array:
 
 
 def plot_error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw mean (dot) and spread (95 % of the rows) of the errors along x, y, z, before and after."""
+    """Draw mean (dot) and spread (95 % of the rows) of the errors [mm] along x, y, z, before and after.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    data
+        The rows; the identification data by default.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_error_axes(result)
+    >>> [label.get_text() for label in ax.get_xticklabels()]
+    ['x', 'y', 'z']
+    """
     ax = _axes(ax)
     for nominal, color, label, shift in ((True, "0.55", "nominal", -0.1), (False, AFTER, "identified", 0.1)):
         vectors = 1e3 * result.error_vectors(data, nominal=nominal)
@@ -157,7 +280,26 @@ def plot_error_axes(result: Calibration, data: Dataset | None = None, ax: Axes =
 def plot_error_vectors(
     result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None
 ) -> Axes:
-    """Draw measured positions in space with their errors, enlarged as the title says; ``ax`` has to be a 3D one."""
+    """Draw measured positions [m] in space with their errors, enlarged as the title says.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    data
+        The rows; the identification data by default.
+    nominal
+        Whether to draw the errors before calibration.
+    ax
+        Matplotlib's 3D axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ro.plot_error_vectors(result, nominal=True).get_title()
+    'nominal errors, enlarged 100 times'
+    """
     ax = _axes(ax, projection="3d")
     points, vectors = result.measured_positions(data), result.error_vectors(data, nominal=nominal)
     points, vectors = (a[np.isfinite(vectors).all(axis=1)] for a in (points, vectors))
@@ -178,7 +320,27 @@ def magnification(points: Array, vectors: Array) -> float:
 
 
 def plot_parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
-    """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances."""
+    """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    dimension
+        ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm].
+    confidence
+        Of the intervals, which only a squared penalty, or none, has.
+    ax
+        Matplotlib's axes; new ones by default.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> ax = ro.plot_parameters(result, "angle")
+    >>> ax.get_xlabel(), len(ax.get_yticks())
+    ('deviation from nominal [deg]', 13)
+    """
     ax, free = _axes(ax), result.problem.parameters.free
     own = ~free.of_frames & (np.array(free.dimensions) == dimension)
     unit, si = display(dimension)

@@ -51,7 +51,14 @@ class Record:
     made
         When, UTC (ISO 8601).
     versions
-        Of the packages that made it.
+        Of the packages that made it, by name.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> record = ro.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})
+    >>> record.made, sorted(record.dated().versions)[:3]
+    ('', ['casadi', 'clarabel', 'cvxpy-base'])
     """
 
     title: str = ""

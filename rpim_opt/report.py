@@ -52,6 +52,16 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     ------
     InputError
         For validation data that do not belong to the problem, or measurements without a length.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
+    >>> ro.write_report(result, "report.html", instance.validation)
+    >>> "0.032" in Path("report.html").read_text(encoding="utf-8")
+    True
     """
     record = calibration.record.dated()
     record = record if validation is None else replace(record, validation=validation)

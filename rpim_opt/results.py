@@ -46,6 +46,15 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
     ------
     InputError
         Naming the file, the key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve).save("result.json", instance.record)
+    >>> result = ro.load_result("result.json")  # without the problem's folder
+    >>> print(f"{1e3 * result.errors(result.record.validation).mean():.3f} mm")
+    0.032 mm
     """
     path = Path(path) / "result.json" if Path(path).is_dir() else Path(path)
     stored = read_json(path)

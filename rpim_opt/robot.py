@@ -46,6 +46,19 @@ class Robot:
         (dof, 2) lower and upper joint values of the controller [rad or m]; infinite where unknown.
     source
         Where the table comes from.
+
+    Raises
+    ------
+    InputError
+        For shapes that do not fit, numbers that are not finite, a singular joint map, limits that are not in order.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> lift = ro.Robot("arm on a lift", np.array([[0, 0, 0, 0.5, 0], [0, 0.4, 0, 0, 0]]), ("prismatic", "revolute"))
+    >>> lift.dof, lift.joint_dimensions
+    (2, ('length', 'angle'))
     """
 
     name: str
@@ -128,6 +141,13 @@ def read_robot(path: str | Path) -> Robot:
     ------
     InputError
         Naming the file, the key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
+    >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
+    [1.5708, 0.0, 0.0, 0.107, 0.0]
     """
     path = Path(path)
     return robot_of(read_toml(path), path)

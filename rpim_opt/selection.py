@@ -32,6 +32,21 @@ class Selection:
         Whether the choice lies inside the weights that were tried. If not, ``note`` says what that means.
     note
         One sentence for the report.
+
+    Examples
+    --------
+    A selector of one's own is a function of the program that returns one.
+
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> def within_a_scale(program):
+    ...     weights = np.geomspace(1e-3, 1e3, 60)
+    ...     largest = np.array([np.abs(e.z).max() for e in program.path(weights)])
+    ...     k = int(np.argmax(largest <= 1))
+    ...     return ro.Selection(weights[k], "within a scale", weights, largest, interior=0 < k < 59)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, within_a_scale)
+    >>> result.selection.name, result.selection.interior
+    ('within a scale', True)
     """
 
     weight: float
@@ -70,6 +85,11 @@ def l_curve(program: ConvexProgram) -> Selection:
     the neighbours on the grid. Otherwise the curvature is that of the circle through three neighbouring
     points (Cultrera and Callegaro 2020). A maximum at the edge is no corner, and
     neither is a curve bent the other way everywhere; the weight is then that edge, or the lower one.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1.8e-05', True)
     """
     if program.closed_form:
         weights = weight_grid(program)
@@ -207,6 +227,13 @@ def reml(program: ConvexProgram) -> Selection:
     ------
     InputError
         For another penalty than the squared norm.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> print(result.weight_sentence())
+    Weight 1.549 (reml: largest restricted likelihood), formulation 'Tikhonov'.
     """
     if program.model.constrained and program.formulation.penalty is cp.sum_squares:
         weights = weight_grid(program)
@@ -264,7 +291,12 @@ def _gcv_score(gamma: float) -> Callable[[LinearModel], Callable[[Array], Array]
 def gcv(program: ConvexProgram) -> Selection:
     """Choose by generalized cross-validation: minimize rho(w) / (m - dof(w))^2 (Golub, Heath and Wahba 1979).
 
-    rho = |A z - b|^2, dof = sum s_i^2 / (s_i^2 + w).
+    rho = |A z - b|^2, dof = sum s_i^2 / (s_i^2 + w). InputError for another penalty than the squared norm.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.gcv)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1', True)
     """
     return _linear_rule(program, "gcv", _gcv_score(1.0), "smallest generalized cross-validation error", EDGES)
 
@@ -272,8 +304,27 @@ def gcv(program: ConvexProgram) -> Selection:
 def robust_gcv(program: ConvexProgram, gamma: float = 1.4) -> Selection:
     """Choose by cross-validation that charges more for degrees of freedom: rho(w) / (m - gamma dof(w))^2.
 
-    Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233). With
-    less than three equations for each direction it guards too much and is refused.
+    Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233).
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    gamma
+        The price of a degree of freedom, 1 in `gcv`.
+
+    Raises
+    ------
+    InputError
+        For another penalty than the squared norm; with less than three equations for each direction, where it guards
+        too much.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.robust_gcv)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1.9', True)
     """
     m, rank = len(program.model.b), program.model.rank
     if m < 3 * rank:
@@ -287,6 +338,12 @@ def discrepancy(program: ConvexProgram) -> Selection:
     """Choose the largest weight that fits as well as the declared noise allows (Morozov 1966).
 
     rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
+    InputError for another penalty than the squared norm.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.discrepancy)
+    >>> f"{result.weight:.2g}", result.selection.note
+    ('28', 'misfit equal to the declared noise')
     """
     chosen = _linear_rule(program, "discrepancy", _misfit, "misfit equal to the declared noise", EDGES)
     fits = np.flatnonzero(chosen.score <= 0)
@@ -316,7 +373,15 @@ def _misfit(model: LinearModel) -> Callable[[Array], Array]:
 
 
 def quasi_optimality(program: ConvexProgram) -> Selection:
-    """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965)."""
+    """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
+
+    The lowest minimum inside the grid, if there is one. InputError for another penalty than the squared norm.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.quasi_optimality)
+    >>> f"{result.weight:.1g}", result.selection.interior
+    ('5e-06', True)
+    """
 
     def of(model: LinearModel) -> Callable[[Array], Array]:
         beta2, s2, _ = _filters(model)
@@ -329,7 +394,13 @@ def ncp(program: ConvexProgram) -> Selection:
     """Choose where the residual looks most like white noise: normalized cumulative periodogram (Hansen et al. 2006).
 
     Minimizes the largest distance of the cumulative periodogram of the residual, in the order of the rows, from
-    a straight line. Needs rows in an order that means something, such as time or place.
+    a straight line. Needs rows in an order that means something, such as time or place. InputError for another penalty
+    than the squared norm.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.ncp)
+    >>> f"{result.weight:.2g}", result.selection.note
+    ('67', 'whitest residual')
     """
 
     def of(model: LinearModel) -> Callable[[Array], Array]:
@@ -355,6 +426,11 @@ def leave_one_out(program: ConvexProgram) -> Selection:
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks);
     for others by solving, on fewer weights.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.leave_one_out)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('0.96', True)
     """
     if not program.closed_form:
         return _held_out(program, "leave_one_out", None)
@@ -381,7 +457,30 @@ def leave_one_out(program: ConvexProgram) -> Selection:
 
 
 def k_fold(program: ConvexProgram, folds: int = 10, seed: int = 0) -> Selection:
-    """Choose by cross-validation in folds that keep configurations whole; any formulation."""
+    """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    folds
+        In how many parts the configurations are divided.
+    seed
+        Of the division.
+
+    Raises
+    ------
+    InputError
+        For fewer configurations than folds, or a formulation without penalty.
+
+    Examples
+    --------
+    >>> from functools import partial
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=partial(ro.k_fold, folds=5))
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('0.93', True)
+    """
     groups = np.unique(program.model.group)
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
@@ -404,6 +503,25 @@ def corner(program: ConvexProgram, tolerance: float = 0.01) -> Selection:
 
     Cultrera and Callegaro 2020 (IOP SciNotes 1:025004): of four points on the curve the inner one with the larger
     curvature stays, and the interval shrinks to its neighbours; one new solution a step.
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    tolerance
+        Length of the interval of ln weight at which the search ends.
+
+    Raises
+    ------
+    InputError
+        For a formulation without penalty.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
+    >>> f"{result.weight:.1g}", result.selection.note
+    ('0.7', 'corner of the L-curve by golden sections')
     """
     grid = weight_grid(program, 2)
     seen: dict[float, Array] = {}
@@ -453,6 +571,11 @@ def two_step(program: ConvexProgram) -> Selection:
        the first weight from which one more step lowers the residual norm by less than 1 %.
     2. Ten weights within the same order of magnitude, 0.184 to 1.653 times that (the paper's 0.563e-14 to
        5.063e-14 around 3.063e-14), compared by held-out error: every configuration is left out once.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.two_step)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1.2', True)
     """
     corner = l_curve(program)
     coarse = np.geomspace(corner.weight, 1e-10 * corner.weight, 30)
@@ -506,6 +629,15 @@ def compare(program: ConvexProgram) -> dict[str, Selection]:
     """Return what every selector chooses that serves a program, by name.
 
     Those that hold configurations out are left out where that would take long: without a closed form, or more than 200.
+
+    >>> import rpim_opt as ro
+    >>> program = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).program
+    >>> chosen = ro.compare(program)
+    >>> for name in ("reml", "l_curve", "gcv"):
+    ...     print(f"{name:8} {chosen[name].weight:.2g}")
+    reml     1.5
+    l_curve  7.3
+    gcv      1
     """
     quick = program.closed_form and len(np.unique(program.model.group)) <= 200
     slow = () if quick else (leave_one_out, k_fold, two_step)

@@ -61,6 +61,7 @@ def display(dimension: str) -> tuple[str, float]:
 def split_unit(name: str) -> tuple[str, Unit | None]:
     """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None where there is none.
 
+    >>> from rpim_opt.units import split_unit
     >>> split_unit("q1_deg")[0]
     'q1'
     >>> split_unit("base_rx_mrad")[1].dimension

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import ast
-import doctest
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -92,17 +90,10 @@ def test_heavy_libraries_wait_until_they_are_used(code: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("module", [m for m in ORDER if m != "cli"])
-def test_examples_in_docstrings(module: str) -> None:
-    assert doctest.testmod(import_module(f"rpim_opt.{module}")).failed == 0
-
-
-def test_public_names_exist_and_are_documented() -> None:
+def test_public_names_exist() -> None:
     import rpim_opt as ro
 
     for name in ro.__all__:
-        value = getattr(ro, name)
-        assert value.__doc__, name
-        assert not isinstance(value, ModuleType), f"the module {name} hides what it is named after"
+        assert not isinstance(getattr(ro, name), ModuleType), f"the module {name} hides what it is named after"
     with pytest.raises(AttributeError, match="no attribute 'callibrate'"):
         ro.callibrate  # noqa: B018

@@ -36,6 +36,14 @@ class Described:
         (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them.
     names
         The file's names of the joints.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> arm = ro.Described(robot, base=[0, 0, 0.5, 0, 0, 0], tool=[0, 0, 0.1, 0, 0, 0])
+    >>> ro.model_parameters(arm.robot, arm.base, {"": arm.tool}).identify(["base_z", "tool_z"]).free.nominal
+    array([0.5, 0.1])
     """
 
     robot: Robot
@@ -69,12 +77,27 @@ class Chain:
 
 
 def identified(result: Calibration, marker: str = "") -> Described:
-    """Return what a calibration identified: the robot, its base in the instrument's frame, the reflector ``marker``.
+    """Return what a calibration identified: the robot, its base in the instrument's frame, and a reflector as tool.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    marker
+        Which reflector; the only one by default.
 
     Raises
     ------
     InputError
-        Naming the identified parameters that no description of a robot holds: ratios, eccentricities, compliances.
+        Naming the identified parameters that no description of a robot holds: ratios, eccentricities, compliances;
+        for a marker that is not known.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.identified(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml))
+    >>> arm.base.round(2), (1e3 * arm.tool[:3]).round(1)  # [m, rad], [mm]
+    (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
     """
     p = result.problem.parameters
     values = p.nominal.copy()
@@ -177,6 +200,19 @@ def without_beta(robot: Robot) -> Robot:
     InputError
         For a beta after the last joint, which belongs to the tool, or axes so nearly parallel that the
         four numbers lose more than 1e-9 m or rad.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> mdh = [[0, 0, 0, 0, 0.001], [0, 0.4, 0, 0, 0]]  # the second axis is tilted by a milliradian
+    >>> arm = ro.Robot("two links", np.array(mdh))
+    >>> plain = ro.without_beta(arm)
+    >>> plain.mdh[:, 3].round(3)  # d [m]: the common normal is far away
+    array([-400.,  400.])
+    >>> q = np.array([[0.3, -0.5]])
+    >>> bool(np.allclose(ro.forward_kinematics(plain, q), ro.forward_kinematics(arm, q)))
+    True
     """
     table, n = robot.mdh, robot.dof
     if table[-1, 4]:

@@ -30,6 +30,13 @@ def read_mdh(path: str | Path) -> Robot:
     ------
     InputError
         Naming the file, the key or column, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.write_robot(ro.load("paper_arm").problem.robot, "arm.csv")
+    >>> ro.read_mdh("arm.csv").dof
+    6
     """
     path = Path(path)
     readers = {".toml": read_robot, ".json": _read_json, ".csv": _read_csv}
@@ -41,10 +48,26 @@ def write_robot(robot: Robot, path: str | Path) -> None:
 
     Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere.
 
+    Parameters
+    ----------
+    robot
+        The robot, `Calibration.robot` for instance.
+    path
+        The file; whole or not written at all.
+
     Raises
     ------
     InputError
         For another ending, one of two limits infinite, or a coupling of joints in CSV, which has no place for it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
+    >>> ro.write_robot(result.robot, "identified.toml")
+    >>> bool((ro.read_mdh("identified.toml").mdh == result.robot.mdh).all())
+    True
     """
     path = Path(path)
     _by_ending({".toml": _write_toml, ".json": _write_json, ".csv": _write_csv}, path)(robot, path)
@@ -57,6 +80,32 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     are turned into common normals. Its API takes such a table with base and tool
     (``SetRobotParams(robot, dhm, poseBase, poseTool)``, RoboDK/RoboDK-API, C#), but documents neither the columns'
     order nor a file that can be read: transfer the numbers by name, and compare a pose before you rely on them.
+
+    Parameters
+    ----------
+    robot
+        The robot, `Calibration.robot` for instance.
+    path
+        The CSV file.
+
+    Raises
+    ------
+    InputError
+        For signs or couplings of joints, and what `without_beta` refuses.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> ro.write_robodk(ro.load("paper_arm").problem.robot, "robodk.csv")
+    >>> print(Path("robodk.csv").read_text())
+    joint,alpha_deg,a_mm,theta_deg,d_mm
+    1,0.0,0.0,0.0,99.927
+    2,90.0,0.0,0.0,106.95
+    3,0.0,428.052,0.0,0.0
+    4,0.0,398.551,0.0,0.0
+    5,-90.0,0.0,0.0,93.16
+    6,-90.0,0.0,0.0,81.91
     """
     table = without_beta(robot).mdh
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):

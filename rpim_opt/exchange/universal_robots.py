@@ -47,6 +47,18 @@ def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Describ
         The file: plain keys, two spaces or more a level, one a line.
     limits
         (6, 2) joint limits [rad], which the file does not hold.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the line or key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.read_ur_kinematics("kinematics.yaml")
+    >>> arm.names[:2], arm.robot.mdh[2:4, 1].round(3)  # a3 and a4 [m]
+    (('shoulder', 'upper_arm'), array([-0.425, -0.392]))
     """
     path = Path(path)
     chain, _ = _yaml_chain(read_bytes(path), path)
@@ -69,6 +81,22 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
         The identified robot.
     target
         Where to write; may be ``source``.
+
+    Raises
+    ------
+    InputError
+        As `read_ur_kinematics`, and for another robot or a beta after the last joint.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> robot = ro.read_ur_kinematics("kinematics.yaml").robot
+    >>> mdh = robot.mdh.copy()
+    >>> mdh[2, 1] -= 0.0005  # as if identified: the upper arm is half a millimetre longer
+    >>> ro.write_ur_kinematics("kinematics.yaml", replace(robot, mdh=mdh), "identified.yaml")
+    >>> (1e3 * (ro.read_ur_kinematics("identified.yaml").robot.mdh - robot.mdh)[2:4, 1]).round(6) + 0.0  # [mm]
+    array([-0.5,  0. ])
     """
     path = Path(source)
     data = read_bytes(path)
@@ -134,6 +162,20 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
         The file.
     nominal
         The model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key, what was found and what is accepted; for a nominal robot without six revolute joints.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.instances import find_robot
+    >>> nominal = ro.read_robot(find_robot("ur10"))
+    >>> arm = ro.read_ur_calibration("calibration.conf", nominal)
+    >>> (1e3 * (arm.robot.mdh - nominal.mdh)[:, 3]).round(2)  # deviations of d [mm]
+    array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])
     """
     path = Path(path)
     deltas, _ = _deltas(read_bytes(path), path)
@@ -168,6 +210,18 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     ------
     InputError
         For alpha1 or a1 that deviate (the base has to hold them), beta6, or axes too nearly parallel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.instances import find_robot
+    >>> nominal = ro.read_robot(find_robot("ur10"))
+    >>> robot = ro.read_ur_calibration("calibration.conf", nominal).robot  # or an identified one
+    >>> ro.write_ur_calibration("calibration.conf", robot, nominal, "identified.conf")
+    >>> again = ro.read_ur_calibration("identified.conf", nominal).robot
+    >>> bool(np.allclose(again.mdh, robot.mdh, atol=1e-9))
+    True
     """
     path = Path(source)
     data = read_bytes(path)

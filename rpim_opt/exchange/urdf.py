@@ -207,6 +207,13 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
         Naming the file, the element, what was found and what is accepted: no URDF, document types and entities, links
         or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
         or mimic joints between base and tip, no or several candidates for base or tip.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
+    >>> arm.robot.dof, arm.names, arm.tool[:3]
+    (1, ('j1',), array([0.4, 0. , 0. ]))
     """
     urdf = _parse(Path(path))
     every, joints, chain = _chain(urdf, base, tip)
@@ -253,6 +260,16 @@ def write_urdf(
     InputError
         As `read_urdf`, and for another robot, couplings, or a tool or last beta for which the chain has no fixed
         joint after its last moving one.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> robot = ro.read_urdf("arm.urdf").robot
+    >>> longer = replace(robot, mdh=robot.mdh + [0, 0, 0, 0.001, 0])  # as if identified: d1 is 1 mm longer
+    >>> ro.write_urdf("arm.urdf", longer, "identified.urdf")
+    >>> robot.mdh[:, 3], ro.read_urdf("identified.urdf").robot.mdh[:, 3]  # [m]
+    (array([0.3]), array([0.301]))
     """
     urdf = _parse(Path(source))
     every, joints, chain = _chain(urdf, base, tip)
