@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,10 +21,10 @@ from rpim_opt.measurement import Measurement, pose, position
 from rpim_opt.parameters import tool_prefix
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
-from rpim_opt.tables import read_columns
-from rpim_opt.text import table
+from rpim_opt.tables import csv_text, read_columns
+from rpim_opt.text import listed, table
 from rpim_opt.uncertainty import Uncertainty
-from rpim_opt.units import display, split_unit
+from rpim_opt.units import display, joint_columns, split_unit
 
 REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
@@ -120,24 +118,20 @@ class Compensation:
         ]
         for status in ("limited", "near singular", "unreachable"):
             found = [i for i, s in enumerate(self.status) if s == status]
-            named = ", ".join(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in found[:8])
-            more = f" and {len(found) - 8} more" if len(found) > 8 else ""
-            lines += [f"{status.capitalize()}: {named}{more}."] if found else []
+            named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in found])
+            lines += [f"{status.capitalize()}: {named}."] if found else []
         return "\n".join(lines)
 
     def csv(self) -> str:
         """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
-        units = [display(dimension) for dimension in self.robot.joint_dimensions]
-        joints = [f"q{i}_{unit}" for i, (unit, _) in enumerate(units, start=1)]
-        q = self.q / [si for _, si in units]
+        joints = joint_columns(self.robot.joint_dimensions)
+        q, rows = self.q / list(joints.values()), []
         left = 1e3 * np.column_stack([self.position_error, self.orientation_error, self.std])
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["label", *joints, "position_error_mm", "orientation_error_mrad", "std_mm", "status"])
         for label, command, errors, status in zip(self.label, q, left, self.status, strict=True):
             cells = [f"{v:.6f}" if np.isfinite(v) else "" for v in errors]
-            writer.writerow([label, *(f"{v:.9f}" for v in command), *cells, status])
-        return stream.getvalue()
+            rows.append([label, *(f"{v:.9f}" for v in command), *cells, status])
+        header = ["label", *joints, "position_error_mm", "orientation_error_mrad", "std_mm", "status"]
+        return csv_text(header, rows)
 
 
 def compensate(
@@ -268,8 +262,7 @@ def read_targets(source: Any, robot: Robot) -> Targets:
             raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
         zeros = [0.0] * len(next(iter(columns.values())))
         if not joints:
-            names = [f"q{i}_{display(d)[0]}" for i, d in enumerate(robot.joint_dimensions, start=1)]
-            columns |= dict.fromkeys(names, zeros)
+            columns |= dict.fromkeys(joint_columns(robot.joint_dimensions), zeros)
         if not placed:
             columns |= dict.fromkeys(("x_mm", "y_mm", "z_mm"), zeros)
         # read as measurements are; what they weigh does not matter

@@ -12,8 +12,8 @@ from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.problem import RANK_TOLERANCE, CalibrationProblem
 from rpim_opt.robot import Array, Robot
-from rpim_opt.tables import numbers, read_columns
-from rpim_opt.units import UNITS, display, with_unit
+from rpim_opt.tables import csv_text, numbers, read_columns
+from rpim_opt.units import UNITS, joint_columns, with_unit
 
 CRITERIA = ("D", "A", "E", "V")
 SMOOTH = 12
@@ -69,7 +69,7 @@ class Design:
         return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
 
 
-def random_candidates(robot: Robot, count: int, seed: int = 0, share: float = 1.0) -> Array:
+def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
     """Return joint values (count, dof) [rad or m], uniform in the middle of the limits.
 
     Parameters
@@ -79,7 +79,7 @@ def random_candidates(robot: Robot, count: int, seed: int = 0, share: float = 1.
     count
         How many configurations.
     seed
-        Of the draws.
+        Of the draws, or a generator to draw from.
     share
         Which part of every joint's range is used, from 0 to 1.
 
@@ -111,11 +111,9 @@ def read_candidates(source: Any, robot: Robot) -> Array:
 
 def joint_table(robot: Robot, q: Array, index: np.ndarray) -> str:
     """Return joint values as CSV text, labelled by the number of the candidate."""
-    units = [display(dimension) for dimension in robot.joint_dimensions]
-    lines = [",".join(["label", *(f"q{i}_{unit}" for i, (unit, _) in enumerate(units, start=1))])]
-    for k, row in zip(index, q, strict=True):
-        lines.append(",".join([f"n{k}", *(f"{v / si:.4f}" for v, (_, si) in zip(row, units, strict=True))]))
-    return "\n".join(lines) + "\n"
+    columns = joint_columns(robot.joint_dimensions)
+    rows = zip(index, q / list(columns.values()), strict=True)
+    return csv_text(["label", *columns], ([f"n{k}", *(f"{v:.4f}" for v in row)] for k, row in rows))
 
 
 def choose(

@@ -82,15 +82,22 @@ def read_toml(path: Path) -> dict[str, Any]:
     InputError
         If there is no such file, or it is no TOML (with line and column).
     """
+    text = _text(path, "*.toml")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
-        raise InputError("the file", "nothing", choices(path.name, near), path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError("the TOML text", str(error), "TOML 1.0", path) from None
+
+
+def _text(path: Path, alike: str) -> str:
+    """Return a file's text, or say what the folder holds that is ``alike``."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob(alike)) if path.parent.is_dir() else []
+        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
 
 
 def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
@@ -136,13 +143,9 @@ def read_json(path: Path) -> Any:
     InputError
         If there is no such file, or it is no JSON (with line and column).
     """
+    text = _text(path, "*.json")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob("*.json")) if path.parent.is_dir() else []
-        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+        return json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
         raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
 

@@ -17,7 +17,7 @@ from rpim_opt.observability import Observability, combination, near_parallel, ob
 from rpim_opt.parameters import tool_prefix
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array
-from rpim_opt.text import table
+from rpim_opt.text import listed, table
 from rpim_opt.units import display
 
 BETTER = 0.2
@@ -107,15 +107,13 @@ class Inspection:
             f"{np.nanmean(mm):.3f} mm mean, {np.nanmax(mm):.3f} mm max ({data.label[int(np.nanargmax(mm))]})."
         ]
         if self.repeated:
-            groups = "; ".join(", ".join(group) for group in self.repeated[:5])
-            more = f" and {len(self.repeated) - 5} more" if len(self.repeated) > 5 else ""
+            groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
             spread = f", repeatable to {1e3 * (self.repeatability or 0.0):.3g} mm" if self.repeatability else ""
-            lines.append(f"Measured more than once in the same configuration{spread}: {groups}{more}.")
+            lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
         if self.standing_out:
             error = dict(zip(data.label, mm, strict=True))
-            named = ", ".join(f"{label} ({error[label]:.2f} mm)" for label in self.standing_out[:10])
-            more = f" and {len(self.standing_out) - 10} more" if len(self.standing_out) > 10 else ""
-            lines.append(f"Nominal error stands out: {named}{more}.")
+            named = listed([f"{label} ({error[label]:.2f} mm)" for label in self.standing_out], 10)
+            lines.append(f"Nominal error stands out: {named}.")
         return "\n".join(lines)
 
     def _identifiable(self) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from pydantic import Field
 from scipy.optimize import least_squares
 
 from rpim_opt.dataset import Block, Dataset, read_data
+from rpim_opt.design import random_candidates
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import Length, Table, validate, write_text
 from rpim_opt.instances import Stated, place_fixtures, read_problem
@@ -21,7 +20,8 @@ from rpim_opt.measurement import Measurement, of_fixture
 from rpim_opt.parameters import Parameters, model_parameters
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array
-from rpim_opt.units import display, quantities
+from rpim_opt.tables import csv_text
+from rpim_opt.units import display, joint_columns, quantities
 
 TORQUE = 20.0
 """Simulated joint torques are uniform up to this [Nm]."""
@@ -81,7 +81,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     blunders: list[str] = []
     configurations = {"identification": plan.configurations, "validation": plan.validation}
     for role, count in configurations.items():
-        q = _random_joints(stated, plan, rng, 2 * count)
+        q = random_candidates(stated.robot, 2 * count, rng, plan.joint_share)
         for shape, each in zip(shapes, stated.observations, strict=True):
             file = getattr(each, role)
             if file is None or not count:
@@ -103,12 +103,8 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     folder = out or read_problem(name).path.parent
     written = []
     for file, table in made.tables.items():
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(zip(*table.values(), strict=True))
         written.append(folder / file)
-        write_text(written[-1], stream.getvalue())
+        write_text(written[-1], csv_text(table, zip(*table.values(), strict=True)))
     lines = [
         f"# made by: rpim-opt simulate {Path(name).name}",
         f"blunders = [{', '.join(map(repr, made.blunders))}]",
@@ -174,12 +170,6 @@ def _truth(parameters: Parameters, plan: _Simulation, rng: np.random.Generator, 
     return truth
 
 
-def _random_joints(stated: Stated, plan: _Simulation, rng: np.random.Generator, count: int) -> Array:
-    low, high = stated.robot.limits.T
-    middle, half = (low + high) / 2, plan.joint_share * (high - low) / 2
-    return rng.uniform(middle - half, middle + half, (count, stated.robot.dof))
-
-
 def _table(
     stated: Stated,
     plan: _Simulation,
@@ -193,7 +183,7 @@ def _table(
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return the columns of one table as text, and the labels of its blunders."""
     robot, kind, count = stated.robot, shape.kind, len(random) // 2
-    units = [display(dimension) for dimension in robot.joint_dimensions]
+    joints = joint_columns(robot.joint_dimensions)
     constraint = not kind.columns
     if kind.points == 1:
         rows = [(k, (m,), f) for k in range(count) for m in shape.markers for f in shape.fixtures]
@@ -215,8 +205,8 @@ def _table(
     torque = rng.uniform(-TORQUE, TORQUE, q.shape).round(3) if compliant else None
     digits = 9 if constraint else 4
     for p, prefix in enumerate(prefixes):
-        for i, (unit, si) in enumerate(units):
-            columns[f"{prefix}q{i + 1}_{unit}"] = [f"{v:.{digits}f}" for v in q[:, p, i] / si]
+        for i, (name, si) in enumerate(joints.items()):
+            columns[prefix + name] = [f"{v:.{digits}f}" for v in q[:, p, i] / si]
             if torque is not None:
                 columns[f"{prefix}tau{i + 1}_Nm"] = [f"{v:.3f}" for v in torque[:, p, i]]
     for name, dimension in kind.columns.items():
@@ -229,8 +219,8 @@ def _table(
         sigma = np.sqrt(data.blocks[0].covariance[0, 0, 0])
         errors = sigma * rng.normal(size=len(rows)) * noisy
         q = _on_constraint(problem, truth, errors, rng, stated, plan)
-        for i, (unit, si) in enumerate(units):
-            columns[f"q{i + 1}_{unit}"] = [f"{v:.{digits}f}" for v in q[:, i] / si]
+        for i, (name, si) in enumerate(joints.items()):
+            columns[name] = [f"{v:.{digits}f}" for v in q[:, i] / si]
         return columns, []
     modelled = np.empty((len(rows), len(kind.columns)))
     for block, values in zip(data.blocks, problem.modelled(truth), strict=True):
@@ -285,7 +275,7 @@ def _on_constraint(
             return problem.on(rows).residual(truth) - wanted
 
         for _ in range(100):
-            start = _random_joints(stated, plan, rng, 1)[0]
+            start = random_candidates(robot, 1, rng, plan.joint_share)[0]
             found = least_squares(residual, start, bounds=robot.limits.T, xtol=1e-15, ftol=1e-15, gtol=1e-15)
             if abs(found.fun[0]) < 1e-10:
                 result.append(found.x)

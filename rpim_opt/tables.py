@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.exceptions import InputError, choices
+from rpim_opt.units import joint_columns
 
 MARKERS = [chr(65 + i) for i in range(26)] + [f"M{i}" for i in range(1, 1000)]
 Columns = Mapping[str, Sequence[Any]]
@@ -104,7 +106,7 @@ def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, lis
             raise InputError(
                 "the header", f"{len(table)} columns", f"{len(joints)} joints, 3 measured and 3 of the tool"
             )
-        names = [f"q{i}_{'deg' if kind == 'angle' else 'mm'}" for i, kind in enumerate(joints, start=1)]
+        names = list(joint_columns(joints))
         columns = dict(zip([*names, "x_mm", "y_mm", "z_mm"], table, strict=False))
         rows = [str(i + 1) for i in range(len(table[0]))]
         tcp = [numbers(cells, rows, f"{len(names) + 4 + i}") for i, cells in enumerate(table[len(names) + 3 :][:3])]
@@ -117,6 +119,15 @@ def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, lis
         tools.setdefault(name, place.tolist())
         markers.append(name)
     return columns | {"marker": markers}
+
+
+def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Return a table as CSV text, one line a row."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return stream.getvalue()
 
 
 def _parquet(path: Path) -> Columns:

@@ -22,6 +22,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "")
     return "\n".join(line.rstrip() for line in stream.getvalue().strip("\n").splitlines() if line.strip())
 
 
+def listed(items: Sequence[str], most: int = 8, between: str = ", ") -> str:
+    """Return the first items in a line, and how many more there are."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return between.join(items[:most]) + more
+
+
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table; the first column is aligned left, the others right."""
     lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]

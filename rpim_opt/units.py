@@ -58,6 +58,17 @@ def display(dimension: str) -> tuple[str, float]:
     return name, UNITS[name].si
 
 
+def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
+    """Return the columns in which joint values are written, with their unit's size in SI.
+
+    >>> from rpim_opt.units import joint_columns
+    >>> joint_columns(["angle", "length"])
+    {'q1_deg': 0.017453292519943295, 'q2_mm': 0.001}
+    """
+    units = (display(dimension) for dimension in dimensions)
+    return {f"q{i}_{unit}": si for i, (unit, si) in enumerate(units, start=1)}
+
+
 def split_unit(name: str) -> tuple[str, Unit | None]:
     """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None where there is none.
 

@@ -13,7 +13,7 @@ from rpim_opt.exchange.chain import read_bytes, without_beta
 from rpim_opt.files import write_json, write_text
 from rpim_opt.parameters import MDH_DIMENSION
 from rpim_opt.robot import MDH, Robot, read_robot, robot_of
-from rpim_opt.tables import read_columns
+from rpim_opt.tables import csv_text, read_columns
 from rpim_opt.units import UNITS, display
 
 LIMITS = ("lower", "upper")
@@ -111,11 +111,9 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
         raise InputError("robot", "signs or couplings of joints", "joints that count as RoboDK's", robot.name)
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
-    lines = [",".join(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())])]
-    for number, row in enumerate(table, start=1):
-        values = (repr(float(v / si)) for v, (_, si) in zip(row, units.values(), strict=False))
-        lines.append(",".join([str(number), *values]))
-    write_text(Path(path), "\n".join(lines) + "\n")
+    numbers = table[:, :4] / [si for _, si in units.values()]
+    rows = [[number, *map(repr, row)] for number, row in enumerate(numbers.tolist(), start=1)]
+    write_text(Path(path), csv_text(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())], rows))
 
 
 def _by_ending(known: dict[str, Any], path: Path) -> Any:
@@ -223,5 +221,4 @@ def _write_csv(robot: Robot, path: Path) -> None:
         rows.append(row)
     header = [f"{c}_{display(MDH_DIMENSION[c])[0]}" for c in MDH]
     header += sorted({key for row in rows for key in row} - set(header))
-    lines = [",".join(header), *(",".join(str(row.get(key, "")) for key in header) for row in rows)]
-    write_text(path, "\n".join(lines) + "\n")
+    write_text(path, csv_text(header, ([row.get(key, "") for key in header] for row in rows)))
