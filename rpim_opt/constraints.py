@@ -39,7 +39,7 @@ def stated(make: Callable[Arguments, Made]) -> Callable[Arguments, Made]:
 
 @dataclass(frozen=True)
 class Box:
-    """A constraint lower <= z <= upper, whose solutions are polished to rounding by an active set.
+    """A constraint lower <= z <= upper; with squared loss and penalty an active set polishes its solutions to rounding.
 
     Parameters
     ----------
@@ -146,6 +146,8 @@ def signed(sign: int, *patterns: str) -> Box:
 def equal(*names: str) -> Constraint:
     """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel.
 
+    InputError for names that are not identified, fewer than two, or of different dimensions.
+
     >>> import cvxpy as cp
     >>> import rpim_opt as ro
     >>> level = ro.Formulation("a4 = a5", penalty=cp.sum_squares, constraints=(ro.equal("a4", "a5"),))
@@ -161,6 +163,9 @@ def equal(*names: str) -> Constraint:
             raise InputError(
                 "equal", f"'{missing}'", "identified parameters, two or more: " + choices(missing, parameters.names)
             )
+        if len({parameters.dimensions[i] for i in k}) > 1:
+            found = ", ".join(f"{parameters.names[i]} ({parameters.dimensions[i]})" for i in k)
+            raise InputError("equal", found, "parameters of one dimension")
         scale, nominal = parameters.scale[k], parameters.nominal[k]
         unit = scale.max()
         value = cp.multiply(scale / unit, z[k]) + nominal / unit

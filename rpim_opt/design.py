@@ -37,8 +37,8 @@ class Design:
     criterion
         ``D``, ``A``, ``E`` or ``V``.
     value, bound
-        The criterion of the chosen set (ln det M for D), and what no set of that size can exceed (fall below, for A
-        and V).
+        The criterion of the chosen set (ln det M for D, [m^2] for V), and what no set of that size can exceed (fall
+        below, for A and V).
     gap
         bound over value as efficiencies, minus 1: 0.01 means that no set is more than 1 % better. D counts per
         parameter, det^(1/n).
@@ -132,7 +132,7 @@ def choose(
         D   maximize ln det M
         A   minimize tr M^-1
         E   maximize the least eigenvalue of M
-        V   minimize the mean variance of predicted positions
+        V   minimize the mean variance of predicted positions, the axes' sum [m^2]
 
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
     any set can reach; E counts directions that some candidate sees. The largest weights are rounded and improved by

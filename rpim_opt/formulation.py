@@ -128,7 +128,7 @@ class ConvexProgram:
 
     @property
     def squared(self) -> bool:
-        """Whether the loss is a sum of squares and the penalty too, or there is none."""
+        """Whether the loss is a sum of squares and the penalty too, or there is none; without ``largest``."""
         return self._posed.quadratic
 
     @property

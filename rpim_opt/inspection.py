@@ -41,8 +41,7 @@ class Inspection:
     repeated
         Groups of labels measured in the same configuration by the same reflector.
     repeatability
-        Root mean square deviation of repeated measurements from their means [m or rad per component]; None
-        without any.
+        Standard deviation of repeated measurements about their means [m], of one coordinate; None without any.
     warnings
         One sentence each: units, signs, frames, limits, coverage.
     proposals

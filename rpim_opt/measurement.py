@@ -42,7 +42,8 @@ class Measurement:
         The components of the residual, name to dimension, in order; the columns by default. Their names are
         the keys of the noise per axis (``sigma_x_mm``, ``[noise] x_mm``).
     noise
-        The keys of the noise common to all components of a dimension: ``{"position": "length"}``.
+        The keys of the noise common to all components of a dimension: ``{"position": "length"}`` stands for
+        ``[noise] position_mm``; ``{"distance": "length"}`` by default.
     parameters
         The measurement's own parameters, name to dimension; ``anchor_x`` is given as ``x`` of a table ``[anchor]``.
     frames

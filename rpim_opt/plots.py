@@ -34,7 +34,7 @@ def _legend(ax: Axes) -> Axes:
 
 
 def plot_l_curve(program: ConvexProgram, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the root of loss against that of penalty of the solutions over the weights, with selectors' choices by name.
+    """Draw the L-curve: the root of the penalty against that of the loss, over the weights, with selectors' choices.
 
     The program is solved at 200 weights where it has a closed form, else at 40.
 

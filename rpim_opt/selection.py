@@ -628,7 +628,8 @@ def disagreement(program: ConvexProgram) -> str:
 def compare(program: ConvexProgram) -> dict[str, Selection]:
     """Return what every selector chooses that serves a program, by name.
 
-    Those that hold configurations out are left out where that would take long: without a closed form, or more than 200.
+    Those that hold configurations out are left out where that would take long: without a closed form, or with more
+    than 200 configurations.
 
     >>> import rpim_opt as ro
     >>> program = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).program

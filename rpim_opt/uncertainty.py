@@ -18,7 +18,7 @@ from rpim_opt.units import display
 
 
 class NoiseTest(NamedTuple):
-    """Observed over declared noise, and the probability that noise as declared would show as much or more."""
+    """Observed over declared standard deviation, its two-sided probability under declared noise, and a verdict."""
 
     ratio: float
     probability: float

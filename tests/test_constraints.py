@@ -122,6 +122,9 @@ def test_signs_and_balls() -> None:
     ball = ro.Formulation("ball", penalty=cp.sum_squares, constraints=(ro.in_ball(0.7, "a?"),))
     z = ball.compile(model).solve(1e-3).z
     assert np.linalg.norm(z[:10]) == pytest.approx(0.7, abs=1e-8)
+    problem, _ = simulated(("a[23]", "alpha2"), configurations=10)
+    with pytest.raises(ro.InputError, match=r"equal: found a2 \(length\), alpha2 \(angle\)"):
+        ro.calibrate(problem, ro.Formulation("x", constraints=(ro.equal("a2", "alpha2"),)))
     for nothing in (ro.at_nominal(), ro.signed(1), ro.in_ball(1.0)):
         with pytest.raises(ro.InputError, match="found no pattern"):
             ro.Formulation("x", constraints=(nothing,)).compile(model)
