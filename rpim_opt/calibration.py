@@ -525,7 +525,8 @@ def calibrate(
         start_feasible = program.violation(z) <= FEASIBLE
         for _ in range(MOST_REGIONS):
             try:
-                estimate = program.solve(lam, z, radius)
+                free = program.closed_form and np.isinf(radius)
+                estimate = program.path([lam])[0] if free else program.solve(lam, z, radius)
             except NoSolutionFound as error:
                 raise error.naming(names) from None
             step = estimate.z - z
