@@ -14,6 +14,7 @@ import numpy as np
 from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 from scipy import sparse
 
+from rpim_opt.phases import phase
 from rpim_opt.robot import Array
 
 clarabel: Any = clarabel_module  # a compiled module, without types
@@ -134,7 +135,8 @@ class Conic:
         data = P_pattern.filled(P), q, A_pattern.filled(values), b, cones
         status, solution = "", SimpleNamespace(x=(), z=())
         for attempt in range(len(ATTEMPTS)):
-            solution = clarabel.DefaultSolver(*data, _settings(attempt)).solve()
+            with phase("solve"):
+                solution = clarabel.DefaultSolver(*data, _settings(attempt)).solve()
             status = STATUS.get(str(solution.status), str(solution.status))
             if status in (cp.OPTIMAL, cp.INFEASIBLE, cp.UNBOUNDED):
                 break
@@ -142,7 +144,7 @@ class Conic:
 
     def _pattern(self, n: int, extra: int) -> tuple[_Pattern, _Pattern]:
         """Return where the numbers of P and A stand."""
-        dense = [(np.repeat(self._touched, n), np.tile(np.arange(n), len(self._touched)))]
+        dense: list[tuple[Any, Any]] = [(np.repeat(self._touched, n), np.tile(np.arange(n), len(self._touched)))]
         dense.append((self._A_rest.row, n + self._A_rest.col))
         k = np.arange(extra)
         dense.append((np.repeat(len(self._b) + k, n), np.tile(np.arange(n), extra)))
