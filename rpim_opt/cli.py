@@ -253,7 +253,7 @@ def describe(instance: Instance, result: Calibration) -> str:
         *(["Nominal: the drawing's robot, frames fitted."] if fitted.any() else []),
         "",
         result.weight_sentence(),
-        f"{len(model.b)} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
+        f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
         *result.remarks(),
     ]
     return "\n".join(lines)

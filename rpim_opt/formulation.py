@@ -30,6 +30,12 @@ STATIONARY = 1e-7
 """Largest gradient of a box-constrained solution off its bounds, relative to that of the data at nominal."""
 
 
+def rotation_invariant(formulation: Formulation) -> bool:
+    """Return whether the loss sees only the length of the whole residual: the triangle of [A b] then says all."""
+    whole = formulation.loss_over == "equation" and not np.isfinite(formulation.largest)
+    return formulation.loss in ROTATION_INVARIANT and whole
+
+
 def squared_norm(value: Any) -> float:
     """Return |value|^2 of an array."""
     return float(np.sum(np.square(value)))
@@ -151,7 +157,7 @@ class ConvexProgram:
         r = self.model.A @ z - self.model.b
         if self.formulation.loss_over == "configuration":
             r = self.norms(z)
-        return self._posed.loss(r), self._posed.penalty(self._posed.penalized(z))
+        return self._posed.loss(r) + self.model.offset, self._posed.penalty(self._posed.penalized(z))
 
     def norms(self, z: Array) -> Array:
         """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
@@ -350,6 +356,9 @@ class _Shape:
 
 def _posed(formulation: Formulation, model: LinearModel) -> _Posed:
     m, n = model.A.shape
+    if model.stands_for is not None and not rotation_invariant(formulation):
+        found = f"formulation '{formulation.name}'"
+        raise InputError(found, "equations of which only the triangle is kept", "a squared loss")
     grouped = formulation.loss_over == "configuration" or np.isfinite(formulation.largest)
     groups = np.unique(model.group, return_inverse=True)[1] if grouped else np.empty(0, dtype=int)
     p = model.parameters
@@ -390,7 +399,7 @@ class _Posed:
             and (formulation.penalty is None or (formulation.penalty is cp.sum_squares and plain))
             and not self.limited
         )
-        self.reduced = formulation.loss in ROTATION_INVARIANT and whole and not self.limited
+        self.reduced = rotation_invariant(formulation)
         over = formulation.penalty_over
         self.differences = [np.asarray(D, dtype=float) for D in over(self.parameters)] if over else None
         z, weight = cp.Variable(n), cp.Parameter(nonneg=True)

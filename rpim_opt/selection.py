@@ -60,6 +60,14 @@ class Selection:
 Selector = Callable[[ConvexProgram], Selection]
 
 
+def _with_rows(program: ConvexProgram, name: str) -> LinearModel:
+    """Return the model for a rule that leaves rows out, if it has its rows."""
+    if program.model.stands_for is not None:
+        found = f"{program.model.equations} equations of which only the triangle is kept"
+        raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
+    return program.model
+
+
 def weight_grid(program: ConvexProgram, count: int = 200) -> Array:
     """Return weights from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside).
 
@@ -254,7 +262,7 @@ def _restricted_likelihood(model: LinearModel) -> Callable[[Array], Array]:
     U, s, _ = np.linalg.svd(R[:, :-1][:, frames], full_matrices=False)
     U = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
     R = R - U @ (U.T @ R)
-    m, b = len(model.b) - U.shape[1], R[:, -1]
+    m, b = model.equations - U.shape[1], R[:, -1]
     U, s, _ = np.linalg.svd(R[:, :-1][:, ~frames], full_matrices=False)
     seen = s > RANK_TOLERANCE * s.max(initial=tiny)
     beta2, s2 = (U[:, seen].T @ b) ** 2, s[seen] ** 2
@@ -280,7 +288,7 @@ def _gcv_score(gamma: float) -> Callable[[LinearModel], Callable[[Array], Array]
 
         def score(weights: Array) -> Array:
             g = weights[:, None] / (s2 + weights[:, None])
-            left = len(model.b) - gamma * np.sum(1 - g, axis=1)
+            left = model.equations - gamma * np.sum(1 - g, axis=1)
             return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
 
         return score
@@ -326,7 +334,7 @@ def robust_gcv(program: ConvexProgram, gamma: float = 1.4) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1.9', True)
     """
-    m, rank = len(program.model.b), program.model.rank
+    m, rank = program.model.equations, program.model.rank
     if m < 3 * rank:
         found = f"{m} equations for {rank} directions"
         raise InputError("selector robust_gcv", found, "three equations a direction; gcv or reml with fewer")
@@ -366,7 +374,7 @@ def _misfit(model: LinearModel) -> Callable[[Array], Array]:
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
-        left = ROOM**2 * np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)
+        left = ROOM**2 * np.maximum(model.equations - np.sum(1 - g, axis=1), 1e-9)
         return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
 
     return score
@@ -402,6 +410,7 @@ def ncp(program: ConvexProgram) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.note
     ('67', 'whitest residual')
     """
+    _with_rows(program, "ncp")
 
     def of(model: LinearModel) -> Callable[[Array], Array]:
         _, s, Vt = model.svd
@@ -432,6 +441,7 @@ def leave_one_out(program: ConvexProgram) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('0.96', True)
     """
+    _with_rows(program, "leave_one_out")
     if not program.closed_form:
         return _held_out(program, "leave_one_out", None)
 
@@ -481,7 +491,7 @@ def k_fold(program: ConvexProgram, folds: int = 10, seed: int = 0) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('0.93', True)
     """
-    groups = np.unique(program.model.group)
+    groups = np.unique(_with_rows(program, "k_fold").group)
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
@@ -577,6 +587,7 @@ def two_step(program: ConvexProgram) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1.2', True)
     """
+    _with_rows(program, "two_step")
     corner = l_curve(program)
     coarse = np.geomspace(corner.weight, 1e-10 * corner.weight, 30)
     residual = np.sqrt([e.loss for e in program.path(coarse)])
