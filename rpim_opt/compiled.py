@@ -21,8 +21,10 @@ SWITCH = "RPIM_OPT_COMPILE"
 
 
 @lru_cache(maxsize=256)
-def compiled(function: ca.Function) -> ca.Function | None:
+def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
     """Return the function as machine code, five times as fast as CasADi's virtual machine; None where that fails.
+
+    Without ``make`` only a library that was made before is taken.
 
     The library's name is a digest of its source, of the compiler and of the machine, so that a stale one is never
     taken; it is made elsewhere and moved there whole. A cache folder that others may write to is not used.
@@ -35,6 +37,8 @@ def compiled(function: ca.Function) -> ca.Function | None:
     source = generator.dump()
     made_of = "\0".join([source, compiler, _version(compiler), *FLAGS, platform.machine(), version("casadi")])
     library = folder / f"{function.name()}-{hashlib.sha256(made_of.encode()).hexdigest()[:32]}.so"
+    if not library.is_file() and not make:
+        return None
     if not library.is_file():
         try:
             with tempfile.TemporaryDirectory(dir=folder) as scratch:

@@ -26,6 +26,8 @@ ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 
 FEASIBLE = 1e-9
 """By how much a solution may miss its constraints, relative to its largest entry."""
+SNAP = 1e-7
+"""How near to a bound an interior point lies, relative to its size, where the active set begins with that bound."""
 STATIONARY = 1e-7
 """Largest gradient of a box-constrained solution off its bounds, relative to that of the data at nominal."""
 
@@ -201,7 +203,9 @@ class ConvexProgram:
                 raise
             z, duals = self._formula(weight), ()  # an interior point may fail where an active set does not
         if polish and box is not None:
-            z, held = self._polished(np.clip(z, *box), weight, *box)
+            near = SNAP * (1 + np.abs(z))  # an interior point stops short of the bounds that hold
+            z = np.where(z - box[0] < near, box[0], np.where(box[1] - z < near, box[1], z))
+            z, held = self._polished(z, weight, *box)
             duals = (held,)
         return Estimate(z, weight, *self.value(z), duals)
 

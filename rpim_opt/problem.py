@@ -21,8 +21,8 @@ from rpim_opt.robot import Array, Robot
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest count as zero: the data do not see those directions."""
-LARGE = 20_000
-"""Rows from which on a function is worth compiling."""
+SOME, LARGE = 1000, 20_000
+"""Rows from which on a compiled function is worth loading, and worth compiling."""
 ROWS = 4096
 """Rows that are evaluated and reduced together: as many as a processor's cache holds."""
 
@@ -339,8 +339,8 @@ class CalibrationProblem:
             self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
             block.measurement, block.markers, block.fixture, block.torque is not None,
         )[what]  # fmt: skip
-        if len(block.row) >= LARGE:
-            function = compiled(function) or function
+        if len(block.row) >= SOME:
+            function = compiled(function, make=len(block.row) >= LARGE) or function
         with phase("evaluation"):
             return call_rows(function, [x, p.nominal], self._rows(block, part))
 
