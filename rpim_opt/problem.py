@@ -260,7 +260,7 @@ class CalibrationProblem:
         return LinearModel(A, b, np.concatenate(group), self.parameters.free, self._constrained)
 
     def reduced(self, x: Array) -> LinearModel:
-        """Return the model of `linearize` at x (n,) [SI] as its triangle: n + 1 equations, the same |A z - b| for every z.
+        """Return the model of `linearize` at x (n,) as its triangle: n + 1 equations, the same |A z - b| for every z.
 
         Rows are evaluated, whitened and rotated into the triangle `ROWS` at a time, so that memory does not grow with
         their number.

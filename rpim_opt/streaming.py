@@ -35,12 +35,30 @@ class PartitionedProblem(CalibrationProblem):
 
     Parameters
     ----------
+    robot, parameters
+        As `CalibrationProblem` has them.
+    data
+        The first part.
     parts
         Functions that read the parts, at least one; `partitions` makes them from files.
     compute
         Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or `on_cluster` (client).
     loss
         The formulation whose loss weighs the rows, where that is not a squared norm; set by `calibrate`.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> whole = ro.load("position").problem
+    >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
+    >>> problem = ro.PartitionedProblem(whole.robot, whole.parameters, halves[0](), tuple(halves))
+    >>> problem.linearize(0 * whole.parameters.free.nominal).equations
+    120
+    >>> formulation = problem.for_loss(ro.robust)[1]  # majorized by a squared loss
+    >>> formulation.loss_over
+    'equation'
+    >>> f"{ro.calibrate(problem, ro.tikhonov, weight=ro.reml).weight:.2f}"
+    '1.55'
     """
 
     parts: tuple[Part, ...] = ()
@@ -128,6 +146,19 @@ def partitions(
         Tables; at least one.
     robot, noise, measurement
         As for `read_data`.
+
+    Raises
+    ------
+    InputError
+        For no paths; when a part is read, as `read_data`.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parts = ro.partitions(["targets.csv"], robot, {"position_mm": 0.03})
+    >>> len(parts), len(parts[0]())
+    (1, 18)
     """
     if not paths:
         raise InputError("paths", "no file", "at least one")
@@ -141,6 +172,12 @@ def on_cluster(client: Any) -> Callable[..., Iterable[Any]]:
     ----------
     client
         A ``distributed.Client``.
+
+    Examples
+    --------
+    With ``from distributed import Client`` and the address of the cluster's scheduler::
+
+        replace(problem, compute=ro.on_cluster(Client("tcp://10.0.0.7:8786")))
     """
 
     def compute(task: Callable[[Part], Any], parts: Sequence[Part]) -> list[Any]:
