@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.table import Table
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a plain-text table; the first column is aligned left, the others right."""
-    grid = Table(*header, box=SIMPLE_HEAD, title=title or None, title_justify="left", pad_edge=False)
+    grid = Table(*header, box=SIMPLE_HEAD, pad_edge=False)
     for column in grid.columns[1:]:
         column.justify = "right"
     for row in rows:

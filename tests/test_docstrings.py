@@ -12,13 +12,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib import pyplot
 
 import rpim_opt as ro
 from tests.test_exchange import CONF, YAML_PLAIN
 
+mpl.use("agg")
 PACKAGE = Path(__file__).parents[1] / "rpim_opt"
 SHAPE = re.compile(r"\(((\w{1,10}|\d)( or \d|[+-]\d)?, ?)+((\w{1,10}|\d)( or \d|[+-]\d)?)?\)")
 """``(N, 3)``, ``(n,)``, ``(n+1, n+1)``, ``(1 or N, k, k)``."""
@@ -104,7 +106,7 @@ def test_a_public_name_describes_parameters_and_shapes(name: str) -> None:
     assert text, "no docstring"
     if called is None:
         return
-    inherited, described = "as for `" in text, entries(text)
+    inherited, described = re.search(r"\b[Aa]rguments( and errors)? as for `", text), entries(text)
     parameters = [p for p in called.parameters.values() if p.name not in ("self", "cls") and p.kind != p.VAR_KEYWORD]
     for p in parameters:
         if not inherited and len(parameters) > 1:
@@ -131,14 +133,10 @@ def test_an_example_prints_what_it_says(name: str, tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     for file, content in FILES.items():
         Path(file).write_text(content, encoding="utf-8")
-    matplotlib.use("agg")
     text, line = DOCS[name]
     example = doctest.DocTestParser().get_doctest(text, {"__name__": "__main__"}, name, None, line)
     runner, said = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE), []
     with np.printoptions(precision=8, suppress=False, linewidth=75, legacy=False):  # NumPy's own, whatever others set
-        runner.run(example, out=said.append)
-    if "matplotlib" in text or "plot_" in name:
-        from matplotlib import pyplot
-
-        pyplot.close("all")
-    assert not runner.failures, "".join(said)
+        failed = runner.run(example, out=said.append).failed
+    pyplot.close("all")
+    assert not failed, "".join(said)
