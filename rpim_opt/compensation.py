@@ -25,6 +25,7 @@ from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
 from rpim_opt.tables import read_columns
 from rpim_opt.text import table
+from rpim_opt.threads import one_blas_thread
 from rpim_opt.uncertainty import Uncertainty
 from rpim_opt.units import display, split_unit
 
@@ -129,6 +130,7 @@ class Compensation:
         return stream.getvalue()
 
 
+@one_blas_thread
 def compensate(
     result: Calibration,
     q: Array | None = None,
