@@ -27,6 +27,7 @@ from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.selection import SELECTORS, Selection, Selector, disagreement
 from rpim_opt.streaming import in_parts
 from rpim_opt.text import table
+from rpim_opt.threads import one_blas_thread
 from rpim_opt.units import display
 
 MOST_REGIONS, SHRINK = 30, 0.25
@@ -597,6 +598,7 @@ class Calibration:
         return [*lines, self.message]
 
 
+@one_blas_thread
 def calibrate(
     problem: CalibrationProblem,
     formulation: Formulation = tikhonov,

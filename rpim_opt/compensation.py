@@ -23,6 +23,7 @@ from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
 from rpim_opt.tables import csv_text, read_columns
 from rpim_opt.text import listed, table
+from rpim_opt.threads import one_blas_thread
 from rpim_opt.uncertainty import Uncertainty
 from rpim_opt.units import display, joint_columns, split_unit
 
@@ -134,6 +135,7 @@ class Compensation:
         return csv_text(header, rows)
 
 
+@one_blas_thread
 def compensate(
     result: Calibration,
     q: Array | None = None,

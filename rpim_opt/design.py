@@ -70,7 +70,7 @@ class Design:
 
 
 def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
-    """Return joint values (count, dof) [rad or m], uniform in the middle of the limits.
+    """Return joint values (count, dof) [rad or m], uniform in the middle of every joint's range.
 
     Parameters
     ----------

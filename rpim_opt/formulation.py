@@ -19,6 +19,7 @@ from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
 from rpim_opt.robot import Array
+from rpim_opt.threads import one_blas_thread
 
 Function = Callable[[Any], Any]
 ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
@@ -171,6 +172,7 @@ class ConvexProgram:
         excess = float(np.max(self.norms(z))) - self.formulation.largest if self._posed.limited else 0.0
         return max(self._posed.violation(z), excess, 0.0)
 
+    @one_blas_thread
     def solve(self, weight: float = 0.0, centre: Array | None = None, radius: float = np.inf) -> Estimate:
         """Return the solution at a weight, from Clarabel.
 
@@ -209,6 +211,7 @@ class ConvexProgram:
             duals = (held,)
         return Estimate(z, weight, *self.value(z), duals)
 
+    @one_blas_thread
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
         """Return the solutions at many weights.
 

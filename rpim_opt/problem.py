@@ -18,6 +18,7 @@ from rpim_opt.measurement import Measurement, of_fixture
 from rpim_opt.parameters import Parameters, tool_prefix
 from rpim_opt.phases import phase
 from rpim_opt.robot import Array, Robot
+from rpim_opt.threads import one_blas_thread
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest count as zero: the data do not see those directions."""
@@ -259,6 +260,7 @@ class CalibrationProblem:
         ]
         return LinearModel(A, b, np.concatenate(group), self.parameters.free, self._constrained)
 
+    @one_blas_thread
     def reduced(self, x: Array) -> LinearModel:
         """Return the model of `linearize` at x (n,) as its triangle: n + 1 equations, the same |A z - b| for every z.
 

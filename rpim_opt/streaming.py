@@ -18,6 +18,7 @@ from rpim_opt.formulation import Formulation, rotation_invariant
 from rpim_opt.measurement import Measurement, position
 from rpim_opt.problem import ROWS, CalibrationProblem, LinearModel, reduced_rows
 from rpim_opt.robot import Array, Robot
+from rpim_opt.threads import one_blas_thread
 
 KEPT = 200_000
 """Equations up to which a problem keeps its rows; beyond, only their triangle."""
@@ -108,6 +109,7 @@ def sketch(problem: CalibrationProblem) -> CalibrationProblem:
     return problem.on(problem.data.take([0]))
 
 
+@one_blas_thread
 def _triangle(problem: CalibrationProblem, x: Array, loss: Formulation | None, part: Part) -> tuple[Array, int, float]:
     """Return a part's triangle, how many equations it stands for, and the majorizing constant."""
     whole = problem.on(part())

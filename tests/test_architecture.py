@@ -18,6 +18,7 @@ ORDER = {
     "files": {"pydantic"},
     "robot": {"pydantic"},
     "phases": set(),
+    "threads": {"threadpoolctl"},
     "kinematics": {"casadi"},
     "compiled": {"casadi"},
     "parameters": {"casadi"},

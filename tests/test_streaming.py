@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import rpim_opt as ro
 from rpim_opt import compiled as native
@@ -20,6 +21,7 @@ from rpim_opt.measurement import MEASUREMENTS
 from rpim_opt.phases import clock
 from rpim_opt.problem import CalibrationProblem, _functions, reduced_rows
 from rpim_opt.streaming import PartitionedProblem, on_cluster, partitions
+from rpim_opt.threads import one_blas_thread
 
 PARTS, ROWS = 5, 1100
 
@@ -219,3 +221,18 @@ def test_phases_add_up() -> None:
     before = dict(seconds)
     ro.calibrate(problem, ro.bounded, ro.reml)  # outside: nothing is counted
     assert dict(running.seconds) == {k: v for k, v in before.items() if k != "other"}
+
+
+def test_linear_algebra_runs_on_one_thread_and_gets_its_threads_back() -> None:
+    def counts() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    inner = one_blas_thread(counts)
+    outer = one_blas_thread(lambda: (inner(), counts()))
+    with threadpool_limits(2, user_api="blas"):
+        before = counts()
+        assert outer() == ({1}, {1})
+        assert counts() == before
+        with pytest.raises(ZeroDivisionError):
+            one_blas_thread(lambda: 1 / 0)()
+        assert counts() == before
