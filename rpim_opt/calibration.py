@@ -577,7 +577,7 @@ class Calibration:
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0, max_iterations=1).remarks()
-        ['Not converged: 1 passes were not enough; give more, or a larger weight.']
+        ['Not converged: 1 pass was not enough; give more, or a larger weight.']
         """
         lines = []
         if self.flagged:
@@ -665,7 +665,8 @@ def calibrate(
         program, selection, history = formulation.compile(model), None, []
     lam, settled = fixed or 0.0, fixed is not None or formulation.penalty is None
     converged, radius, names = False, np.inf, dict(zip(problem.data.configuration, problem.data.label, strict=True))
-    message = f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight."
+    passes = f"{max_iterations} passes were" if max_iterations != 1 else "1 pass was"
+    message = f"Not converged: {passes} not enough; give more, or a larger weight."
     for _ in range(max_iterations):
         if not settled and callable(weight):
             with phase("selection"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -300,7 +301,7 @@ class ConvexProgram:
         R, n = self.model.triangle, len(z)
         A = np.vstack([R[:, :n], np.sqrt(weight) * np.eye(n)])
         b = np.concatenate([R[:, n], np.zeros(n)])
-        size = np.linalg.norm(A, axis=0) * max(float(np.linalg.norm(b)), 1e-300)
+        size = np.maximum(np.linalg.norm(A, axis=0), 1e-300) * max(float(np.linalg.norm(b)), 1e-300)
         free = (z > lower) & (z < upper)
         for _ in range(10 * n + 10):
             r = b - A @ z
@@ -486,6 +487,8 @@ class _Posed:
             weight = max(weight, 1e-16 * s[0] ** 2) if not s.all() or not self.quadratic else weight
         D = np.sqrt(s**2 + weight)
         inverse = np.divide(1.0, D, out=np.zeros_like(D), where=D > 0)
+        if self.formulation.penalty is None and not self.constrained:
+            inverse[s == 0] = 0.0  # nothing says anything of these directions: they stay nominal
         basis, centre = Vt.T * inverse, Vt.T @ (inverse**2 * s * beta)
         T, c = basis, centre
         if not self.quadratic:
@@ -573,7 +576,9 @@ def _conflict(program: ConvexProgram) -> Conflict:
             hard.append(
                 _norms(program.model.A @ z - program.model.b, program.model.group) <= formulation.largest + extra
             )
-        cp.Problem(cp.Minimize(cp.sum(slack)), hard).solve(solver=cp.CLARABEL)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that a diagnosis may be inaccurate
+            cp.Problem(cp.Minimize(cp.sum(slack)), hard).solve(solver=cp.CLARABEL)
         return np.zeros(slack.size) if slack.value is None else np.asarray(slack.value)
 
     box, rows = least(True) * parameters.scale, least(False)

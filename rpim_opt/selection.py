@@ -570,7 +570,7 @@ def corner(program: ConvexProgram, tolerance: float = 0.01) -> Selection:
         else "the search ended at an edge: the L-curve has no corner"
     )
     points = np.array([seen[t] for t in order])
-    return Selection(float(np.exp(best)), "corner", np.exp(order), _menger(points), interior, note)
+    return Selection(float(np.exp(best)), "corner", np.exp(order), _menger(points), bool(interior), note)
 
 
 def two_step(program: ConvexProgram) -> Selection:

@@ -138,3 +138,21 @@ def test_what_is_not_convex_is_refused() -> None:
 def test_a_weight_is_a_finite_number(weight: float) -> None:
     with pytest.raises(ro.InputError, match="weight: found"):
         ro.tikhonov.compile(model()).solve(weight)
+
+
+def test_a_loss_without_a_penalty_leaves_unseen_directions_nominal() -> None:
+    problem = ro.load("position").problem
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    absolute = ro.Formulation("absolute values", loss=cp.norm1)
+    z = absolute.compile(model).solve().z
+    _, s, Vt = model.svd
+    assert (s == 0).any()
+    assert np.abs(Vt[s == 0] @ z).max() < 1e-9
+    assert np.abs(z).max() < 10
+
+
+def test_a_column_of_zeros_costs_no_warning() -> None:
+    result = ro.calibrate(ro.load("paper_arm").problem, ro.least_squares)  # theta6 moves no point on its axis
+    assert result.x[result.problem.parameters.free.names.index("theta6")] == 0.0
+    boxed = ro.Formulation("boxed", constraints=(ro.signed(1, "a?"),))
+    assert np.isfinite(ro.calibrate(ro.load("paper_arm").problem, boxed).x).all()
