@@ -80,13 +80,11 @@ def read_candidates(source: Any, robot: Robot) -> Array:
     return np.column_stack(q)
 
 
-def joint_table(robot: Robot, q: Array, index: np.ndarray) -> str:
-    """Return joint values as CSV text, labelled by the number of the candidate."""
+def joint_columns(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str]]:
+    """Return joint values as the columns of a table, labelled by the number of the candidate."""
     units = [display(dimension) for dimension in robot.joint_dimensions]
-    lines = [",".join(["label", *(f"q{i}_{unit}" for i, (unit, _) in enumerate(units, start=1))])]
-    for k, row in zip(index, q, strict=True):
-        lines.append(",".join([f"n{k}", *(f"{v / si:.4f}" for v, (_, si) in zip(row, units, strict=True))]))
-    return "\n".join(lines) + "\n"
+    joints = {f"q{i}_{unit}": [f"{v / si:.4f}" for v in q[:, i - 1]] for i, (unit, si) in enumerate(units, start=1)}
+    return {"label": [f"n{k}" for k in index], **joints}
 
 
 def choose(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +19,7 @@ from rpim_opt.measurement import Measurement, of_fixture
 from rpim_opt.parameters import Parameters, model_parameters
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array
+from rpim_opt.tables import csv_text
 from rpim_opt.units import display, quantities
 
 TORQUE = 20.0
@@ -103,12 +102,8 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     folder = out or read_problem(name).path.parent
     written = []
     for file, table in made.tables.items():
-        stream = io.StringIO()
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(zip(*table.values(), strict=True))
         written.append(folder / file)
-        write_text(written[-1], stream.getvalue())
+        write_text(written[-1], csv_text(table))
     lines = [
         f"# made by: rpim-opt simulate {Path(name).name}",
         f"blunders = [{', '.join(map(repr, made.blunders))}]",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -51,6 +52,15 @@ def read_columns(source: Any) -> Columns:
     if not columns or not len(next(iter(columns.values()))):
         raise InputError("the table", "a header and no rows" if columns else "an empty table", "at least one row")
     return columns
+
+
+def csv_text(columns: Columns) -> str:
+    """Return columns as CSV with a header."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return stream.getvalue()
 
 
 def _csv(path: Path) -> Columns:
