@@ -194,9 +194,10 @@ def export(
     urdf_base: Annotated[str | None, typer.Option(help="Link where the robot starts, if not the root.")] = None,
     urdf_tip: Annotated[str | None, typer.Option(help="Link where it ends, if there are several.")] = None,
     base: Annotated[
-        bool | None, typer.Option(help="Whether the URDF's root becomes the instrument's frame; if it is near.")
+        bool | None,
+        typer.Option(help="Make the URDF's root the instrument's frame; by default if the identified base is near."),
     ] = None,
-    tool: Annotated[bool | None, typer.Option(help="Whether its tip becomes the reflector; if it is near.")] = None,
+    tool: Annotated[bool | None, typer.Option(help="Make its tip the reflector; by default if it is near.")] = None,
     marker: Marker = None,
     as_json: Json = False,
 ) -> None:

@@ -72,7 +72,7 @@ class Validation:
         return {
             "nominal": statistics(self.nominal),
             "identified": statistics(self.error),
-            "axes": {a: {**statistics(np.abs(v)), "mean_mm": float(1e3 * v.mean())} for a, v in axes.items() if len(v)},
+            "axes": {a: {**statistics(np.abs(v)), "bias_mm": 1e3 * v.mean()} for a, v in axes.items() if len(v)},
             "orientation": statistics(self.angle, "mrad"),
             "beyond": [self.label[i] for i in self.beyond],
             "judged": bool(np.isfinite(self.sigmas).any()),
@@ -89,7 +89,8 @@ class Validation:
         """Return the errors as a table, and the rows beyond their uncertainty by name."""
         found = self.content()
         sets = {"nominal": found["nominal"], "identified": found["identified"]}
-        sets |= {f"  identified, {axis} (mean signed)": figures for axis, figures in found["axes"].items()}
+        for axis, figures in found["axes"].items():
+            sets[f"  {axis}, mean signed"] = {**figures, "mean_mm": figures["bias_mm"]}
         rows = [[name, str(s["count"]), *(f"{s[k]:.4f}" for k in ("mean_mm", "rms_mm", "max_mm"))]
                 for name, s in sets.items()]  # fmt: skip
         turn = found["orientation"]
