@@ -77,10 +77,9 @@ def write_csv(path: Path, header: list[str], rows: np.ndarray) -> None:
 TOOL = link_of(a=0.03, theta=0.4, d=0.06)
 
 
-@pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a person has: a URDF and tables without units, 40 configurations and 100 without noise, in m and rad."""
-    folder, rng = tmp_path_factory.mktemp("cell"), np.random.default_rng(5)
+def write_cell(folder: Path) -> Path:
+    """Write what a person has: a URDF and tables without units, 40 configurations and 100 without noise [m, rad]."""
+    rng = np.random.default_rng(5)
     (folder / "arm.urdf").write_text(urdf_text(ARM.mdh, TOOL))
     mdh = ARM.mdh + np.array([1e-3, 3e-4, 1e-3, 3e-4, 0.0]) * rng.normal(size=ARM.mdh.shape)
     (folder / "true.urdf").write_text(urdf_text(mdh, TOOL @ link_of(a=3e-4, d=-4e-4)))
@@ -89,6 +88,11 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
         p = urdf_points(folder / "true.urdf", q)
         write_csv(folder / name, HEADER, np.hstack([p + noise * rng.normal(size=p.shape), q]))
     return folder
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_cell(tmp_path_factory.mktemp("cell"))
 
 
 @pytest.fixture(scope="module")
