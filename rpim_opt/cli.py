@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -56,10 +56,11 @@ def new(
 ) -> None:
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with _progress():
-        from rpim_opt.starting import start
+        from rpim_opt.files import refused
+        from rpim_opt.starting import new_problem
 
-        with _writing(folder):
-            made = start(
+        with refused(folder):
+            made = new_problem(
                 folder, robot, data, measurement=measurement, units=units, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip,
             )  # fmt: skip
@@ -101,6 +102,7 @@ def calibrate(
     """
     with _progress() as say:
         from rpim_opt.calibration import calibrate
+        from rpim_opt.files import refused
         from rpim_opt.instances import load, parse_formulation, parse_weight
         from rpim_opt.summary import describe, summary
 
@@ -122,7 +124,7 @@ def calibrate(
     if without:
         text = f"Refitted without {', '.join(without)}.\n\n{text}"
     if out is not None:
-        with _writing(out / "result.json"):
+        with refused(out / "result.json"):
             result.save(out / "result.json")
         text += f"\n\nWritten: {out / 'result.json'}"
     _show(text, {**found, "refitted_without": without, "written": [out / "result.json"] if out else []}, as_json)
@@ -138,6 +140,7 @@ def report(
 ) -> None:
     """Write a result as one HTML page that works offline, for whoever has to believe it."""
     with _progress() as say:
+        from rpim_opt.files import refused
         from rpim_opt.report import write_report
         from rpim_opt.results import load_result
 
@@ -145,7 +148,7 @@ def report(
         loaded = load_result(result)
         say("writing the report")
         out = out or (result if result.is_dir() else result.parent) / "report.html"
-        with _writing(out):
+        with refused(out):
             write_report(loaded, out)
     _show(f"Written: {out}", {"written": [out]}, as_json)
 
@@ -168,8 +171,10 @@ def validate(
         _require_positive("--limit", limit)
         say("reading the result")
         loaded = load_result(result)
-        found = validate(loaded, read_measurements(loaded, data, measurement, units))
-    text, document = str(found), {**found.content(), "limit_mm": limit, "written": _written(out, found.csv())}
+        rows, left_out = read_measurements(loaded, data, measurement, units)
+        found = validate(loaded, rows)
+    text = str(found) + _left(left_out)
+    document = {**found.content(), "left_out": left_out, "limit_mm": limit, "written": _written(out, found.csv())}
     failed = limit is not None and 1e3 * found.largest > limit
     if limit is not None:
         text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
@@ -218,15 +223,16 @@ def export(
             (ur_calibration, lambda target: export_ur_calibration(loaded, ur_calibration or "", target)),
         ]
         targets = _targets([source for source, _ in corrected if source], out)
-        writers = {targets[source]: write for source, write in corrected if source}
         plain = ((mdh, partial(write_robot, robot)), (robodk, partial(write_robodk, robot)))
-        writers |= {target: write for target, write in plain if target}
+        writers = [(targets[source], write) for source, write in corrected if source]
+        writers += [(target, write) for target, write in plain if target]
         if not writers:
             accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, one or several"
             raise InputError("export", "nothing to write", accepted)
         notes = write_all(writers)
-    _show("\n".join([*notes, *(f"Written: {target}" for target in writers)]),
-          {"written": list(writers), "notes": notes}, as_json)  # fmt: skip
+    written = [target for target, _ in writers]
+    text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
+    _show(text, {"written": written, "notes": notes}, as_json)
 
 
 @app.command()
@@ -258,7 +264,8 @@ def compensate(
         loaded = load_result(result)
         robot = loaded.problem.robot
         try:
-            read = read_targets(rename(read_columns(targets), robot, pose, parse_units(units)).columns, robot)
+            named = rename(read_columns(targets), robot, pose, parse_units(units))
+            read = read_targets(named.columns, robot)
         except InputError as error:
             raise error.within(targets) from None
         say("compensating")
@@ -266,8 +273,9 @@ def compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=_tool(tool), marker=marker or "", base=base, largest=largest,
         )  # fmt: skip
-    document = {**found.content(), "limit_mm": limit, "written": _written(out, found.csv())}
-    _show(str(found) + (_named(out) or "\n" + found.csv().rstrip("\n")), document, as_json)
+    document = {**found.content(), "left_out": named.left_out, "limit_mm": limit}
+    document["written"] = _written(out, found.csv())
+    _show(str(found) + _left(named.left_out) + (_named(out) or "\n" + found.csv().rstrip("\n")), document, as_json)
     if limit is not None and 1e3 * found.position_error.max() > limit:
         raise typer.Exit(1)
 
@@ -280,9 +288,10 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
+    from rpim_opt.files import refused
     from rpim_opt.simulation import write_simulation
 
-    with _writing(out or problem):
+    with refused(out or problem):
         written = write_simulation(problem, seed, out)
     _show("\n".join(f"Written: {path}" for path in written), {"written": written}, as_json)
 
@@ -387,28 +396,23 @@ def _fail(text: str, code: int) -> None:
     sys.exit(code)
 
 
-@contextmanager
-def _writing(path: object) -> Iterator[None]:
-    """Turn what the system refuses into a sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise RpimError(f"{path}: cannot be written: {error}.") from None
-
-
 def _written(path: Path | None, text: str) -> list[Path]:
     """Write a text where a path is given."""
-    from rpim_opt.files import write_text
+    from rpim_opt.files import refused, write_text
 
     if path is None:
         return []
-    with _writing(path):
+    with refused(path):
         write_text(path, text)
     return [path]
 
 
 def _named(path: Path | None) -> str:
     return f"\nWritten: {path}" if path else ""
+
+
+def _left(columns: Sequence[str]) -> str:
+    return f"\nColumns that were left out: {', '.join(columns)}." if columns else ""
 
 
 def _require_positive(where: str, value: float | None) -> None:

@@ -20,7 +20,7 @@ from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import write_text
 from rpim_opt.kinematics import FRAME, call_rows, frame, motion, numeric_frame, transforms
 from rpim_opt.measurement import Measurement, pose, position
-from rpim_opt.parameters import tool_prefix
+from rpim_opt.parameters import reflectors, tool_prefix
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.record import statistics
 from rpim_opt.robot import Array, Robot
@@ -393,7 +393,7 @@ class _Cell(NamedTuple):
     def of(cls, result: Calibration, kind: Measurement, tool: Any, marker: str, base: bool, torques: bool) -> _Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
         robot, p = result.problem.robot, result.problem.parameters
-        known = [name[5:-1].rstrip("_") for name in p.names if name.startswith("tool_") and name.endswith("_x")]
+        known = reflectors(p.names)
         if tool is None and marker not in known:
             raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
         marker = marker if tool is None else known[0]  # whose place the tool takes

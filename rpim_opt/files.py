@@ -7,13 +7,15 @@ import os
 import re
 import tempfile
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import to_jsonable_python
 
-from rpim_opt.exceptions import InputError, choices
+from rpim_opt.exceptions import InputError, RpimError, choices
 from rpim_opt.units import UNITS, number, quantities
 
 Length = Annotated[float, "length"]
@@ -160,6 +162,15 @@ def read_json(path: Path) -> Any:
 def write_text(path: Path, text: str) -> None:
     """Write text so that ``path`` holds either the whole new text or what it held before."""
     write_bytes(path, text.encode("utf-8"))
+
+
+@contextmanager
+def refused(path: object) -> Iterator[None]:
+    """Turn what the system refuses while ``path`` is written into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RpimError(f"{path}: cannot be written: {error}.") from None
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -33,6 +33,8 @@ ALIASES = (
     (r"marker|reflector|smr", "marker"),
 )  # fmt: skip
 """What else a column may be called, in lower case: unambiguous names alone."""
+AMBIGUOUS = ("rx", "ry", "rz")
+"""Without a unit these may also be a rotation vector, as Universal Robots' are."""
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 
 
@@ -99,6 +101,9 @@ def rename(
         if stem not in numeric and stem not in plain:
             left_out.append(name)
             continue
+        if name in AMBIGUOUS and stem in numeric:
+            accepted = "roll, pitch, yaw; rx_deg, ry_deg, rz_deg, the same; a quaternion; or --measurement position"
+            raise InputError("the header", f"column '{name}', of angles or of a rotation vector", accepted)
         dimensions = [d for d in numeric.get(stem, [""]) if d]
         if dimensions and not unit:
             unit = units.get(dimensions[0], "") if len(dimensions) == 1 else ""

@@ -42,7 +42,7 @@ class Started:
         return "\n".join([f"Made: {self.folder}", *lines, *self.notes])
 
 
-def start(
+def new_problem(
     folder: str | Path,
     robot: str,
     data: str | Path,
@@ -89,7 +89,8 @@ def start(
         raise InputError("the folder", "one that is there", "a new one: nothing is overwritten", folder)
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a part to hold out", "one of them")
-    file = Path(robot) if robot.endswith(ROBOT_FILES) else find_robot(robot)
+    ready = not robot.endswith(ROBOT_FILES)
+    file = find_robot(robot) if ready else Path(robot)
     if not file.is_file():
         raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
     arm = read_arm(file, urdf_base, urdf_tip)
@@ -110,7 +111,6 @@ def start(
         tables = {"identification.csv": _taken(columns, ~kept), "validation.csv": _taken(columns, kept)}
         apart = f'validation = "validation.csv"\n# configurations drawn with seed {seed}; no choice sees them'
         rows = rows.take(np.flatnonzero(~kept))
-    ready = Path(robot) != file
     said = {
         "robot": toml(robot if ready else "robot.toml"),
         "drawing": "a ready robot" if ready else f"modified DH table, from {file.name}",

@@ -135,8 +135,10 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     )  # fmt: skip
 
 
-def read_measurements(result: Calibration, source: Any, measurement: str | None = None, units: str = "") -> Dataset:
-    """Return the measurements of a table, as `read_data` or under other names (`naming.rename`).
+def read_measurements(
+    result: Calibration, source: Any, measurement: str | None = None, units: str = ""
+) -> tuple[Dataset, tuple[str, ...]]:
+    """Return the measurements of a table, whose columns `naming.rename` recognises, and columns that were left out.
 
     Rows that state no uncertainty have that of the calibration's data, at the noise level that it observed.
 
@@ -157,10 +159,11 @@ def read_measurements(result: Calibration, source: Any, measurement: str | None 
         raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
     given = parse_units(units)
     try:
-        columns = rename(read_columns(source), result.problem.robot, kinds[name], given).columns
-        return read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
+        found = rename(read_columns(source), result.problem.robot, kinds[name], given)
+        data = read_data(found.columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
+    return data, found.left_out
 
 
 def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:

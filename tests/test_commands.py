@@ -279,12 +279,14 @@ def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp
 def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, cell, made, tmp_path) -> None:
     header, rows = table(cell / "later.csv")
     rows[7, 1] += 5e-4
-    write_csv(tmp_path / "later.csv", header, rows)
+    write_csv(tmp_path / "later.csv", [*header, "temperature"], np.hstack([rows, rows[:, :1]]))
     arguments = ["validate", str(made / "results"), str(tmp_path / "later.csv"), "--units", "rad,m"]
     assert run(monkeypatch, *arguments, "--json") == 0
     assert json.loads(capsys.readouterr().out)["beyond"] == ["8"]
     assert run(monkeypatch, *arguments) == 0
-    assert "allows: 8 (" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "allows: 8 (" in said
+    assert "left out: temperature." in said
 
 
 def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:
@@ -387,6 +389,7 @@ BAD = {
     "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
     "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
     "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
+    "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', of angles or of a rotation vector"]),
     "no positions": ([*NEW[:5], "joints.csv", *NEW[6:]], ["joints.csv", "no positions", "--measurement"]),
     "option unknown": ([*NEW, "--unit", "m"], ["No such option", "--units"]),
     "no result": (["validate", "nothing", "later.csv"], ["nothing", "the file: found nothing"]),
@@ -404,6 +407,11 @@ BAD = {
     ),
     "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "off by"]),
     "ending of a table": (["export", *RESULT, "--mdh", "made.txt"], ["made.txt", "ending in .toml"]),
+    "two files in one": (["export", *RESULT, "--mdh", "made.csv", "--robodk", "made.csv"], ["made.csv", "two files"]),
+    "unwritable": (
+        ["export", *RESULT, "--mdh", "made.csv", "--robodk", "arm.urdf/dk.csv"],
+        ["arm.urdf/dk.csv", "cannot be written"],
+    ),
     "no reflector": (["export", *RESULT, "--mdh", "made.csv", "--marker", "B"], ["marker", "'B'"]),
     "no targets": (["compensate", *RESULT, "nothing.csv"], ["nothing.csv", "the file: found nothing"]),
     "bad tool": (["compensate", *RESULT, "joints.csv", "--units", "rad", "--tool", "1,2"], ["--tool", "six numbers"]),
@@ -420,6 +428,7 @@ def desk(cell: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "result.json").rename(tmp_path / "results" / "result.json")
     header, rows = table(cell / "measured.csv")
     write_csv(tmp_path / "points.csv", ["x1", "y1", "z1", "x2", *header[4:]], rows)
+    write_csv(tmp_path / "turns.csv", [*header, "rx", "ry", "rz"], np.hstack([rows, rows[:, :3]]))
     write_csv(tmp_path / "twice.csv", [*header, "X"], np.hstack([rows, rows[:, :1]]))
     write_csv(tmp_path / "joints.csv", header[3:], rows[:, 3:])
     broken = rows[:9].copy()
@@ -451,7 +460,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
             assert text.strip().endswith(".")
             assert "\n" not in text.strip()
     assert {path: path.read_bytes() for path in desk.rglob("*") if path.is_file()} == before
-    assert not (desk / "made").exists()
+    assert not list(desk.glob("made*"))
 
 
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from shutil import copyfile
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from rpim_opt.calibration import Calibration
-from rpim_opt.exceptions import InputError, RpimError
+from rpim_opt.exceptions import InputError
 from rpim_opt.exchange.chain import Described, identified, placed, same_place
 from rpim_opt.exchange.universal_robots import write_ur_calibration
 from rpim_opt.exchange.urdf import read_urdf, write_urdf
-from rpim_opt.files import write_bytes
+from rpim_opt.files import refused
+from rpim_opt.parameters import reflectors
 
 
 def export_urdf(
@@ -84,34 +87,41 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
 
 def found_by(result: Calibration, marker: str | None = None) -> tuple[Described, bool]:
     """Return what was identified with a reflector, by default the first; and whether there are several."""
-    names = result.problem.parameters.names
-    markers = [n.removesuffix("_x").removeprefix("tool").lstrip("_") for n in names
-               if n.startswith("tool_") and n.endswith("_x")]  # fmt: skip
+    markers = reflectors(result.problem.parameters.names)
     return identified(result, markers[0] if marker is None else marker), len(markers) > 1
 
 
-def write_all(writers: Mapping[Path, Callable[[Path], Sequence[str] | None]]) -> list[str]:
+def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]]) -> list[str]:
     """Write several files, or none of them if one cannot be written; return what their writers say.
 
     Parameters
     ----------
     writers
-        By target: a function that writes to the path it is given.
+        Targets, each with a function that writes to the path it is given.
     """
     notes: list[str] = []
-    with TemporaryDirectory() as folder:
-        for number, (target, write) in enumerate(writers.items()):
-            made = Path(folder) / str(number) / target.name
-            made.parent.mkdir()
+    targets = [target for target, _ in writers]
+    for target in targets:
+        if targets.count(target) > 1 or target.is_dir():
+            found = "a folder" if target.is_dir() else "two files for it"
+            raise InputError("the file", found, "a name of its own for every file", target)
+    with ExitStack() as stack:
+        scratch = Path(stack.enter_context(TemporaryDirectory()))
+        made, beside = {}, {}
+        for number, (target, write) in enumerate(writers):
+            made[target] = path = scratch / str(number) / target.name
+            path.parent.mkdir()
             try:
-                notes += write(made) or ()
+                notes += write(path) or ()
             except InputError as error:
-                raise (
-                    InputError(error.where, error.found, error.accepted, target) if error.file == made else error
-                ) from None
-        for number, target in enumerate(writers):
-            try:
-                write_bytes(target, (Path(folder) / str(number) / target.name).read_bytes())
-            except OSError as error:
-                raise RpimError(f"{target}: cannot be written: {error}.") from None
+                file = target if error.file == path else error.file
+                raise InputError(error.where, error.found, error.accepted, file) from None
+        for target, path in made.items():  # all of them first, so that nothing but their renaming is left to be done
+            with refused(target):
+                target.parent.mkdir(parents=True, exist_ok=True)
+                folder = stack.enter_context(TemporaryDirectory(dir=target.parent, prefix=f"{target.name}."))
+                beside[target] = copyfile(path, Path(folder) / target.name)
+        for target, path in beside.items():
+            with refused(target):
+                path.replace(target)
     return notes
