@@ -101,6 +101,9 @@ if TYPE_CHECKING:
     from rpim_opt.selection import robust_gcv as robust_gcv
     from rpim_opt.selection import two_step as two_step
     from rpim_opt.starting import new_problem as new_problem
+    from rpim_opt.streaming import PartitionedProblem as PartitionedProblem
+    from rpim_opt.streaming import on_cluster as on_cluster
+    from rpim_opt.streaming import partitions as partitions
     from rpim_opt.uncertainty import Uncertainty as Uncertainty
     from rpim_opt.uncertainty import monte_carlo as monte_carlo
     from rpim_opt.validation import Validation as Validation
@@ -188,6 +191,7 @@ _HOME = {
         "plot_selection",
         "plot_selectors",
     ),
+    "streaming": ("PartitionedProblem", "on_cluster", "partitions"),
     "uncertainty": ("Uncertainty", "monte_carlo"),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}

@@ -20,11 +20,14 @@ from rpim_opt.formulation import FEASIBLE, ConvexProgram, Estimate, Formulation,
 from rpim_opt.frames import relocated
 from rpim_opt.markup import html_table
 from rpim_opt.measurement import Measurement, position
+from rpim_opt.phases import phase
 from rpim_opt.problem import CalibrationProblem, LinearModel
 from rpim_opt.record import Record, content
 from rpim_opt.robot import MDH, Array, Robot
 from rpim_opt.selection import SELECTORS, Selection, Selector, disagreement
+from rpim_opt.streaming import in_parts
 from rpim_opt.text import table
+from rpim_opt.threads import one_blas_thread
 from rpim_opt.units import display
 
 MOST_REGIONS, SHRINK = 30, 0.25
@@ -338,7 +341,7 @@ class Calibration:
             return ()
         z, parameters = self.x / self.problem.parameters.free.scale, self.problem.parameters.free
         multiplier = np.sum(self._again.duals, axis=0)
-        loss, rows, found = self.program.value(z)[0], len(self.program.model.b), []
+        loss, rows, found = self.program.value(z)[0], self.program.model.equations, []
         near = np.minimum(z - box[0], box[1] - z) < 1e-6 * (1 + np.abs(z))
         for i in np.flatnonzero((multiplier > 1e-6 * loss / rows) & near & (box[0] < box[1])):
             bound = box[1][i] if abs(z[i] - box[1][i]) < abs(z[i] - box[0][i]) else box[0][i]
@@ -459,6 +462,7 @@ class Calibration:
         return [*lines, self.message]
 
 
+@one_blas_thread
 def calibrate(
     problem: CalibrationProblem,
     formulation: Formulation = tikhonov,
@@ -502,7 +506,7 @@ def calibrate(
         When a convex program fails.
     """
     elsewhere = relocated(problem) if start is None else None
-    problem = elsewhere or problem
+    problem, formulation = in_parts(elsewhere or problem).for_loss(formulation)
     scale = problem.parameters.free.scale
     begin = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float)
     if begin.shape != scale.shape or not np.isfinite(begin).all():
@@ -510,22 +514,26 @@ def calibrate(
     z = begin / scale
     model = problem.linearize(scale * z)
     fixed = None if callable(weight) else float(weight)
-    if len(model.b) < len(z) and (formulation.penalty is None or fixed == 0):
-        found = f"{len(model.b)} equations for {len(z)} parameters"
+    if model.equations < len(z) and (formulation.penalty is None or fixed == 0):
+        found = f"{model.equations} equations for {len(z)} parameters"
         raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
-    program, selection, history = formulation.compile(model), None, []
+    with phase("canonicalization"):
+        program, selection, history = formulation.compile(model), None, []
     lam, settled = fixed or 0.0, fixed is not None or formulation.penalty is None
     converged, radius, names = False, np.inf, dict(zip(problem.data.configuration, problem.data.label, strict=True))
     message = f"Not converged: {max_iterations} passes were not enough; give more, or a larger weight."
     for _ in range(max_iterations):
         if not settled and callable(weight):
-            selection = weight(program)
+            with phase("selection"):
+                selection = weight(program)
             lam = selection.weight
         before = _objective(program, z, lam)
         start_feasible = program.violation(z) <= FEASIBLE
         for _ in range(MOST_REGIONS):
             try:
-                estimate = program.solve(lam, z, radius)
+                free = program.closed_form and np.isinf(radius)
+                with phase("solve"):
+                    estimate = program.path([lam])[0] if free else program.solve(lam, z, radius)
             except NoSolutionFound as error:
                 raise error.naming(names) from None
             step = estimate.z - z

@@ -26,6 +26,7 @@ from rpim_opt.record import statistics
 from rpim_opt.robot import Array, Robot
 from rpim_opt.tables import read_columns
 from rpim_opt.text import table
+from rpim_opt.threads import one_blas_thread
 from rpim_opt.uncertainty import known_covariance
 from rpim_opt.units import display, split_unit
 
@@ -150,6 +151,7 @@ class Compensation:
         return stream.getvalue()
 
 
+@one_blas_thread
 def compensate(
     result: Calibration,
     q: Array | None = None,

@@ -14,6 +14,7 @@ import numpy as np
 from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
 from scipy import sparse
 
+from rpim_opt.phases import phase
 from rpim_opt.robot import Array
 
 clarabel: Any = clarabel_module  # a compiled module, without types
@@ -63,11 +64,11 @@ class Conic:
     ):
         self.problem = cp.Problem(cp.Minimize(objective), list(constraints))
         first, self._chain, self._inverse = self._data(weight, 1.0)
-        self._P, self._q, self._dP, self._dq = first["P"], first["c"], 0.0 * first["P"], 0.0 * first["c"]
+        P, q, dP, dq = first["P"], first["c"], 0.0 * first["P"], 0.0 * first["c"]
         if weight is not None:
             second = self._data(weight, 2.0)[0]
-            self._dP, self._dq = second["P"] - first["P"], second["c"] - first["c"]
-            self._P, self._q = first["P"] - self._dP, first["c"] - self._dq
+            dP, dq = second["P"] - first["P"], second["c"] - first["c"]
+            P, q = first["P"] - dP, first["c"] - dq
         place = first["param_prob"].var_id_to_col
         rows, own, start = [], [], 0
         for variable in variables:
@@ -77,13 +78,14 @@ class Conic:
             start += variable.size
         self._rows = np.concatenate(rows) if rows else np.empty(0, dtype=int)
         own = np.concatenate(own) if own else np.empty(0, dtype=int)
-        rest = np.setdiff1d(np.arange(len(self._q)), own)
-        self._own, self._rest, self._b = own, rest, first["b"]
-        self._cones = dims_to_solver_cones(first["dims"])
+        rest = np.setdiff1d(np.arange(len(first["c"])), own)
+        self._objective = _Affine(P, dP, q, dq, own, rest)
+        self._size, self._b, self._cones = len(first["c"]), first["b"], dims_to_solver_cones(first["dims"])
         A = sparse.csr_array(first["A"])
         self._A_own, self._A_rest = A[:, own], sparse.coo_array(A[:, rest])
         self._touched = np.flatnonzero(np.diff(self._A_own.indptr))
         self._A_touched = self._A_own[self._touched]
+        self._patterns: dict[tuple[int, int], tuple[_Pattern, _Pattern]] = {}
 
     def _data(self, weight: cp.Parameter | None, value: float) -> tuple[dict[str, Any], Any, Any]:
         if weight is not None:
@@ -118,49 +120,40 @@ class Conic:
         -------
         CVXPY's word for the status, u (n,), and the multipliers of the cones.
         """
-        n = T.shape[1]
+        n, extra = T.shape[1], 0 if box is None else 2 * len(box[1])
+        if (n, extra) not in self._patterns:
+            self._patterns[n, extra] = self._pattern(n, extra)
+        P_pattern, A_pattern = self._patterns[n, extra]
         T, c = T[self._rows], c[self._rows]
-        P, q = self._P + weight * self._dP, self._q + weight * self._dq
-        Poo, Por = P[self._own][:, self._own], P[self._own][:, self._rest]
-        Prr = sparse.coo_array(sparse.triu(P[self._rest][:, self._rest]))
-        Puu = T.T @ (Poo @ T) + 2 * identity * np.eye(n)
-        upper = np.triu_indices(n)
-        cross = sparse.coo_array(T.T @ Por) if Por.nnz else sparse.coo_array((n, len(self._rest)))
-        size = n + len(self._rest)
-        P_new = _csc(
-            [
-                (upper[0], upper[1], Puu[upper]),
-                (cross.row, n + cross.col, cross.data),
-                (n + Prr.row, n + Prr.col, Prr.data),
-            ],
-            (size, size),
-        )
-        q_new = np.concatenate([T.T @ (q[self._own] + Poo @ c), q[self._rest] + Por.T @ c])
-        dense = self._A_touched @ T
-        parts = [
-            (np.repeat(self._touched, n), np.tile(np.arange(n), len(self._touched)), dense.ravel()),
-            (self._A_rest.row, n + self._A_rest.col, self._A_rest.data),
-        ]
-        b, cones, height = self._b - self._A_own @ c, list(self._cones), len(self._b)
+        P, q = self._objective.at(T, c, weight, identity)
+        values = [(self._A_touched @ T).ravel(), self._A_rest.data]
+        b, cones = self._b - self._A_own @ c, self._cones
         if box is not None:
-            B, lower, top = box
-            for sign, bound in ((1.0, top), (-1.0, -lower)):
-                k = len(bound)
-                parts.append((np.repeat(height + np.arange(k), n), np.tile(np.arange(n), k), sign * B.ravel()))
-                b, height = np.concatenate([b, bound]), height + k
-            cones.append(clarabel.NonnegativeConeT(2 * len(lower)))
-        A_new = _csc(parts, (height, size))
+            B, lower, upper = box
+            values += [B.ravel(), -B.ravel()]
+            b, cones = np.concatenate([b, upper, -lower]), [*cones, clarabel.NonnegativeConeT(extra)]
+        data = P_pattern.filled(P), q, A_pattern.filled(values), b, cones
         status, solution = "", SimpleNamespace(x=(), z=())
         for attempt in range(len(ATTEMPTS)):
-            solution = clarabel.DefaultSolver(P_new, q_new, A_new, b, cones, _settings(attempt)).solve()
+            with phase("solve"):
+                solution = clarabel.DefaultSolver(*data, _settings(attempt)).solve()
             status = STATUS.get(str(solution.status), str(solution.status))
             if status in (cp.OPTIMAL, cp.INFEASIBLE, cp.UNBOUNDED):
                 break
         return status, np.array(solution.x[:n]), np.array(solution.z[: len(self._b)])
 
+    def _pattern(self, n: int, extra: int) -> tuple[_Pattern, _Pattern]:
+        """Return where the numbers of P and A stand."""
+        dense: list[tuple[Any, Any]] = [(np.repeat(self._touched, n), np.tile(np.arange(n), len(self._touched)))]
+        dense.append((self._A_rest.row, n + self._A_rest.col))
+        k = np.arange(extra)
+        dense.append((np.repeat(len(self._b) + k, n), np.tile(np.arange(n), extra)))
+        size = n + self._size - len(self._rows)
+        return _Pattern(self._objective.places(n), (size, size)), _Pattern(dense, (len(self._b) + extra, size))
+
     def multipliers(self, z: Array, constraint: Any) -> Array:
         """Return the multipliers of one of the constraints, from those of the cones."""
-        raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0, z=z, x=np.zeros(len(self._q)))
+        raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0, z=z, x=np.zeros(self._size))
         return np.ravel(self._chain.invert(raw, self._inverse).dual_vars[constraint.id])
 
 
@@ -175,9 +168,58 @@ def _settings(attempt: int) -> Any:
     return settings
 
 
-def _csc(parts: Sequence[tuple[Any, Any, Any]], shape: tuple[int, int]) -> Any:
-    rows, columns, values = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    return sparse.csc_matrix((values, (rows, columns)), shape=shape)
+class _Affine:
+    """Objective 1/2 x'(P + weight dP) x + (q + weight dq)'x, when some x are T u + c and the others stay."""
+
+    def __init__(self, P: Any, dP: Any, q: Array, dq: Array, own: np.ndarray, rest: np.ndarray):
+        both = abs(P) + abs(dP)  # where numbers may stand
+        cross = sparse.coo_array(both[own][:, rest])
+        self._crossed = np.unique(cross.col)
+        upper = sparse.coo_array(sparse.triu(both[rest][:, rest]))
+        self._upper = upper.row, upper.col
+        self._parts = [
+            (
+                M[own][:, own],
+                M[own][:, rest],
+                M[own][:, rest[self._crossed]],
+                np.asarray(sparse.csr_array(M[rest][:, rest])[self._upper]).ravel() if len(upper.row) else np.empty(0),
+                v[own],
+                v[rest],
+            )
+            for M, v in ((sparse.csr_array(P), q), (sparse.csr_array(dP), dq))
+        ]
+
+    def places(self, n: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return rows and columns of the numbers that `at` returns, for n unknowns u."""
+        k = len(self._crossed)
+        cross = np.repeat(np.arange(n), k), n + np.tile(self._crossed, n)
+        return [np.triu_indices(n), cross, (n + self._upper[0], n + self._upper[1])]
+
+    def at(self, T: Array, c: Array, weight: float, identity: float) -> tuple[list[Array], Array]:
+        """Return the numbers of P and q, with identity |u|^2 added."""
+        n = T.shape[1]
+        own, rest, crossed, upper, q_own, q_rest = (
+            a + weight * b if weight else a for a, b in zip(*self._parts, strict=True)
+        )
+        dense = T.T @ (own @ T) + 2 * identity * np.eye(n)
+        q = np.concatenate([T.T @ (q_own + own @ c), q_rest + rest.T @ c])
+        return [dense[np.triu_indices(n)], np.asarray(T.T @ crossed).ravel(), upper], q
+
+
+class _Pattern:
+    """A sparse matrix whose numbers change and whose places do not, zeros among them."""
+
+    def __init__(self, places: Sequence[tuple[Any, Any]], shape: tuple[int, int]):
+        rows, columns = (np.concatenate([part[k] for part in places]) for k in range(2))
+        self._order = np.lexsort((rows, columns))
+        ends = np.searchsorted(columns[self._order], np.arange(shape[1] + 1))
+        self._empty = sparse.csc_matrix((np.zeros(len(rows)), rows[self._order], ends), shape=shape)
+
+    def filled(self, values: Sequence[Array]) -> Any:
+        """Return the matrix with these numbers, in the order of the places."""
+        matrix = self._empty.copy()
+        matrix.data = np.concatenate(values)[self._order]
+        return matrix
 
 
 class Term:

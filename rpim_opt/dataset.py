@@ -240,8 +240,8 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     except InputError as error:
         raise InputError(f"row {label[int(error.where)]}", error.found, error.accepted) from None
     covariance = _covariance(columns, declared, kind, y, label)
-    names = [texts(table.get(p + "marker", table.get("marker", [""] * N)), p + "marker") for p in prefixes]
-    fixture = texts(table.get("fixture", [""] * N), "fixture")
+    names = [_texts(table, (p + "marker", "marker"), N) for p in prefixes]
+    fixture = _texts(table, ("fixture",), N)
     if kind.points == 2:
         still = [i for i in range(N) if names[0][i] == names[1][i] and np.array_equal(q[0][i], q[1][i])]
         if still:
@@ -252,6 +252,8 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     else:
         configuration = np.unique(np.hstack(q), axis=0, return_inverse=True)[1]
     whole = Block(kind, np.stack(q, axis=1), y, covariance, np.arange(N), torque=torque)
+    if not {"marker", "to_marker", "fixture"} & set(table):
+        return Dataset((replace(whole, markers=("",) * kind.points),), label, configuration)
     groups: dict[tuple[str, ...], list[int]] = {}
     for i, key in enumerate(zip(*names, fixture, strict=True)):
         groups.setdefault(key, []).append(i)
@@ -262,10 +264,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     return Dataset(tuple(blocks), label, configuration)
 
 
+def _texts(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
+    """Return the texts of the first of the columns that is there, or N empty ones."""
+    found = next((column for column in columns if column in table), None)
+    return ("",) * N if found is None else texts(table[found], found)
+
+
 def _labels(table: Columns, N: int) -> tuple[str, ...]:
-    label = texts(table["label"], "label") if "label" in table else tuple(str(i + 1) for i in range(N))
+    label = texts(table["label"], "label") if "label" in table else tuple(map(str, range(1, N + 1)))
     seen: set[str] = set()
-    for i, name in enumerate(label):
+    for i, name in enumerate(label if "label" in table else ()):
         if not name or name in seen:
             raise InputError(f"row {i + 1}, column label", f"'{name}'", "a label that no other row has")
         seen.add(name)

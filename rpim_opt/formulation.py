@@ -19,6 +19,7 @@ from rpim_opt.exceptions import Conflict, InputError, NoSolutionFound
 from rpim_opt.parameters import Parameters
 from rpim_opt.problem import LinearModel
 from rpim_opt.robot import Array
+from rpim_opt.threads import one_blas_thread
 
 Function = Callable[[Any], Any]
 ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
@@ -26,8 +27,16 @@ ROTATION_INVARIANT = (cp.sum_squares, cp.norm2)
 
 FEASIBLE = 1e-9
 """By how much a solution may miss its constraints, relative to its largest entry."""
+SNAP = 1e-7
+"""How near to a bound an interior point lies, relative to its size, where the active set begins with that bound."""
 STATIONARY = 1e-7
 """Largest gradient of a box-constrained solution off its bounds, relative to that of the data at nominal."""
+
+
+def rotation_invariant(formulation: Formulation) -> bool:
+    """Return whether the loss sees only the length of the whole residual: the triangle of [A b] then says all."""
+    whole = formulation.loss_over == "equation" and not np.isfinite(formulation.largest)
+    return formulation.loss in ROTATION_INVARIANT and whole
 
 
 def squared_norm(value: Any) -> float:
@@ -135,7 +144,7 @@ class ConvexProgram:
         r = self.model.A @ z - self.model.b
         if self.formulation.loss_over == "configuration":
             r = self.norms(z)
-        return self._posed.loss(r), self._posed.penalty(self._posed.penalized(z))
+        return self._posed.loss(r) + self.model.offset, self._posed.penalty(self._posed.penalized(z))
 
     def norms(self, z: Array) -> Array:
         """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
@@ -147,6 +156,7 @@ class ConvexProgram:
         excess = float(np.max(self.norms(z))) - self.formulation.largest if self._posed.limited else 0.0
         return max(self._posed.violation(z), excess, 0.0)
 
+    @one_blas_thread
     def solve(self, weight: float = 0.0, centre: Array | None = None, radius: float = np.inf) -> Estimate:
         """Return the solution at a weight, from Clarabel.
 
@@ -178,10 +188,13 @@ class ConvexProgram:
                 raise
             z, duals = self._formula(weight), ()  # an interior point may fail where an active set does not
         if polish and box is not None:
-            z, held = self._polished(np.clip(z, *box), weight, *box)
+            near = SNAP * (1 + np.abs(z))  # an interior point stops short of the bounds that hold
+            z = np.where(z - box[0] < near, box[0], np.where(box[1] - z < near, box[1], z))
+            z, held = self._polished(z, weight, *box)
             duals = (held,)
         return Estimate(z, weight, *self.value(z), duals)
 
+    @one_blas_thread
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
         """Return the solutions at many weights.
 
@@ -333,6 +346,9 @@ class _Shape:
 
 def _posed(formulation: Formulation, model: LinearModel) -> _Posed:
     m, n = model.A.shape
+    if model.stands_for is not None and not rotation_invariant(formulation):
+        found = f"formulation '{formulation.name}'"
+        raise InputError(found, "equations of which only the triangle is kept", "a squared loss")
     grouped = formulation.loss_over == "configuration" or np.isfinite(formulation.largest)
     groups = np.unique(model.group, return_inverse=True)[1] if grouped else np.empty(0, dtype=int)
     p = model.parameters
@@ -373,7 +389,7 @@ class _Posed:
             and (formulation.penalty is None or (formulation.penalty is cp.sum_squares and plain))
             and not self.limited
         )
-        self.reduced = formulation.loss in ROTATION_INVARIANT and whole and not self.limited
+        self.reduced = rotation_invariant(formulation)
         over = formulation.penalty_over
         self.differences = [np.asarray(D, dtype=float) for D in over(self.parameters)] if over else None
         z, weight = cp.Variable(n), cp.Parameter(nonneg=True)

@@ -21,6 +21,8 @@ Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
 MISPLACED = 3.0
 """How many scales a frame may be from where it is stated before the statement counts as a mistake."""
+ENOUGH = 2000
+"""Rows of a measurement from which frames are placed, where there are more."""
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
 """What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
 
@@ -152,6 +154,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         When there are no positions and no poses, or they do not determine the base.
     """
     seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
+    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
     if not seen:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
     places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
@@ -174,6 +177,11 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         weight.append(1 / np.broadcast_to(variance, len(flange)))
     q = np.concatenate(weight)
     return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
 
 
 def _transforms(y: Array) -> Array:

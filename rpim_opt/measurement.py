@@ -81,6 +81,15 @@ class Measurement:
         if not self.noise:
             object.__setattr__(self, "noise", {"distance": "length"})
 
+    def __reduce__(self) -> Any:
+        """Ready measurements travel to other processes by name, so that they stay the same there."""
+        known = MEASUREMENTS.get(self.name) is self
+        return (_ready, (self.name,)) if known else super().__reduce__()
+
+
+def _ready(name: str) -> Measurement:
+    return MEASUREMENTS[name]
+
 
 def of_fixture(parameter: str, fixture: str) -> str:
     """Return the name of an own parameter at one of several fixtures: ``anchor_x`` of A is ``anchor_A_x``."""

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
+from rpim_opt.compiled import compiled
 from rpim_opt.dataset import Block, Dataset
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.kinematics import FRAME, call_rows, chain, frame
 from rpim_opt.measurement import Measurement, of_fixture
 from rpim_opt.parameters import Parameters, tool_prefix
+from rpim_opt.phases import phase
 from rpim_opt.robot import Array, Robot
+from rpim_opt.threads import one_blas_thread
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest count as zero: the data do not see those directions."""
+SOME, LARGE = 1000, 20_000
+"""Rows from which on a compiled function is worth loading, and worth compiling."""
+ROWS = 4096
+"""Rows that are evaluated and reduced together: as many as a processor's cache holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +52,30 @@ class LinearModel:
     group: np.ndarray
     parameters: Parameters
     constrained: bool = False
+    stands_for: int | None = None
+    """How many equations A and b were reduced from by a rotation, None where they are the equations themselves."""
+    offset: float = 0.0
+    """What a loss that these equations majorize has besides |A z - b|^2."""
+
+    @property
+    def equations(self) -> int:
+        """Number of equations."""
+        return len(self.b) if self.stands_for is None else self.stands_for
 
     @cached_property
     def svd(self) -> tuple[Array, Array, Array]:
         """U'b (n,), s (n,), V' (n, n) of A = U diag(s) V'; singular values below rounding are zero."""
-        n = self.A.shape[1]
-        R = self.triangle
-        U, s, Vt = np.linalg.svd(R[:n, :n])
+        n, R = self.A.shape[1], self.triangle
+        with phase("reduction"):
+            U, s, Vt = np.linalg.svd(R[:n, :n])
         s = np.where(s > RANK_TOLERANCE * s[0], s, 0.0)
         return U.T @ R[:n, n], s, Vt
 
     @cached_property
     def triangle(self) -> Array:
         """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
-        n = self.A.shape[1]
-        R = np.linalg.qr(np.column_stack([self.A, self.b]), mode="r")
-        return np.vstack([R, np.zeros((n + 1 - len(R), n + 1))])
+        with phase("reduction"):
+            return reduced_rows(np.column_stack([self.A, self.b]))
 
     @property
     def rank(self) -> int:
@@ -124,6 +141,10 @@ class CalibrationProblem:
         """Return the same problem with other parameters identified, (P,) true or false."""
         return CalibrationProblem(self.robot, replace(self.parameters, identified=identified), self.data)
 
+    def for_loss(self, formulation: Any) -> tuple[CalibrationProblem, Any]:
+        """Return the problem and the formulation that `calibrate` solves: these, unless the data come in parts."""
+        return self, formulation
+
     def residual(self, x: Array) -> Array:
         """Return measured minus modelled, (m,) [SI]."""
         return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
@@ -161,17 +182,53 @@ class CalibrationProblem:
 
     def linearize(self, x: Array) -> LinearModel:
         """Return the whitened, scaled linear model around the deviations x (n,) [SI]."""
-        scale = self.parameters.free.scale
-        A, r, group = [], [], []
-        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
-            residual, jacobian = self._evaluate(block, "jacobian", x)
-            r.append((whitening @ residual.transpose(0, 2, 1)).ravel())
-            A.append((whitening @ jacobian).reshape(-1, len(x)) * scale)
-            group.append(np.repeat(self.data.configuration[block.row], residual.shape[2]))
-        stacked = np.concatenate(A)
-        b = np.concatenate(r) + stacked @ (x / scale)
-        constrained = any(not block.measurement.columns for block in self.data.blocks)
-        return LinearModel(stacked, b, np.concatenate(group), self.parameters.free, constrained)
+        parts = [self._equations(i, x, slice(None)) for i in range(len(self.data.blocks))]
+        A, b = (np.concatenate([part[k] for part in parts]) for k in range(2))
+        group = [
+            np.repeat(self.data.configuration[block.row], len(block.measurement.components))
+            for block in self.data.blocks
+        ]
+        return LinearModel(A, b, np.concatenate(group), self.parameters.free, self._constrained)
+
+    @one_blas_thread
+    def reduced(self, x: Array) -> LinearModel:
+        """Return the model of `linearize` as its triangle: n + 1 equations with the same |A z - b| for every z.
+
+        Rows are evaluated, whitened and rotated into the triangle `ROWS` at a time, so that memory does not grow with
+        their number.
+        """
+        R, count = np.zeros((0, len(x) + 1)), 0
+        for i, block in enumerate(self.data.blocks):
+            for start in range(0, len(block.row), ROWS):
+                A, b = self._equations(i, x, slice(start, start + ROWS))
+                count += len(b)
+                with phase("reduction"):
+                    R = reduced_rows(np.column_stack([A, b]), R)
+        return self.from_triangle(R, count)
+
+    def from_triangle(self, R: Array, count: int) -> LinearModel:
+        """Return the model of ``count`` equations whose triangle R (n+1, n+1) is known."""
+        return LinearModel(
+            R[:, :-1], R[:, -1], np.zeros(len(R), dtype=int), self.parameters.free, self._constrained, count
+        )
+
+    @property
+    def _constrained(self) -> bool:
+        return any(not block.measurement.columns for block in self.data.blocks)
+
+    def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
+        """Return whitened, scaled A and b of some rows of a block."""
+        block, whitening, scale = self.data.blocks[i], self._whitening[i], self.parameters.free.scale
+        residual, jacobian = self._evaluate(block, "jacobian", x, part)
+        L = whitening if len(whitening) == 1 else whitening[part]
+        if len(L) == 1 and np.count_nonzero(L - np.diag(np.diagonal(L[0]))) == 0:  # independent, the same for all rows
+            each = np.diagonal(L[0])
+            r, A = (residual[:, 0] * each).ravel(), (jacobian * each[:, None]).reshape(-1, len(x))
+        else:
+            r = (L @ residual.transpose(0, 2, 1)).ravel()
+            A = (L @ jacobian).reshape(-1, len(x))
+        A *= scale
+        return A, r + A @ (x / scale)
 
     @cached_property
     def _whitening(self) -> list[Array]:
@@ -182,26 +239,51 @@ class CalibrationProblem:
         except np.linalg.LinAlgError:
             raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
-    def _evaluate(self, block: Block, what: str, x: Array) -> list[Array]:
+    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
         p = self.parameters
         absent = (p.nominal == 0) & ~p.identified
-        functions = _functions(
+        function = _functions(
             self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
             block.measurement, block.markers, block.fixture, block.torque is not None,
-        )  # fmt: skip
-        return call_rows(functions[what], [x, p.nominal], self._rows[id(block)])
+        )[what]  # fmt: skip
+        if len(block.row) >= SOME:
+            function = compiled(function, make=len(block.row) >= LARGE) or function
+        with phase("evaluation"):
+            return call_rows(function, [x, p.nominal], self._rows(block, part))
+
+    def _rows(self, block: Block, part: slice) -> Array:
+        """Return joint values of the model, torques, and measured values, side by side."""
+        if part == slice(None):
+            if id(block) not in self._kept:
+                self._kept[id(block)] = self._stacked(block, part)
+            return self._kept[id(block)]
+        return self._stacked(block, part)
 
     @cached_property
-    def _rows(self) -> dict[int, Array]:
-        """For every block: joint values of the model, torques, and measured values, side by side."""
-        rows, M = {}, self.robot.joint_map
-        for block in self.data.blocks:
-            N = len(block.row)
-            parts = [(block.q @ M.T).reshape(N, -1)]
-            if block.torque is not None:
-                parts.append((block.torque @ np.linalg.inv(M)).reshape(N, -1))  # virtual work: tau_model = M^-T tau
-            rows[id(block)] = np.hstack([*parts, block.y])
-        return rows
+    def _kept(self) -> dict[int, Array]:
+        return {}
+
+    def _stacked(self, block: Block, part: slice) -> Array:
+        M, y = self.robot.joint_map, block.y[part]
+        parts = [(block.q[part] @ M.T).reshape(len(y), -1)]
+        if block.torque is not None:  # virtual work: tau_model = M^-T tau
+            parts.append((block.torque[part] @ np.linalg.inv(M)).reshape(len(y), -1))
+        return np.hstack([*parts, y])
+
+
+_geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
+
+
+def reduced_rows(rows: Array, R: Array | None = None) -> Array:
+    """Return the upper triangle (n+1, n+1) of R over ``rows`` (m, n+1), by Householder's QR."""
+    n = rows.shape[1]
+    above = 0 if R is None else len(R)
+    stacked = np.empty((max(above + len(rows), n), n), order="F")
+    stacked[:above] = 0 if R is None else R
+    stacked[above : above + len(rows)] = rows
+    stacked[above + len(rows) :] = 0.0
+    factors = _geqrf(stacked, lwork=64 * n, overwrite_a=1)[0]
+    return np.triu(factors[:n])
 
 
 @lru_cache(maxsize=256)

@@ -445,7 +445,7 @@ def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
 def _identifiability(result: Calibration) -> list[Element]:
     found = observe(result.problem)
     n, rank = len(found.names), found.rank
-    text = f"{found.configurations} configurations, {len(result.program.model.b)} equations for {n} parameters, "
+    text = f"{found.configurations} configurations, {result.program.model.equations} equations for {n} parameters, "
     text += f"of which the data determine {rank} combinations at nominal."
     if rank < n:
         text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."

@@ -45,6 +45,14 @@ class Selection:
 Selector = Callable[[ConvexProgram], Selection]
 
 
+def _with_rows(program: ConvexProgram, name: str) -> LinearModel:
+    """Return the model for a rule that leaves rows out, if it has its rows."""
+    if program.model.stands_for is not None:
+        found = f"{program.model.equations} equations of which only the triangle is kept"
+        raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
+    return program.model
+
+
 def weight_grid(program: ConvexProgram, count: int = 200) -> Array:
     """Return weights from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside).
 
@@ -227,7 +235,7 @@ def _restricted_likelihood(model: LinearModel) -> Callable[[Array], Array]:
     U, s, _ = np.linalg.svd(R[:, :-1][:, frames], full_matrices=False)
     U = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
     R = R - U @ (U.T @ R)
-    m, b = len(model.b) - U.shape[1], R[:, -1]
+    m, b = model.equations - U.shape[1], R[:, -1]
     U, s, _ = np.linalg.svd(R[:, :-1][:, ~frames], full_matrices=False)
     seen = s > RANK_TOLERANCE * s.max(initial=tiny)
     beta2, s2 = (U[:, seen].T @ b) ** 2, s[seen] ** 2
@@ -253,7 +261,7 @@ def _gcv_score(gamma: float) -> Callable[[LinearModel], Callable[[Array], Array]
 
         def score(weights: Array) -> Array:
             g = weights[:, None] / (s2 + weights[:, None])
-            left = len(model.b) - gamma * np.sum(1 - g, axis=1)
+            left = model.equations - gamma * np.sum(1 - g, axis=1)
             return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
 
         return score
@@ -275,7 +283,7 @@ def robust_gcv(program: ConvexProgram, gamma: float = 1.4) -> Selection:
     Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233). With
     less than three equations for each direction it guards too much and is refused.
     """
-    m, rank = len(program.model.b), program.model.rank
+    m, rank = program.model.equations, program.model.rank
     if m < 3 * rank:
         found = f"{m} equations for {rank} directions"
         raise InputError("selector robust_gcv", found, "three equations a direction; gcv or reml with fewer")
@@ -309,7 +317,7 @@ def _misfit(model: LinearModel) -> Callable[[Array], Array]:
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
-        left = ROOM**2 * np.maximum(len(model.b) - np.sum(1 - g, axis=1), 1e-9)
+        left = ROOM**2 * np.maximum(model.equations - np.sum(1 - g, axis=1), 1e-9)
         return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
 
     return score
@@ -331,6 +339,7 @@ def ncp(program: ConvexProgram) -> Selection:
     Minimizes the largest distance of the cumulative periodogram of the residual, in the order of the rows, from
     a straight line. Needs rows in an order that means something, such as time or place.
     """
+    _with_rows(program, "ncp")
 
     def of(model: LinearModel) -> Callable[[Array], Array]:
         _, s, Vt = model.svd
@@ -356,6 +365,7 @@ def leave_one_out(program: ConvexProgram) -> Selection:
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks);
     for others by solving, on fewer weights.
     """
+    _with_rows(program, "leave_one_out")
     if not program.closed_form:
         return _held_out(program, "leave_one_out", None)
 
@@ -382,7 +392,7 @@ def leave_one_out(program: ConvexProgram) -> Selection:
 
 def k_fold(program: ConvexProgram, folds: int = 10, seed: int = 0) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole; any formulation."""
-    groups = np.unique(program.model.group)
+    groups = np.unique(_with_rows(program, "k_fold").group)
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
@@ -454,6 +464,7 @@ def two_step(program: ConvexProgram) -> Selection:
     2. Ten weights within the same order of magnitude, 0.184 to 1.653 times that (the paper's 0.563e-14 to
        5.063e-14 around 3.063e-14), compared by held-out error: every configuration is left out once.
     """
+    _with_rows(program, "two_step")
     corner = l_curve(program)
     coarse = np.geomspace(corner.weight, 1e-10 * corner.weight, 30)
     residual = np.sqrt([e.loss for e in program.path(coarse)])

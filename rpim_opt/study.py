@@ -46,7 +46,7 @@ def studies_folder() -> Path:
 
 
 @lru_cache(maxsize=8)
-def load_study(path: Path) -> ModuleType:
+def load_study(path: Path, needed: tuple[str, ...] = ("QUESTION", "METRICS", "cases", "run", "report")) -> ModuleType:
     """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case), report(rows).
 
     If it has prepare(quick), that is called once before the first case.
@@ -57,9 +57,9 @@ def load_study(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
-    missing = [name for name in ("QUESTION", "METRICS", "cases", "run", "report") if not hasattr(module, name)]
+    missing = [name for name in needed if not hasattr(module, name)]
     if missing:
-        raise InputError("the study", f"no '{missing[0]}'", "QUESTION, METRICS, cases, run, report", path)
+        raise InputError("the study", f"no '{missing[0]}'", ", ".join(needed), path)
     return module
 
 

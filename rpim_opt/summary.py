@@ -55,7 +55,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "remarks": [
             *(["Nominal: the drawing's robot, frames fitted."] if fitted.any() else []),
             result.weight_sentence(),
-            f"{len(model.b)} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
+            f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
             *result.remarks(),
         ],
     }

@@ -138,7 +138,13 @@ def _parquet(path: Path) -> Columns:
     for name in table.column_names:
         if table.column_names.count(name) > 1:
             raise InputError("the header", f"column '{name}' twice", "every column once")
-    return {name: table.column(name).to_pylist() for name in table.column_names}
+    return {name: _cells(table.column(name)) for name in table.column_names}
+
+
+def _cells(column: Any) -> Sequence[Any]:
+    """Return a column of numbers without gaps as an array, any other as a list."""
+    numeric = str(column.type) in ("float", "double") or str(column.type).startswith(("int", "uint"))
+    return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
 
 
 def _excel(path: Path) -> Columns:

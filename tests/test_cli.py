@@ -194,7 +194,7 @@ def test_a_solver_failure_writes_nothing(monkeypatch, capsys, folder) -> None:
     nothing = np.zeros(0)
     monkeypatch.setattr("rpim_opt.conic.Conic.solve", lambda *_: ("out of luck", nothing, nothing))
     out = folder / "out"
-    assert run(monkeypatch, "calibrate", str(folder), "--out", str(out)) == 3
+    assert run(monkeypatch, "calibrate", str(folder), "--formulation", "robust", "--out", str(out)) == 3
     assert "out of luck" in capsys.readouterr().err
     assert not out.exists()
 

@@ -8,6 +8,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.test_cli import run
@@ -50,3 +51,24 @@ def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: P
         named = [w.removeprefix("problems/") for w in words]
         with contextlib.redirect_stdout(io.StringIO()):
             assert run(monkeypatch, *named) == 0
+
+
+def test_the_main_table_is_the_studys() -> None:
+    from pyarrow import parquet
+
+    path = Path(__file__).parents[1] / "studies" / "results" / "peers" / "replicates.parquet"
+    rows = parquet.read_table(path).to_pylist()
+    lines = re.findall(r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("##")[0].replace("**", ""), flags=re.MULTILINE)
+    assert len(lines) == 5
+    for name, cells in lines:
+        tool, _, method = name.partition(", ")
+        own = [row for row in rows if (row["tool"], row["method"]) == (tool, method)]
+        stated = [cell.strip() for cell in cells.split("|")]
+        for situation, figure in zip(("clean52", "few10", "blunders52"), stated, strict=False):
+            errors = [row["rms_mm"] for row in own if row["situation"] == situation]
+            assert f"{np.mean(errors):.3f}" == figure, (name, situation)
+        if stated[3]:
+            largest = max(row["largest_mm"] for row in own)
+            assert stated[3] == (f"{largest:.0f} mm" if largest > 10 else f"{largest:.1f} mm"), name
+        clean = [row["seconds"] for row in own if row["situation"] == "clean52"]
+        assert float(stated[4]) == pytest.approx(np.median(clean), rel=0.05), name

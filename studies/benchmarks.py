@@ -1,0 +1,320 @@
+"""Measure the time of calibrations against SciPy and the peers, and time and memory over the number of measurements.
+
+Simulated: the benchmark arm of the study `peers` (52 configurations, 27 parameters), and random configurations of the
+same arm with base and reflector (33 parameters) as Parquet tables of 50,000 rows. Times are medians in a warm process,
+of its own where memory is measured; the machines are shared, so that only ratios within a run count.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rpim_opt as ro
+from rpim_opt.phases import clock
+from rpim_opt.problem import ROWS, CalibrationProblem, reduced_rows
+from rpim_opt.streaming import PartitionedProblem, on_cluster, partitions
+from rpim_opt.study import Metric, Report, find_study, load_study
+from rpim_opt.text import markdown
+
+QUESTION = "How fast is a calibration, and what do a million configurations cost?"
+PART = 50_000
+PEERS = (
+    ("pybotics", "documented"),
+    ("pybotics", "xyz, trf"),
+    ("robotkinecal", "documented"),
+    ("figaroh", "structural"),
+    ("figaroh", "map_cv"),
+)
+METRICS = {
+    "over SciPy": Metric("lower", 1.0),
+    "robotkinecal, documented over ours": Metric("higher", 0.5),
+    "figaroh, structural over ours": Metric("higher", 0.5),
+    "bounded path [ms]": Metric("lower", 4.0),
+    "bootstrap of 1000 [s]": Metric("lower", 4.0),
+    "us per configuration and pass": Metric("lower", 4.0),
+    "peak memory, largest over smallest": Metric("lower", 0.3),
+}
+
+
+def prepare(quick: bool) -> None:
+    """Install the peers, as the study `peers` does."""
+    load_study(find_study("peers")).prepare(quick)
+
+
+def cases(quick: bool) -> list[dict[str, Any]]:
+    """Return the small problem, its bootstrap, the peers, and growing numbers of rows; run by one worker."""
+    counts = (1_000, 10_000, 100_000) if quick else (1_000, 10_000, 100_000, 1_000_000)
+    one: list[dict[str, Any]] = [{"part": "small"}, {"part": "bootstrap", "count": 50 if quick else 1000}]
+    one += [{"part": "peer", "tool": t, "method": m} for t, m in PEERS if not (quick and m == "map_cv")]
+    one += [{"part": "rows", "count": count} for count in counts]
+    return one if quick else [*one, {"part": "cluster", "count": 10_000_000}]
+
+
+def run(part: str, count: int = 0, tool: str = "", method: str = "") -> dict[str, Any]:
+    """Return the times of one part [s], or its memory [MB]."""
+    if part == "peer":
+        found = load_study(find_study("peers")).run(tool, method, "clean52", 0)
+        return {"seconds": found["seconds"]}
+    if part in ("rows", "cluster"):
+        command = [sys.executable, "-P", __file__, part, str(count)]  # -P: selectors.py here is not Python's
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(done.stderr)
+        return json.loads(done.stdout.splitlines()[-1])
+    return _small() if part == "small" else _bootstrap(count)
+
+
+def _arm(bounds: bool) -> tuple[CalibrationProblem, np.ndarray, np.ndarray]:
+    """Return the benchmark's problem, and its tables as SciPy gets them [mm, rad]."""
+    peers = load_study(find_study("peers"))
+    with tempfile.TemporaryDirectory() as folder:
+        peers.write_problem(Path(folder), "clean52", 0)
+        calib = np.loadtxt(Path(folder) / "calib.csv", delimiter=",", skiprows=1)
+    robot = ro.load("paper_arm").problem.robot
+    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = parameters.scaled({"length_mm": 1, "angle_mrad": 1, "tool_mm": 1})
+    parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
+    if bounds:
+        parameters = parameters.toleranced({"length_mm": 0.4, "angle_mrad": 1.0, "tool_mm": 0.5})
+    problem = CalibrationProblem(robot, parameters, ro.Dataset.of(calib[:, 3:], calib[:, :3], 5e-5))
+    return problem, calib[:, 3:], 1e3 * calib[:, :3]
+
+
+def _median(work: Callable[[], Any], runs: int = 31) -> float:
+    work()
+    seconds = []
+    for _ in range(runs):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+def _small() -> dict[str, Any]:
+    """Return medians for 52 configurations, and the time of the phases."""
+    from scipy.optimize import least_squares
+
+    problem, q, p = _arm(bounds=False)
+    positions = load_study(find_study("peers").parent / "peer_scripts" / "run_scipy.py", ("positions",)).positions
+    rows = problem.robot.mdh[:, :4] * [1, 1e3, 1, 1e3]
+    x0 = np.append(rows, 1e3 * np.array([0.03, -0.02, 0.06]))
+    times = {
+        "L-curve": _median(lambda: ro.calibrate(problem, ro.tikhonov, ro.l_curve)),
+        "REML": _median(lambda: ro.calibrate(problem, ro.tikhonov, ro.reml)),
+        "SciPy": _median(lambda: least_squares(lambda x: (positions(x, q) - p).ravel(), x0, method="lm"), 11),
+    }
+    bounded, _, _ = _arm(bounds=True)
+    program = ro.bounded.compile(bounded.linearize(np.zeros(27)))
+    s = program.model.svd[1]
+    weights = np.geomspace(1e-4 * s[s > 0][-1] ** 2, 10 * s[0] ** 2, 200)
+    inside = [float(np.abs(e.z).max()) for e in program.path(weights)]
+    times["bounded path"] = _median(lambda: program.path(weights), 11)
+    times["bounded"] = _median(lambda: ro.calibrate(bounded, ro.bounded, 1.0))
+    times["robust"] = _median(lambda: ro.calibrate(problem, ro.robust, ro.reml), 5)
+    times["Clarabel once"] = _median(lambda: program.solve(1.0))
+    with clock() as running:
+        for _ in range(20):
+            ro.calibrate(bounded, ro.bounded, 1.0)
+    phases = {name: seconds / 20 for name, seconds in running.rows()}
+    return {**times, "held": float(np.mean(np.array(inside) > 0.99)), "phases": phases}
+
+
+def _bootstrap(count: int) -> dict[str, Any]:
+    """Return the seconds of a bounded calibration's bootstrap: rows drawn with replacement."""
+    problem, _, _ = _arm(bounds=True)
+    rng, rows = np.random.default_rng(0), len(problem.data)
+    ro.calibrate(problem, ro.bounded, 1.0)
+    start = time.perf_counter()
+    for _ in range(count):
+        ro.calibrate(problem.on(problem.data.take(rng.integers(rows, size=rows))), ro.bounded, 1.0)
+    return {"seconds": time.perf_counter() - start}
+
+
+def _tables(folder: Path, count: int) -> tuple[PartitionedProblem, np.ndarray]:
+    """Write simulated tables and return their problem with the truth, deviations [SI]."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    robot = ro.load("paper_arm").problem.robot
+    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]", "base_*"])
+    truth = 0.3 * np.random.default_rng(0).normal(size=len(parameters.free)) * parameters.free.scale
+    files = []
+    for start in range(0, count, PART):
+        rng, size = np.random.default_rng([start, count]), min(PART, count - start)
+        q = rng.uniform(-2, 2, (size, 6))
+        empty = CalibrationProblem(robot, parameters, ro.Dataset.of(q, np.zeros((size, 3)), 5e-5))
+        y = empty.modelled(truth)[0] + 5e-5 * rng.normal(size=(size, 3))
+        columns = {f"q{i + 1}_rad": q[:, i] for i in range(6)} | {f"{a}_m": y[:, i] for i, a in enumerate("xyz")}
+        files.append(folder / f"{start}.parquet")
+        parquet.write_table(pa.table(columns), files[-1])
+    readers = partitions(files, robot, {"position_mm": 0.05})
+    return PartitionedProblem(robot, parameters, readers[0](), readers), truth
+
+
+def _rows(count: int) -> dict[str, Any]:
+    """Return seconds, passes, memory and phases of a calibration that reads its rows from Parquet."""
+    with tempfile.TemporaryDirectory() as folder:
+        problem, truth = _tables(Path(folder), count)
+        first = problem.parts[0]()
+        warm = CalibrationProblem(problem.robot, problem.parameters, first)
+        warm.reduced(0 * truth)  # compiles, where that pays
+        ro.calibrate(warm.on(first.take(range(500))), ro.tikhonov, ro.reml)
+        with clock() as running:
+            start = time.perf_counter()
+            result = ro.calibrate(problem, ro.tikhonov, ro.reml)
+            seconds = time.perf_counter() - start
+        phases = dict(running.rows())
+    block = np.random.default_rng(0).normal(size=(3 * ROWS, len(truth) + 1))
+    target = np.empty_like(block)
+    return {
+        "seconds": seconds,
+        "passes": len(result.history) + 1,  # one linearization more than steps
+        "converged": result.converged,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "phases": phases,
+        "qr_us": 1e6 * _median(lambda: reduced_rows(block), 11) / ROWS,
+        "copy_us": 1e6 * _median(lambda: np.copyto(target, block), 11) / ROWS,
+        "worst": float(np.abs((result.x - truth) / problem.parameters.free.scale).max()),
+    }
+
+
+def _cluster(count: int) -> dict[str, Any]:
+    """Return seconds and the workers' memory of a calibration on a Dask cluster of two processes on this machine."""
+    warnings.simplefilter("ignore")
+    off: Any = None  # the annotation says str
+    from dataclasses import replace
+
+    from distributed import Client, LocalCluster
+
+    with tempfile.TemporaryDirectory() as folder:
+        problem, truth = _tables(Path(folder), count)
+        with (
+            LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=off) as cluster,
+            Client(cluster) as client,
+        ):
+            start = time.perf_counter()
+            result = ro.calibrate(replace(problem, compute=on_cluster(client)), ro.tikhonov, ro.reml)
+            seconds = time.perf_counter() - start
+            peak: Any = client.run(lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    return {
+        "seconds": seconds,
+        "passes": len(result.history) + 1,
+        "converged": result.converged,
+        "peak_mb": max(peak.values()),
+        "worst": float(np.abs((result.x - truth) / problem.parameters.free.scale).max()),
+    }
+
+
+def report(rows: list[dict[str, Any]]) -> Report:
+    """Return times and ratios, time and memory over the number of rows, and the phases with their floors."""
+    small = next(row for row in rows if row["part"] == "small")
+    boot = next(row for row in rows if row["part"] == "bootstrap")
+    counted = [row for row in rows if row["part"] == "rows"]
+    ours = small["L-curve"]
+    lines = [
+        ["rpim_opt, L-curve over 200 weights, to convergence", f"{1e3 * ours:.2f}", "1"],
+        ["rpim_opt, REML", f"{1e3 * small['REML']:.2f}", f"{small['REML'] / ours:.2g}"],
+        [
+            "SciPy least_squares(lm), vectorised, no weight",
+            f"{1e3 * small['SciPy']:.2f}",
+            f"{small['SciPy'] / ours:.2g}",
+        ],
+    ]
+    metrics = {"over SciPy": ours / small["SciPy"]}
+    for row in rows:
+        if row["part"] == "peer":
+            name = f"{row['tool']}, {row['method']}"
+            metrics[f"{name} over ours"] = row["seconds"] / ours
+            lines.append([name, f"{1e3 * row['seconds']:.0f}", f"{row['seconds'] / ours:.3g}"])
+    other = [
+        ["bounded path over 200 weights", f"{1e3 * small['bounded path']:.1f} ms"],
+        ["bounded calibration", f"{1e3 * small['bounded']:.2f} ms"],
+        ["robust calibration with REML", f"{1e3 * small['robust']:.0f} ms"],
+        [f"{boot['count']} bootstrap replicates of the bounded calibration, serial", f"{boot['seconds']:.2f} s"],
+    ]
+    metrics["bounded path [ms]"] = 1e3 * small["bounded path"]
+    metrics["bootstrap of 1000 [s]"] = boot["seconds"] / boot["count"] * 1000
+    table = []
+    for row in [*counted, *(r for r in rows if r["part"] == "cluster")]:
+        each = 1e6 * row["seconds"] / row["count"] / row["passes"]
+        where = " (Dask, two workers)" if row["part"] == "cluster" else ""
+        table.append([f"{row['count']:,}{where}", f"{row['seconds']:.2f}", str(row["passes"]), f"{each:.2f}"])
+        table[-1].append(f"{row['peak_mb']:.0f}")
+    last = counted[-1]
+    metrics["us per configuration and pass"] = 1e6 * last["seconds"] / last["count"] / last["passes"]
+    parted = [row["peak_mb"] for row in counted if row["count"] >= 2 * PART]
+    metrics["peak memory, largest over smallest"] = parted[-1] / parted[0]
+    work = last["count"] * last["passes"] / 1e6
+    phases = [
+        [name, f"{1e6 * small['phases'][name]:.0f}", f"{last['phases'][name] / work:.2f}"] for name in last["phases"]
+    ]
+    text = TEXT.format(
+        times=markdown(["52 configurations, 27 parameters", "ms", "over ours"], lines),
+        other=markdown(["also", "time"], other),
+        rows=markdown(["configurations", "seconds", "passes", "us each and pass", "peak memory [MB]"], table),
+        phases=markdown(["phase", "bounded, 52 configurations [us]", f"{last['count']:,} [us each and pass]"], phases),
+        held=100 * small["held"],
+        clarabel=1e3 * small["Clarabel once"],
+        qr=last["qr_us"],
+        reduction=last["phases"]["reduction"] / work,
+        copy=last["copy_us"],
+        evaluation=last["phases"]["evaluation"] / work,
+    )
+    return Report(text, metrics, {"rows": _figure(counted)})
+
+
+TEXT = """\
+{times}
+
+Medians in one warm process; of the peers one run, without imports, in a process of its own.
+
+{other}
+
+On {held:.0f} % of the path some bound holds. One bounded program, Clarabel and active set, takes {clarabel:.2f} ms.
+
+{rows}
+
+Positions, 33 parameters, read from Parquet in tables of 50,000 rows at every pass, Tikhonov with REML to convergence.
+
+{phases}
+
+Floors: LAPACK's QR of the same rows takes {qr:.2f} us a configuration, where the reduction takes {reduction:.2f}; a
+copy of the whitened rows takes {copy:.2f} us, where their evaluation takes {evaluation:.2f}. `other` is the reading of
+the tables and Python.
+"""
+
+
+def _figure(counted: list[dict[str, Any]]) -> Any:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    N = np.array([row["count"] for row in counted])
+    seconds = np.array([row["seconds"] / row["passes"] for row in counted])
+    left.loglog(N, seconds, "o-", color="C3", ms=4, label="one pass")
+    left.loglog(N, seconds[-1] * N / N[-1], color="0.5", ls="--", lw=1, label="linear")
+    left.set_ylabel("seconds a pass")
+    left.legend(frameon=False)
+    right.semilogx(N, [row["peak_mb"] for row in counted], "o-", color="C0", ms=4)
+    right.set_ylim(bottom=0)
+    right.set_ylabel("peak resident memory [MB]")
+    for ax in (left, right):
+        ax.set_xlabel("configurations")
+        ax.grid(alpha=0.3)
+    return figure
+
+
+if __name__ == "__main__":
+    print(json.dumps({"rows": _rows, "cluster": _cluster}[sys.argv[1]](int(sys.argv[2]))))
