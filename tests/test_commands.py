@@ -465,7 +465,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
 
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
     monkeypatch.setattr("rpim_opt.conic.Conic.solve", lambda *_: ("out of luck", np.zeros(0), np.zeros(0)))
-    assert run(monkeypatch, "calibrate", str(made), "--formulation", "bounded", "--json") == 3
+    assert run(monkeypatch, "calibrate", str(made), "--formulation", "robust", "--json") == 3
     said = capsys.readouterr()
     assert said.out == ""
     assert "out of luck" in json.loads(said.err)["error"]
