@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rpim_opt.exchange.chain import Described as Described
     from rpim_opt.exchange.chain import identified as identified
     from rpim_opt.exchange.chain import without_beta as without_beta
+    from rpim_opt.exchange.export import export_urdf as export_urdf
     from rpim_opt.exchange.plain import read_mdh as read_mdh
     from rpim_opt.exchange.plain import write_robodk as write_robodk
     from rpim_opt.exchange.plain import write_robot as write_robot
@@ -99,11 +100,15 @@ if TYPE_CHECKING:
     from rpim_opt.selection import reml as reml
     from rpim_opt.selection import robust_gcv as robust_gcv
     from rpim_opt.selection import two_step as two_step
+    from rpim_opt.starting import new_problem as new_problem
     from rpim_opt.streaming import PartitionedProblem as PartitionedProblem
     from rpim_opt.streaming import on_cluster as on_cluster
     from rpim_opt.streaming import partitions as partitions
     from rpim_opt.uncertainty import Uncertainty as Uncertainty
     from rpim_opt.uncertainty import monte_carlo as monte_carlo
+    from rpim_opt.validation import Validation as Validation
+    from rpim_opt.validation import read_measurements as read_measurements
+    from rpim_opt.validation import validate as validate
 
 __version__ = "0.1.0"
 
@@ -136,6 +141,7 @@ _HOME = {
         "tikhonov",
     ),
     "exchange.chain": ("Described", "identified", "without_beta"),
+    "exchange.export": ("export_urdf",),
     "exchange.plain": ("read_mdh", "write_robodk", "write_robot"),
     "exchange.universal_robots": (
         "read_ur_calibration",
@@ -171,6 +177,8 @@ _HOME = {
         "robust_gcv",
         "two_step",
     ),
+    "starting": ("new_problem",),
+    "validation": ("Validation", "read_measurements", "validate"),
     "design": ("Design", "choose", "random_candidates"),
     "plots": (
         "plot_error_axes",

@@ -3,105 +3,72 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Timer
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from rpim_opt.exceptions import NoSolutionFound, RpimError
+from rpim_opt.exceptions import InputError, NoSolutionFound, RpimError
 
-if TYPE_CHECKING:
-    from rpim_opt.calibration import Calibration
-    from rpim_opt.dataset import Dataset
-    from rpim_opt.instances import Instance
+HELP = """Robot calibration by convex optimization.
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
-    help="Robot calibration by convex optimization.",
-)  # fmt: skip
+From a table of measurements to a corrected robot: new, calibrate, export, report.
 
+Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found.
+"""
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
+USAGE: Any = next(
+    c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
+)  # click's, or typer's own copy
 
-@app.callback()
-def _commands() -> None:
-    """Robot calibration by convex optimization."""
+Problem = Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")]
+Variant = Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")]
+Result = Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")]
+Units = Annotated[str, typer.Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
+Marker = Annotated[str | None, typer.Option(help="Which reflector, where there are several.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="One JSON document on stdout instead of text, errors as JSON on stderr.")
+]
 
 
 @app.command()
-def calibrate(
-    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
-    variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
-    select: Annotated[
-        str | None, typer.Option(help="How to choose the weight: reml, l_curve, gcv, k_fold, ..., or a number.")
+def new(
+    folder: Annotated[Path, typer.Argument(help="The problem folder to make; none that is there already.")],
+    robot: Annotated[str, typer.Option(help="A ready robot (rpim-opt robots), or a file .urdf, .toml, .json, .csv.")],
+    data: Annotated[Path, typer.Option(help="Joint values and measured values: .csv, .parquet or .xlsx.")],
+    units: Units = "",
+    measurement: Annotated[
+        str | None, typer.Option(help="position, pose, cable, distance, plane or sphere; guessed from the columns.")
     ] = None,
-    formulation: Annotated[
-        str | None, typer.Option(help="Instead of the file's: tikhonov, robust, bounded, ...")
+    validation: Annotated[Path | None, typer.Option(help="A table to keep apart for validation.")] = None,
+    hold_out: Annotated[
+        float | None, typer.Option(help="Part of the configurations to keep apart instead, 0.25.")
     ] = None,
-    refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the configurations that are kept apart.")] = 0,
+    urdf_base: Annotated[str | None, typer.Option(help="Link where the robot starts, if not the root.")] = None,
+    urdf_tip: Annotated[str | None, typer.Option(help="Link where it ends, if there are several.")] = None,
+    as_json: Json = False,
 ) -> None:
-    """Calibrate a problem: print the parameters and the errors before and after, write result.json.
+    """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
+    with _progress():
+        from rpim_opt.files import refused
+        from rpim_opt.starting import new_problem
 
-    Exit codes: 0 converged, 1 not converged, 2 unusable input, 3 no solution found.
-    """
-    with _progress() as say:
-        from rpim_opt.calibration import calibrate
-        from rpim_opt.instances import load, parse_formulation, parse_weight
-
-        say("reading the problem")
-        instance = load(problem, variant)
-        weight = instance.weight if select is None else parse_weight(select)
-        say("choosing the weight")
-        result = calibrate(
-            instance.problem, instance.formulation if formulation is None else parse_formulation(formulation), weight,
-            progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
-        )  # fmt: skip
-        result = replace(result, record=instance.record)
-        if refit and result.flagged:
-            say("calibrating without the distrusted rows")
-            print("Refitted without " + ", ".join(flag.label for flag in result.flagged) + ".\n")  # noqa: T201
-            result = result.without_flagged()
-    print(f"{instance.title}\n{instance.source}\n")  # noqa: T201
-    print(describe(instance, result))  # noqa: T201
-    if out is not None:
-        try:
-            result.save(out / "result.json")
-        except OSError as error:
-            raise RpimError(f"{out / 'result.json'}: cannot be written: {error}.") from None
-        print(f"\nWritten: {out / 'result.json'}")  # noqa: T201
-    if not result.converged:
-        raise typer.Exit(1)
+        with refused(folder):
+            made = new_problem(
+                folder, robot, data, measurement=measurement, units=units, validation=validation, hold_out=hold_out,
+                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip,
+            )  # fmt: skip
+    _show(made, {"written": [made.folder], "rows": made.rows, "notes": made.notes}, as_json)
 
 
 @app.command()
-def report(
-    result: Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")],
-    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the result by default.")] = None,
-) -> None:
-    """Write a result as one HTML page that works offline, for whoever has to believe it."""
-    with _progress() as say:
-        from rpim_opt.report import write_report
-        from rpim_opt.results import load_result
-
-        say("reading the result")
-        loaded = load_result(result)
-        say("writing the report")
-        out = out or (result if result.is_dir() else result.parent) / "report.html"
-        try:
-            write_report(loaded, out)
-        except OSError as error:
-            raise RpimError(f"{out}: cannot be written: {error}.") from None
-    print(f"Written: {out}")  # noqa: T201
-
-
-@app.command()
-def inspect(
-    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
-    variant: Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")] = None,
-) -> None:
+def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) -> None:
     """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
     with _progress() as say:
         from rpim_opt.inspection import inspect
@@ -111,8 +78,213 @@ def inspect(
         instance = load(problem, variant)
         say("inspecting")
         found = inspect(instance.problem)
-    print(f"{instance.title}\n{instance.source}\n")  # noqa: T201
-    print(found)  # noqa: T201
+    head = {"title": instance.title, "source": instance.source}
+    _show(f"{instance.title}\n{instance.source}\n\n{found}", {**head, **found.content()}, as_json)
+
+
+@app.command()
+def calibrate(
+    problem: Problem,
+    variant: Variant = None,
+    select: Annotated[
+        str | None, typer.Option(help="How to choose the weight: reml, l_curve, gcv, k_fold, ..., or a number.")
+    ] = None,
+    formulation: Annotated[
+        str | None, typer.Option(help="Instead of the file's: tikhonov, robust, bounded, ...")
+    ] = None,
+    refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
+    profile: Annotated[bool, typer.Option(help="Say where the time went.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a problem: print the parameters and the errors before and after, write result.json.
+
+    Exit code 1 if it did not converge.
+    """
+    with _progress() as say:
+        from rpim_opt.calibration import calibrate
+        from rpim_opt.files import refused
+        from rpim_opt.instances import load, parse_formulation, parse_weight
+        from rpim_opt.phases import clock
+        from rpim_opt.summary import describe, describe_times, summary
+
+        say("reading the problem")
+        instance = load(problem, variant)
+        weight = instance.weight if select is None else parse_weight(select)
+        say("choosing the weight")
+        posed = instance.formulation if formulation is None else parse_formulation(formulation)
+        with clock() as running:
+            result = calibrate(
+                instance.problem, posed, weight,
+                progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
+            )  # fmt: skip
+            times = dict(running.rows())
+        result, without = replace(result, record=instance.record), []
+        if refit and result.flagged:
+            say("calibrating without the distrusted rows")
+            without = [flag.label for flag in result.flagged]
+            result = result.without_flagged()
+        found = summary(result, instance.published)
+    text = describe(result, found)
+    if without:
+        text = f"Refitted without {', '.join(without)}.\n\n{text}"
+    if profile:
+        text, found = f"{text}\n\n{describe_times(times)}", {**found, "seconds": times}
+    if out is not None:
+        with refused(out / "result.json"):
+            result.save(out / "result.json")
+        text += f"\n\nWritten: {out / 'result.json'}"
+    _show(text, {**found, "refitted_without": without, "written": [out / "result.json"] if out else []}, as_json)
+    if not result.converged:
+        raise typer.Exit(1)
+
+
+@app.command()
+def report(
+    result: Result,
+    out: Annotated[Path | None, typer.Option(help="HTML file; report.html beside the result by default.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a result as one HTML page that works offline, for whoever has to believe it."""
+    with _progress() as say:
+        from rpim_opt.files import refused
+        from rpim_opt.report import write_report
+        from rpim_opt.results import load_result
+
+        say("reading the result")
+        loaded = load_result(result)
+        say("writing the report")
+        out = out or (result if result.is_dir() else result.parent) / "report.html"
+        with refused(out):
+            write_report(loaded, out)
+    _show(f"Written: {out}", {"written": [out]}, as_json)
+
+
+@app.command()
+def validate(
+    result: Result,
+    data: Annotated[Path, typer.Argument(help="New measurements, in the same instrument's frame.")],
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    limit: Annotated[float | None, typer.Option(help="Largest error that is allowed [mm]; exit code 1 above.")] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the errors, row by row.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named."""
+    with _progress() as say:
+        from rpim_opt.results import load_result
+        from rpim_opt.validation import read_measurements, validate
+
+        _require_positive("--limit", limit)
+        say("reading the result")
+        loaded = load_result(result)
+        rows, left_out = read_measurements(loaded, data, measurement, units)
+        found = validate(loaded, rows)
+    text = str(found) + _left(left_out)
+    document = {**found.content(), "left_out": left_out, "limit_mm": limit, "written": _written(out, found.csv())}
+    failed = limit is not None and 1e3 * found.largest > limit
+    if limit is not None:
+        text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
+    _show(text + _named(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def export(
+    result: Result,
+    urdf: Annotated[Path | None, typer.Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
+    ur_kinematics: Annotated[
+        Path | None, typer.Option(help="kinematics.yaml of ROS for a Universal Robot; corrected to --out.")
+    ] = None,
+    ur_calibration: Annotated[
+        Path | None, typer.Option(help="calibration.conf of a Universal Robot; corrected to --out.")
+    ] = None,
+    mdh: Annotated[Path | None, typer.Option(help="MDH table to write: .csv, .json or .toml.")] = None,
+    robodk: Annotated[Path | None, typer.Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write; of several sources the folder for them.")] = None,
+    urdf_base: Annotated[str | None, typer.Option(help="Link where the robot starts, if not the root.")] = None,
+    urdf_tip: Annotated[str | None, typer.Option(help="Link where it ends, if there are several.")] = None,
+    base: Annotated[
+        bool | None,
+        typer.Option(help="Make the URDF's root the instrument's frame; by default if the identified base is near."),
+    ] = None,
+    tool: Annotated[bool | None, typer.Option(help="Make its tip the reflector; by default if it is near.")] = None,
+    marker: Marker = None,
+    as_json: Json = False,
+) -> None:
+    """Write the identified robot for other tools: all files that are asked for, or none."""
+    with _progress() as say:
+        from rpim_opt.exchange.export import export_ur_calibration, export_urdf, found_by, write_all
+        from rpim_opt.exchange.plain import write_robodk, write_robot
+        from rpim_opt.exchange.universal_robots import write_ur_kinematics
+        from rpim_opt.results import load_result
+
+        say("reading the result")
+        loaded = load_result(result)
+        robot = found_by(loaded, marker)[0].robot
+        options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
+        corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
+            (urdf, lambda target: export_urdf(loaded, urdf or "", target, **options)),
+            (ur_kinematics, lambda target: write_ur_kinematics(ur_kinematics or "", robot, target)),
+            (ur_calibration, lambda target: export_ur_calibration(loaded, ur_calibration or "", target)),
+        ]
+        targets = _targets([source for source, _ in corrected if source], out)
+        plain = ((mdh, partial(write_robot, robot)), (robodk, partial(write_robodk, robot)))
+        writers = [(targets[source], write) for source, write in corrected if source]
+        writers += [(target, write) for target, write in plain if target]
+        if not writers:
+            accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, one or several"
+            raise InputError("export", "nothing to write", accepted)
+        notes = write_all(writers)
+    written = [target for target, _ in writers]
+    text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
+    _show(text, {"written": written, "notes": notes}, as_json)
+
+
+@app.command()
+def compensate(
+    result: Result,
+    targets: Annotated[Path, typer.Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
+    units: Units = "",
+    position_only: Annotated[bool, typer.Option(help="Let orientations go.")] = False,
+    tool: Annotated[
+        str | None, typer.Option(help="Tool instead of the reflector: x,y,z [mm], roll,pitch,yaw [deg].")
+    ] = None,
+    marker: Marker = None,
+    base: Annotated[bool, typer.Option(help="Correct for the base, too.")] = False,
+    largest: Annotated[float, typer.Option(help="Largest correction of a joint [rad or m].")] = 0.2,
+    limit: Annotated[float | None, typer.Option(help="Error that may be left [mm]; exit code 1 above.")] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the corrected commands.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Correct joint commands so that the real robot goes where the nominal one would."""
+    with _progress() as say:
+        from rpim_opt.compensation import compensate, read_targets
+        from rpim_opt.measurement import pose
+        from rpim_opt.naming import parse_units, rename
+        from rpim_opt.results import load_result
+        from rpim_opt.tables import read_columns
+
+        _require_positive("--limit", limit)
+        say("reading the result")
+        loaded = load_result(result)
+        robot = loaded.problem.robot
+        try:
+            named = rename(read_columns(targets), robot, pose, parse_units(units))
+            read = read_targets(named.columns, robot)
+        except InputError as error:
+            raise error.within(targets) from None
+        say("compensating")
+        found = compensate(
+            loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
+            tool=_tool(tool), marker=marker or "", base=base, largest=largest,
+        )  # fmt: skip
+    document = {**found.content(), "left_out": named.left_out, "limit_mm": limit}
+    document["written"] = _written(out, found.csv())
+    _show(str(found) + _left(named.left_out) + (_named(out) or "\n" + found.csv().rstrip("\n")), document, as_json)
+    if limit is not None and 1e3 * found.position_error.max() > limit:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -120,48 +292,44 @@ def simulate(
     problem: Annotated[str, typer.Argument(help="A problem folder with a [simulation] table.")],
     seed: Annotated[int | None, typer.Option(help="Instead of the file's.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the tables; the problem's own by default.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
+    from rpim_opt.files import refused
     from rpim_opt.simulation import write_simulation
 
-    try:
-        for path in write_simulation(problem, seed, out):
-            print(f"Written: {path}")  # noqa: T201
-    except OSError as error:
-        raise RpimError(f"{out or problem}: cannot be written: {error}.") from None
+    with refused(out or problem):
+        written = write_simulation(problem, seed, out)
+    _show("\n".join(f"Written: {path}" for path in written), {"written": written}, as_json)
 
 
 @app.command()
 def design(
-    problem: Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")],
+    problem: Problem,
     count: Annotated[int, typer.Option(help="How many configurations to choose.")] = 30,
     criterion: Annotated[str, typer.Option(help="V (predicted positions), D, A or E.")] = "V",
     candidates: Annotated[int, typer.Option(help="How many random candidates within the joint limits.")] = 1000,
     table: Annotated[Path | None, typer.Option(help="A table of candidates instead: q1_deg, ...")] = None,
     seed: Annotated[int, typer.Option(help="Of the random candidates.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Choose the configurations to measure next, from candidates, by optimal design."""
     with _progress() as say:
-        from rpim_opt.design import choose, joint_table, random_candidates, read_candidates
-        from rpim_opt.files import write_text
+        from rpim_opt.design import choose, joint_cells, random_candidates, read_candidates
         from rpim_opt.instances import load
+        from rpim_opt.tables import csv_text
 
         say("reading the problem")
         instance = load(problem)
         robot = instance.problem.robot
         q = random_candidates(robot, candidates, seed) if table is None else read_candidates(table, robot)
         found = choose(instance.problem, q, count, criterion, progress=say)
-    text = joint_table(robot, q[found.chosen], found.chosen)
-    print(found)  # noqa: T201
-    if out is None:
-        print(text, end="")  # noqa: T201
-        return
-    try:
-        write_text(out, text)
-    except OSError as error:
-        raise RpimError(f"{out}: cannot be written: {error}.") from None
-    print(f"Written: {out}")  # noqa: T201
+    columns = joint_cells(robot, q[found.chosen], found.chosen)
+    text = csv_text(columns, zip(*columns.values(), strict=True))
+    document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap,
+                "configurations": columns, "written": _written(out, text)}  # fmt: skip
+    _show(str(found) + (_named(out) or "\n" + text.rstrip("\n")), document, as_json)
 
 
 @app.command()
@@ -174,10 +342,11 @@ def study(
     redraw: Annotated[bool, typer.Option(help="Only write the report anew, from the last run's replicates.")] = False,
     gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than studies/baselines.json allows.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Run a study: replicates in parallel, with the time that is left; the results say what made them.
 
-    Exit codes: 0 done, 1 a metric got worse, 2 unusable input.
+    With --gate exit code 1 if a metric got worse.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -185,23 +354,21 @@ def study(
     from rpim_opt.study import regressions, run_study
 
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=as_json) as bar:
         task = bar.add_task(name)
         report, folder = run_study(
             name, quick, workers, scheduler, resume, redraw, out,
             progress=lambda done, every: bar.update(task, completed=done, total=every),
         )  # fmt: skip
-    print(report.text)  # noqa: T201
-    print(f"\nWritten: {folder}")  # noqa: T201
     worse = regressions(name, quick, report.metrics) if gate else []
-    for line in worse:
-        print(f"Worse: {line}", file=sys.stderr)  # noqa: T201
+    text = f"{report.text}\n\nWritten: {folder}"
+    _show(text, {"report": report.text, "metrics": report.metrics, "worse": worse, "written": [folder]}, as_json)
     if worse:
-        raise typer.Exit(1)
+        _fail("\n".join(f"Worse: {line}" for line in worse), 1)
 
 
 @app.command()
-def robots() -> None:
+def robots(as_json: Json = False) -> None:
     """List the ready robots that a problem file may name."""
     from rpim_opt.instances import find_robot
     from rpim_opt.instances import robots as names
@@ -209,71 +376,84 @@ def robots() -> None:
     from rpim_opt.text import table
 
     ready = {name: read_robot(find_robot(name)) for name in names()}
-    print(table(["robot", "name", "joints"], [[k, r.name, str(r.dof)] for k, r in ready.items()]))  # noqa: T201
+    rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
+    text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
+    _show(text, {"robots": rows}, as_json)
 
 
-def describe(instance: Instance, result: Calibration) -> str:
-    """Return the tables that a metrologist reads: parameters, errors, the weight and where it came from."""
-    import numpy as np
-
-    from rpim_opt.record import statistics
-    from rpim_opt.text import table
-
-    errors = []
-    for name, data in _data(instance).items():
-        published = instance.published.get(name, {})
-        for kind, rows in _kinds(data).items():
-            which = f"{name}, {kind}" if len(_kinds(instance.problem.data)) > 1 else name
-            for method, each in (("nominal", result.nominal_errors(data)), ("identified", result.errors(data))):
-                stats = statistics(each[rows])
-                figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
-                errors.append([f"{which}, {method}", str(stats["count"]), *figures])
-        if name == "identification" and result.flagged:
-            distrusted = {flag.label for flag in result.flagged}
-            stats = statistics(result.errors(data)[[label not in distrusted for label in data.label]])
-            figures = [f"{stats[key]:.4f}" for key in ("mean_mm", "rms_mm", "max_mm")]
-            errors.append(["identification, trusted rows", str(stats["count"]), *figures])
-        errors += [[f"  printed: {method}", "", f"{mean:.3f}", "", ""] for method, mean in published.items()]
-    fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
-    angles = [
-        [
-            name,
-            str(int(np.isfinite(each).sum())),
-            *(f"{1e3 * f(each[np.isfinite(each)]):.4f}" for f in (np.mean, _rms, np.max)),
-        ]
-        for name, data in _data(instance).items()
-        if np.isfinite(each := result.errors(data, "angle")).any()
-    ]
-    model = result.program.model
-    lines = [
-        result.parameter_table(),
-        "",
-        table(["error [mm]", "rows", "mean", "RMS", "max"], errors),
-        *([table(["orientation error [mrad]", "rows", "mean", "RMS", "max"], angles)] if angles else []),
-        *(["Nominal: the drawing's robot, frames fitted."] if fitted.any() else []),
-        "",
-        result.weight_sentence(),
-        f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see.",
-        *result.remarks(),
-    ]
-    return "\n".join(lines)
+# --- what they share ---------------------------------------------------------------------------------------
 
 
-def _data(instance: Instance) -> dict[str, Dataset]:
-    sets = {"identification": instance.problem.data}
-    return {**sets, "validation": instance.validation} if instance.validation else sets
+def _show(text: object, document: dict[str, Any], as_json: bool) -> None:
+    """Print one or the other."""
+    if as_json:
+        from rpim_opt.files import json_text
+
+        text = json_text(document).rstrip("\n")
+    print(text)  # noqa: T201
 
 
-def _kinds(data: Dataset) -> dict[str, list[int]]:
-    """Return the rows of every kind of measurement."""
-    kinds: dict[str, list[int]] = {}
-    for block in data.blocks:
-        kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
-    return kinds
+def _fail(text: str, code: int) -> None:
+    """Say on stderr what is wrong, as JSON where that was asked for, and end."""
+    if "--json" in sys.argv:
+        from rpim_opt.files import json_text
+
+        text = json_text({"error": text}).rstrip("\n")
+    print(text, file=sys.stderr)  # noqa: T201
+    sys.exit(code)
 
 
-def _rms(values: Any) -> float:
-    return float((values**2).mean() ** 0.5)
+def _written(path: Path | None, text: str) -> list[Path]:
+    """Write a text where a path is given."""
+    from rpim_opt.files import refused, write_text
+
+    if path is None:
+        return []
+    with refused(path):
+        write_text(path, text)
+    return [path]
+
+
+def _named(path: Path | None) -> str:
+    return f"\nWritten: {path}" if path else ""
+
+
+def _left(columns: Sequence[str]) -> str:
+    return f"\nColumns that were left out: {', '.join(columns)}." if columns else ""
+
+
+def _require_positive(where: str, value: float | None) -> None:
+    if value is not None and not value > 0:
+        raise InputError(where, f"{value:g}", "a number greater than zero [mm]")
+
+
+def _targets(sources: list[Path], out: Path | None) -> dict[Path, Path]:
+    """Return where every corrected file goes: ``--out``, or a file of the same name in that folder."""
+    if not sources:
+        return {}
+    if out is None:
+        raise InputError("--out", "nothing", f"where to write the corrected {sources[0].name}")
+    folder = len(sources) > 1 or out.is_dir()
+    targets = {source: out / source.name if folder else out for source in sources}
+    for source, target in targets.items():
+        if target.resolve() == source.resolve():
+            raise InputError("--out", f"the original, {source}", "another place: the original stays")
+    return targets
+
+
+def _tool(text: str | None) -> list[float] | None:
+    """Return a tool [m, rad] from six numbers in mm and degrees."""
+    from math import radians
+
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 6:
+        raise InputError("--tool", f"'{text}'", "six numbers: x,y,z [mm], roll,pitch,yaw [deg]")
+    return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]
 
 
 @contextmanager
@@ -297,10 +477,13 @@ def _progress() -> Iterator[Callable[[str], None]]:
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
     try:
-        app()
+        sys.exit(app(standalone_mode=False))
+    except USAGE as error:
+        if "--json" not in sys.argv:
+            error.show()
+            sys.exit(error.exit_code)
+        _fail(error.format_message(), error.exit_code)
     except NoSolutionFound as error:
-        print(error, file=sys.stderr)  # noqa: T201
-        sys.exit(3)
+        _fail(str(error), 3)
     except RpimError as error:
-        print(error, file=sys.stderr)  # noqa: T201
-        sys.exit(2)
+        _fail(str(error), 2)

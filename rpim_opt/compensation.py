@@ -18,13 +18,14 @@ from rpim_opt.exceptions import InputError, choices
 from rpim_opt.files import write_text
 from rpim_opt.kinematics import FRAME, call_rows, frame, motion, numeric_frame, transforms
 from rpim_opt.measurement import Measurement, pose, position
-from rpim_opt.parameters import tool_prefix
+from rpim_opt.parameters import reflectors, tool_prefix
 from rpim_opt.problem import CalibrationProblem
+from rpim_opt.record import statistics
 from rpim_opt.robot import Array, Robot
 from rpim_opt.tables import csv_text, read_columns
 from rpim_opt.text import listed, table
 from rpim_opt.threads import one_blas_thread
-from rpim_opt.uncertainty import Uncertainty
+from rpim_opt.uncertainty import known_covariance
 from rpim_opt.units import display, joint_columns, split_unit
 
 REACHED = 1e-7
@@ -81,6 +82,8 @@ class Compensation:
     >>> found = ro.compensate(result, np.radians([[10, -80, 60, 20, 30, 0]]), label=["P1"])
     >>> np.degrees(found.q - found.nominal).round(2), found.status
     (array([[ 0.08,  0.86, -2.02,  1.21, -0.09, -0.04]]), ('ok',))
+    >>> sorted(found.content())
+    ['corrected', 'largest_corrections', 'nominal', 'rows']
     >>> print(found.csv().splitlines()[0])
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
     """
@@ -122,6 +125,26 @@ class Compensation:
             named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in found])
             lines += [f"{status.capitalize()}: {named}."] if found else []
         return "\n".join(lines)
+
+    def content(self) -> dict[str, Any]:
+        """Return the errors [mm, mrad], and a row for every target as in `csv`."""
+        before = statistics(self.position_before), statistics(self.orientation_before, "mrad")
+        after = statistics(self.position_error), statistics(self.orientation_error, "mrad")
+        units = [display(dimension) for dimension in self.robot.joint_dimensions]
+        columns = {f"q{i}_{unit}": self.q[:, i - 1] / si for i, (unit, si) in enumerate(units, start=1)}
+        largest = {f"q{i}_{unit}": np.abs(self.q - self.nominal)[:, i - 1].max() / si
+                   for i, (unit, si) in enumerate(units, start=1)}  # fmt: skip
+        columns |= {
+            "position_error_mm": 1e3 * self.position_error,
+            "orientation_error_mrad": 1e3 * self.orientation_error, "std_mm": 1e3 * self.std,
+        }  # fmt: skip
+        rows = zip(self.label, *(v.tolist() for v in columns.values()), self.status, strict=True)
+        return {
+            "nominal": {"position": before[0], "orientation": before[1]},
+            "corrected": {"position": after[0], "orientation": after[1]},
+            "largest_corrections": largest,
+            "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
+        }
 
     def csv(self) -> str:
         """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
@@ -416,12 +439,12 @@ class _Cell(NamedTuple):
     def of(cls, result: Calibration, kind: Measurement, tool: Any, marker: str, base: bool, torques: bool) -> _Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
         robot, p = result.problem.robot, result.problem.parameters
-        known = [name[5:-1].rstrip("_") for name in p.names if name.startswith("tool_") and name.endswith("_x")]
+        known = reflectors(p.names)
         if tool is None and marker not in known:
             raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
         marker = marker if tool is None else known[0]  # whose place the tool takes
         prefix = tool_prefix(marker)
-        x, covariance = np.zeros(len(p)), _covariance(result)
+        x, covariance = np.zeros(len(p)), known_covariance(result)
         x[p.identified] = result.x
         if tool is not None:
             own = np.asarray(tool, dtype=float)
@@ -522,13 +545,6 @@ class _Cell(NamedTuple):
     def _reached(self, error: Array, W: Array) -> np.ndarray:
         place, turn = self._norms(_times(W, error))
         return (place <= REACHED) & ~(turn > REACHED)
-
-
-def _covariance(result: Calibration) -> Array | None:
-    try:
-        return Uncertainty(result).total
-    except InputError:  # a penalty or loss that has none
-        return None
 
 
 def _units(robot: Robot, equations: int) -> Array:

@@ -352,12 +352,16 @@ def _labels(table: Columns, N: int) -> tuple[str, ...]:
     return label
 
 
-def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, ...]) -> dict[tuple[str, str], Array]:
-    """Return the numeric columns [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
+def text_columns(kind: Measurement) -> list[str]:
+    """Return the columns of names that a table may have."""
+    return ["label", "configuration", "marker", "fixture", *(["to_marker"] if kind.points == 2 else [])]
+
+
+def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
+    """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
     torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
-    required = {**joints, **kind.columns}
-    known: dict[str, list[str]] = {stem: [dimension] for stem, dimension in {**required, **torques}.items()}
+    known: dict[str, list[str]] = {stem: [d] for stem, d in {**joints, **kind.columns, **torques}.items()}
     for form, _ in kind.forms:
         known.update({stem: [dimension] for stem, dimension in form.items()})
     if kind.points == 2:
@@ -369,7 +373,13 @@ def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, 
     for i, (a, da) in enumerate(kind.components.items()):
         for b, db in list(kind.components.items())[i:]:
             known[f"cov_{a}_{b}"] = [f"{da}2" if da == db else f"{da} {db}"]
-    plain = ["label", "configuration", "marker", "fixture", *(["to_marker"] if kind.points == 2 else [])]
+    return known
+
+
+def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, ...]) -> dict[tuple[str, str], Array]:
+    """Return the numeric columns [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
+    joints, torques = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau"))
+    known, plain = number_columns(robot, kind), text_columns(kind)
     columns: dict[tuple[str, str], Array] = {}
     for name, cells in table.items():
         if name in plain:
@@ -392,7 +402,7 @@ def _numeric(table: Columns, robot: Robot, kind: Measurement, label: tuple[str, 
             row = label[int(np.argmin(values > 0))]
             found = f"{values.min() / (unit.si if unit else 1.0):g}"
             raise InputError(f"row {row}, column {name}", found, "an uncertainty greater than zero")
-    groups = [list(torques)]
+    groups = [torques]
     if kind.points == 2:
         groups += [[f"to_{s}" for s in group] for group in (joints, torques)]
     optional = [group for group in groups if any((stem, "") in columns for stem in group)]

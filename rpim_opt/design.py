@@ -12,7 +12,7 @@ from rpim_opt.dataset import Dataset
 from rpim_opt.exceptions import InputError, choices
 from rpim_opt.problem import RANK_TOLERANCE, CalibrationProblem
 from rpim_opt.robot import Array, Robot
-from rpim_opt.tables import csv_text, numbers, read_columns
+from rpim_opt.tables import numbers, read_columns
 from rpim_opt.units import UNITS, joint_columns, with_unit
 
 CRITERIA = ("D", "A", "E", "V")
@@ -109,11 +109,11 @@ def read_candidates(source: Any, robot: Robot) -> Array:
     return np.column_stack(q)
 
 
-def joint_table(robot: Robot, q: Array, index: np.ndarray) -> str:
-    """Return joint values as CSV text, labelled by the number of the candidate."""
-    columns = joint_columns(robot.joint_dimensions)
-    rows = zip(index, q / list(columns.values()), strict=True)
-    return csv_text(["label", *columns], ([f"n{k}", *(f"{v:.4f}" for v in row)] for k, row in rows))
+def joint_cells(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str]]:
+    """Return joint values as the columns of a table, labelled by the number of the candidate."""
+    units = joint_columns(robot.joint_dimensions)
+    cells = {name: [f"{v / si:.4f}" for v in column] for (name, si), column in zip(units.items(), q.T, strict=True)}
+    return {"label": [f"n{k}" for k in index], **cells}
 
 
 def choose(

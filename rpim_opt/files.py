@@ -7,12 +7,15 @@ import os
 import re
 import tempfile
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import to_jsonable_python
 
-from rpim_opt.exceptions import InputError, choices
+from rpim_opt.exceptions import InputError, RpimError, choices
 from rpim_opt.units import UNITS, number, quantities
 
 Length = Annotated[float, "length"]
@@ -126,13 +129,22 @@ def _where(loc: tuple[int | str, ...]) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that ``path`` holds either the whole new content or what it held before.
+    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    write_text(path, _json(content))
 
-    A row of numbers stands on one line; a text cannot be taken for one, since JSON escapes its line breaks.
+
+def json_text(content: Any) -> str:
+    """Return any content as JSON: arrays as lists, paths as texts, what is not finite as null."""
+    return _json(to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: value.tolist()))
+
+
+def _json(content: Any) -> str:
+    """Return JSON; a row of numbers stands on one line.
+
+    A text cannot be taken for such a row, since JSON escapes its line breaks.
     """
     text = json.dumps(content, indent=2, allow_nan=False)
-    text = re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text)
-    write_text(path, text + "\n")
+    return re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text) + "\n"
 
 
 def read_json(path: Path) -> Any:
@@ -153,6 +165,15 @@ def read_json(path: Path) -> Any:
 def write_text(path: Path, text: str) -> None:
     """Write text so that ``path`` holds either the whole new text or what it held before."""
     write_bytes(path, text.encode("utf-8"))
+
+
+@contextmanager
+def refused(path: object) -> Iterator[None]:
+    """Turn what the system refuses while ``path`` is written into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RpimError(f"{path}: cannot be written: {error}.") from None
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from rpim_opt.kinematics import FRAME
 from rpim_opt.observability import Observability, combination, near_parallel, observe
 from rpim_opt.parameters import tool_prefix
 from rpim_opt.problem import CalibrationProblem
+from rpim_opt.record import statistics
 from rpim_opt.robot import Array
 from rpim_opt.text import listed, table
 from rpim_opt.units import display
@@ -55,6 +57,8 @@ class Inspection:
     >>> found = ro.inspect(ro.load("paper_arm", variant="misprints").problem)
     >>> found.standing_out, found.observability.rank, len(found.warnings)
     (('T8-6', 'T8-7'), 20, 0)
+    >>> [row["label"] for row in found.content()["standing_out"]]
+    ['T8-6', 'T8-7']
     >>> lines = str(found).splitlines()
     >>> print(lines[0])
      joint   unit      from        to     span   limits   of them
@@ -78,25 +82,65 @@ class Inspection:
         parts += ["\n".join(f"Proposal: {text}" for text in self.proposals)]
         return "\n\n".join(part for part in parts if part)
 
-    def _joints(self) -> str:
+    def content(self) -> dict[str, Any]:
+        """Return the same as a document; joints and measured values in the unit that they name."""
+        o, mm = self.observability, (1e3 * self.residual).tolist()
+        error = dict(zip(self.problem.data.label, mm, strict=True))
+        return {
+            "joints": self._joint_rows(),
+            "measured": self._measured_rows(),
+            "rows": len(mm),
+            "configurations": len(np.unique(self.problem.data.configuration)),
+            "nominal": statistics(self.residual),
+            "standing_out": [{"label": label, "error_mm": error[label]} for label in self.standing_out],
+            "repeated": self.repeated,
+            "repeatability_mm": None if self.repeatability is None else 1e3 * self.repeatability,
+            "observability": {
+                "parameters": o.names, "rank": o.rank, "weak": int(np.count_nonzero(o.singular_values[: o.rank] < 1)),
+                "condition": o.condition, "raw_condition": o.raw_condition, **o.indices, "unseen": o.unseen,
+                "redundant": o.redundant,
+            },
+            "warnings": self.warnings,
+            "proposals": self.proposals,
+        }  # fmt: skip
+
+    def _joint_rows(self) -> list[dict[str, Any]]:
         robot, rows = self.problem.robot, []
         for i, (q, dimension) in enumerate(zip(_all_q(self.problem.data).T, robot.joint_dimensions, strict=True)):
             unit, si = display(dimension)
-            low, high = robot.limits[i] / si
-            limits = f"{low:.0f} to {high:.0f}" if np.isfinite(robot.limits[i]).all() else "-"
-            share = f"{100 * np.ptp(q) / np.ptp(robot.limits[i]):.0f} %" if limits != "-" else "-"
-            figures = [f"{q.min() / si:.2f}", f"{q.max() / si:.2f}", f"{np.ptp(q) / si:.2f}", limits, share]
-            rows.append([f"q{i + 1}", unit, *figures])
+            limited = np.isfinite(robot.limits[i]).all()
+            limits = (robot.limits[i] / si).tolist() if limited else None
+            share = float(np.ptp(q) / np.ptp(robot.limits[i])) if limited else None
+            rows.append({"joint": f"q{i + 1}", "unit": unit, "from": q.min() / si, "to": q.max() / si,
+                         "limits": limits, "share": share})  # fmt: skip
+        return rows
+
+    def _joints(self) -> str:
+        rows = []
+        for r in self._joint_rows():
+            limits = f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}" if r["limits"] else "-"
+            share = f"{100 * r['share']:.0f} %" if r["limits"] else "-"
+            figures = [f"{r['from']:.2f}", f"{r['to']:.2f}", f"{r['to'] - r['from']:.2f}", limits, share]
+            rows.append([r["joint"], r["unit"], *figures])
         return table(["joint", "unit", "from", "to", "span", "limits", "of them"], rows)
 
-    def _measured(self) -> str:
+    def _measured_rows(self) -> list[dict[str, Any]]:
         rows = []
         for (name, reflector), values in _by_kind(self.problem.data).items():
             for column, (dimension, cells, sigma) in values.items():
                 unit, si = display(dimension) if dimension else ("", 1.0)
-                spread = "-" if sigma is None else f"{1e3 * sigma:.3g} {'mm' if dimension == 'length' else 'mrad'}"
-                figures = [f"{cells.min() / si:.3f}", f"{cells.max() / si:.3f}"] if len(cells) else ["-", "-"]
-                rows.append([f"{name}{f' of {reflector}' if reflector else ''}: {column}", unit, *figures, spread])
+                low, high = (cells.min() / si, cells.max() / si) if len(cells) else (None, None)
+                spread = {"sigma_mm" if dimension == "length" else "sigma_mrad": None if sigma is None else 1e3 * sigma}
+                what = f"{name}{f' of {reflector}' if reflector else ''}: {column}"
+                rows.append({"measured": what, "unit": unit, "from": low, "to": high, **spread})
+        return rows
+
+    def _measured(self) -> str:
+        rows = []
+        for r in self._measured_rows():
+            figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
+            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad") if r.get(f"sigma_{u}") is not None]
+            rows.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
         return table(["measured", "unit", "from", "to", "typical sigma"], rows)
 
     def _rows(self) -> str:

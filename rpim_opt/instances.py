@@ -36,6 +36,7 @@ from rpim_opt.units import quantities, split_unit
 
 HERE = Path(__file__).resolve().parent
 ROLES = ("identification", "validation")
+ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +284,7 @@ class Stated:
         """Return the parameters with the file's scales and tolerances, and those identified that it names."""
         table = self.table
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
-        patterns = _proposed(self.robot, parameters, data) if table.identify == "auto" else table.identify
+        patterns = proposed(self.robot, parameters, data) if table.identify == "auto" else table.identify
         return parameters.identify(patterns)
 
 
@@ -312,7 +313,10 @@ def read_problem(name: str | Path, variant: str | None = None, measurements: Seq
     parse_weight(table.selector, path)
     several = bool(table.tool) and not any(split_unit(key)[0] in FRAME for key in table.tool)
     tools = {m: _frame(t, f"tool.{m}", path) for m, t in table.tool.items()} if several else {}
-    arm = _arm(table, path)
+    file = find_robot(table.robot, path.parent)
+    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip):
+        raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    arm = read_arm(file, table.urdf_base, table.urdf_tip)
     return Stated(
         path=path,
         table=table,
@@ -323,16 +327,6 @@ def read_problem(name: str | Path, variant: str | None = None, measurements: Seq
         tools=tools or {"": _frame(table.tool, "tool", path) if table.tool else tuple(arm.tool)},
         base=None if table.base == "auto" else _frame(table.base, "base", path) if table.base else tuple(arm.base),
     )
-
-
-def _arm(table: _ProblemTable, path: Path) -> Described:
-    """Return the problem's robot, with its base and tool where its file states them."""
-    file = find_robot(table.robot, path.parent)
-    if file.suffix == ".urdf":
-        return read_urdf(file, table.urdf_base, table.urdf_tip)
-    if table.urdf_base or table.urdf_tip:
-        raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
-    return Described(read_mdh(file), np.zeros(6), np.zeros(6))
 
 
 def _split(content: dict[str, Any], fixtures: set[str], path: Path) -> tuple[_ProblemTable, dict[str, Any]]:
@@ -378,7 +372,7 @@ def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]
     return own
 
 
-def _proposed(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
+def proposed(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
     """Return what ``identify = "auto"`` means: geometry, Hayati's beta where it is needed, and what places things."""
     kinds = {block.measurement.name for block in data.blocks}
     absolute = kinds & {"position", "pose"}
@@ -402,12 +396,19 @@ def robots() -> list[str]:
 
 def find_robot(name: str, folder: Path | None = None) -> Path:
     """Return the file of a robot: one in ``folder``, or a ready robot by name."""
-    if folder is not None and name.endswith((".toml", ".urdf", ".csv", ".json")):
+    if folder is not None and name.endswith(ROBOT_FILES):
         return folder / name
     if name in robots():
         return HERE / "robots" / f"{name}.toml"
     accepted = "a file .toml, .urdf, .csv or .json, or a ready robot: " + choices(name, robots())
     raise InputError("key robot", f"'{name}'", accepted, folder / "problem.toml" if folder else None)
+
+
+def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
+    """Return the robot of a file, with base and tool where a URDF states them."""
+    if file.suffix == ".urdf":
+        return read_urdf(file, urdf_base, urdf_tip)
+    return Described(read_mdh(file), np.zeros(6), np.zeros(6))
 
 
 def parse_formulation(text: str) -> Formulation:

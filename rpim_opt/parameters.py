@@ -226,6 +226,11 @@ def tool_prefix(marker: str) -> str:
     return f"tool_{marker}_" if marker else "tool_"
 
 
+def reflectors(names: Iterable[str]) -> list[str]:
+    """Return the markers whose reflectors are among the parameters; ``""`` for the only one."""
+    return [name[5:-2] for name in names if name.startswith("tool_") and name.endswith("_x")]
+
+
 def model_parameters(
     robot: Robot,
     base: Sequence[float] | Array = (0.0,) * 6,

@@ -263,13 +263,13 @@ def content(result: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def statistics(errors: Array) -> dict[str, Any]:
-    """Return mean, RMS, largest [mm] and number of errors [m]; None for the errors of measurements without a length."""
-    mm = 1e3 * errors[np.isfinite(errors)]
-    if not len(mm):
-        return {"mean_mm": None, "rms_mm": None, "max_mm": None, "count": 0}
-    rms = float((mm**2).mean() ** 0.5)
-    return {"mean_mm": float(mm.mean()), "rms_mm": rms, "max_mm": float(mm.max()), "count": len(mm)}
+def statistics(errors: Array, unit: Literal["mm", "mrad"] = "mm") -> dict[str, Any]:
+    """Return mean, RMS, largest [mm or mrad] and number of errors [m or rad]; None where none is a number."""
+    of = 1e3 * errors[np.isfinite(errors)]
+    if not len(of):
+        return {f"mean_{unit}": None, f"rms_{unit}": None, f"max_{unit}": None, "count": 0}
+    rms = float((of**2).mean() ** 0.5)
+    return {f"mean_{unit}": float(of.mean()), f"rms_{unit}": rms, f"max_{unit}": float(of.max()), "count": len(of)}
 
 
 def _rows(result: Any, data: Dataset) -> list[dict[str, Any]]:

@@ -201,6 +201,14 @@ class Uncertainty:
         return "\n".join(lines + (["* held by a bound, of which the interval does not know."] if self.at_bound else []))
 
 
+def known_covariance(result: Calibration) -> Array | None:
+    """Return the covariance (n, n) [SI] of the deviations; None for a penalty or loss that has none."""
+    try:
+        return Uncertainty(result).total
+    except InputError:
+        return None
+
+
 def monte_carlo(result: Calibration, draws: int = 200, seed: int = 0) -> Array:
     """Return deviations (draws, n) [SI] identified from data drawn anew around the fit, noise at the observed level.
 

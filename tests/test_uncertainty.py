@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.design import choose, joint_table, random_candidates, read_candidates
+from rpim_opt.design import choose, joint_cells, random_candidates, read_candidates
+from rpim_opt.tables import csv_text
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -122,7 +123,8 @@ def test_design_from_the_command_line(monkeypatch, capsys, tmp_path) -> None:
     q = read_candidates(out, robot)
     assert q.shape == (40, 6)
     again = tmp_path / "again.csv"
-    again.write_text(joint_table(robot, q, np.arange(40)))
+    cells = joint_cells(robot, q, np.arange(40))
+    again.write_text(csv_text(cells, zip(*cells.values(), strict=True)))
     assert run(monkeypatch, "design", "position", "--count", "35", "--table", str(again), "--criterion", "D") == 0
     assert run(monkeypatch, "design", "position", "--criterion", "Q") == 2
     assert "criterion: found 'Q', accepted: D, A, E, V" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rpim_opt.calibration import Calibration
 from rpim_opt.exceptions import InputError
-from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, forward_kinematics, frame_numbers, link
+from rpim_opt.kinematics import FRAME, JOINT_EXTRAS, forward_kinematics, frame_numbers, link, numeric_frame
 from rpim_opt.parameters import tool_prefix
 from rpim_opt.robot import MDH, Array, Robot
 
@@ -20,6 +20,8 @@ NEAR_PARALLEL = 0.1
 """Axes nearer to parallel than this [rad] get Hayati's beta, as `observability.near_parallel` proposes."""
 ANOTHER_ARM = 0.1
 """A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
+SAME_PLACE = (0.01, 0.1)
+"""Two frames nearer than this [m], [rad] are one and the same, known twice."""
 LARGEST = 2**24
 """Bytes that a description may have: a hundred times what the largest public ones need."""
 
@@ -111,6 +113,19 @@ def identified(result: Calibration, marker: str = "") -> Described:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     base, tool = (np.array([of[start + c] for c in FRAME]) for start in ("base_", prefix))
     return Described(result.robot, base, tool)
+
+
+def same_place(one: Array, other: Array) -> bool:
+    """Return whether two frames (6,) are within `SAME_PLACE`."""
+    T = np.linalg.inv(numeric_frame(one)) @ numeric_frame(other)
+    angle = Rotation.from_matrix(T[:3, :3]).magnitude()
+    return bool(np.linalg.norm(T[:3, 3]) < SAME_PLACE[0] and angle < SAME_PLACE[1])
+
+
+def placed(place: Array) -> str:
+    """Say a frame (6,)."""
+    values = [*(1e3 * place[:3]), *np.degrees(place[3:])]
+    return " ".join(f"{name} {value + 0.0:.3f}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg"
 
 
 def describe(

@@ -167,21 +167,21 @@ def _content(robot: Robot) -> dict[str, Any]:
         joint: dict[str, Any] = {}
         for column, value in zip(MDH, row, strict=True):
             if value:
-                unit, (number,) = _exact(MDH_DIMENSION[column], [value])
+                unit, (number,) = exact(MDH_DIMENSION[column], [value])
                 joint[f"{column}_{unit}"] = number
         if kind != "revolute":
             joint["type"] = kind
         if plain and sign < 0:
             joint["sign"] = -1
         if np.isfinite(limits).any():
-            unit, pair = _exact("angle" if kind == "revolute" else "length", limits)
+            unit, pair = exact("angle" if kind == "revolute" else "length", limits)
             joint[f"limits_{unit}"] = pair
         joints.append(joint)
     head = {"name": robot.name, "source": robot.source} if robot.source else {"name": robot.name}
     return head | ({} if plain else {"coupling": robot.joint_map.tolist()}) | {"joint": joints}
 
 
-def _exact(dimension: str, values: Any) -> tuple[str, list[float]]:
+def exact(dimension: str, values: Any) -> tuple[str, list[float]]:
     """Return values in the unit that is shown, or in SI where that would not read back the same."""
     if not np.isfinite(values).all():
         raise InputError("limits of the robot", f"{[float(v) for v in values]}", "finite numbers, or no limits")
@@ -199,12 +199,12 @@ def _write_json(robot: Robot, path: Path) -> None:
 def _write_toml(robot: Robot, path: Path) -> None:
     content = _content(robot)
     joints = content.pop("joint")
-    blocks = [[f"{key} = {_toml(value)}" for key, value in content.items()]]
-    blocks += [["[[joint]]", *(f"{key} = {_toml(value)}" for key, value in joint.items())] for joint in joints]
+    blocks = [[f"{key} = {toml(value)}" for key, value in content.items()]]
+    blocks += [["[[joint]]", *(f"{key} = {toml(value)}" for key, value in joint.items())] for joint in joints]
     write_text(path, "\n\n".join("\n".join(block) for block in blocks) + "\n")
 
 
-def _toml(value: Any) -> str:
+def toml(value: Any) -> str:
     """Return a text, number or list of lists as TOML, which writes them as JSON does."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 

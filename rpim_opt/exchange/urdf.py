@@ -289,7 +289,7 @@ def write_urdf(
     if np.abs(tail - chain.tail).max() > 1e-13:
         if every[-1].kind:
             what = f"a tool or beta{len(joints)} that moves the tip '{every[-1].child}'"
-            accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it"
+            accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it, or no tool"
             raise InputError("robot", what, accepted, urdf.path)
         rest = np.linalg.inv(before @ np.linalg.inv(every[-1].origin))
         edits |= every[-1].origin_edits(urdf.data, rest @ tail)

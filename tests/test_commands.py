@@ -1,0 +1,540 @@
+"""From a table and a URDF to a corrected robot: the commands in order, what they write, and what they refuse."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.exchange.chain import link_of
+from rpim_opt.files import read_toml
+from rpim_opt.kinematics import frame_numbers
+from rpim_opt.measurement import pose, position
+from rpim_opt.naming import parse_units, rename
+from rpim_opt.robot import MDH
+from rpim_opt.validation import validate
+from tests.simulate import ARM, simulated
+from tests.test_cli import run
+from tests.test_exchange import CONF, YAML_PLAIN
+
+SHARED = Path(__file__).parents[2] / "shared"
+BENCH, REAL = SHARED / "bench", SHARED / "data"
+HEADER = ["x1", "y1", "z1", *(f"joint_{i}" for i in range(1, 7))]
+
+
+def urdf_text(mdh: np.ndarray, tool: np.ndarray, fixed: bool = True) -> str:
+    """Return a URDF whose joints turn about z, named J1, ..., and whose tip is fixed to the last link."""
+    parts = ['<robot name="arm"><link name="base_link"/>']
+
+    def joint(kind: str, name: str, parent: str, child: str, T: np.ndarray) -> None:
+        six = [repr(float(v)) for v in frame_numbers(T)]
+        origin = f'<origin xyz="{" ".join(six[:3])}" rpy="{" ".join(six[3:])}"/>'
+        ends = f'<parent link="{parent}"/><child link="{child}"/>'
+        limit = '<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/>'
+        parts.append(f'<link name="{child}"/><joint name="{name}" type="{kind}">{ends}{origin}{limit}</joint>')
+
+    for i, row in enumerate(mdh, start=1):
+        joint("revolute", f"J{i}", f"link_{i - 1}" if i > 1 else "base_link", f"link_{i}", link_of(*row[:4]))
+    if fixed:
+        joint("fixed", "mount", f"link_{len(mdh)}", "smr", tool)
+    return "\n".join([*parts, "</robot>"])
+
+
+def urdf_points(path: Path, q: np.ndarray) -> np.ndarray:
+    """Return the positions of the tip (N, 3), from the file alone: no code of the package."""
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    moving = 0
+    for joint in ElementTree.parse(path).getroot().iter("joint"):
+        origin = joint.find("origin")
+        assert origin is not None
+        step = np.eye(4)
+        step[:3, 3] = [float(v) for v in origin.attrib["xyz"].split()]
+        step[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.attrib["rpy"].split()]).as_matrix()
+        T = T @ step
+        if joint.attrib["type"] == "revolute":
+            turn = np.tile(np.eye(4), (len(q), 1, 1))
+            turn[:, :3, :3] = Rotation.from_rotvec(np.outer(q[:, moving], [0, 0, 1])).as_matrix()
+            T, moving = T @ turn, moving + 1
+    return T[:, :3, 3]
+
+
+def write_csv(path: Path, header: list[str], rows: np.ndarray) -> None:
+    lines = [",".join(header), *(",".join(repr(float(v)) for v in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+TOOL = link_of(a=0.03, theta=0.4, d=0.06)
+
+
+def write_cell(folder: Path) -> Path:
+    """Write what a person has: a URDF and tables without units, 40 configurations and 100 without noise [m, rad]."""
+    rng = np.random.default_rng(5)
+    (folder / "arm.urdf").write_text(urdf_text(ARM.mdh, TOOL))
+    mdh = ARM.mdh + np.array([1e-3, 3e-4, 1e-3, 3e-4, 0.0]) * rng.normal(size=ARM.mdh.shape)
+    (folder / "true.urdf").write_text(urdf_text(mdh, TOOL @ link_of(a=3e-4, d=-4e-4)))
+    for name, count, noise in (("measured.csv", 40, 3e-5), ("later.csv", 100, 0.0)):
+        q = rng.uniform(-2, 2, (count, 6))
+        p = urdf_points(folder / "true.urdf", q)
+        write_csv(folder / name, HEADER, np.hstack([p + noise * rng.normal(size=p.shape), q]))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_cell(tmp_path_factory.mktemp("cell"))
+
+
+@pytest.fixture(scope="module")
+def made(cell: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with its result, by the commands themselves."""
+    folder = tmp_path_factory.mktemp("made") / "arm"
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, "new", str(folder), "--robot", str(cell / "arm.urdf"), "--data", str(cell / "measured.csv"),
+                   "--units", "rad,m", "--hold-out", "0.2") == 0  # fmt: skip
+        assert run(patch, "calibrate", str(folder), "--out", str(folder / "results")) == 0
+    return folder
+
+
+def table(path: Path) -> tuple[list[str], np.ndarray]:
+    with path.open(newline="") as stream:
+        header, *rows = csv.reader(stream)
+    return header, np.array(rows, dtype=float)
+
+
+def rms_mm(difference: np.ndarray) -> float:
+    return 1e3 * float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
+
+
+# --- in order ----------------------------------------------------------------------------------------------
+
+
+def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cell, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, "new", "arm", "--robot", str(cell / "arm.urdf"), "--data", str(cell / "measured.csv"),
+               "--validation", str(cell / "later.csv"), "--units", "m,rad") == 0  # fmt: skip
+    said = capsys.readouterr().out
+    assert "joint_1 is q1_rad" in said
+    assert "Guessed: the data put the base" in said
+    assert run(monkeypatch, "inspect", "arm") == 0
+    assert "Warning" not in capsys.readouterr().out
+    assert run(monkeypatch, "calibrate", "arm", "--out", "arm/results") == 0
+    assert run(monkeypatch, "export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out", "corrected.urdf") == 0
+    assert run(monkeypatch, "report", "arm/results") == 0
+    assert {p.name for p in (tmp_path / "arm" / "results").iterdir()} == {"result.json", "report.html"}
+    result = ro.load_result("arm/results")
+    later = table(cell / "later.csv")[1]
+    stated = rms_mm(later[:, :3] - result.forward(later[:, 3:])[:, :3, 3])
+    left = rms_mm(later[:, :3] - urdf_points(tmp_path / "corrected.urdf", later[:, 3:]))
+    assert left == pytest.approx(stated, abs=1e-9)
+    assert left < 0.03  # as the noise of the data; the drawing is off by more than a millimetre
+    assert rms_mm(later[:, :3] - urdf_points(cell / "arm.urdf", later[:, 3:])) > 1.0
+
+
+@pytest.mark.skipif(not BENCH.is_dir(), reason="the peers' benchmark ../shared/bench is not here")
+def test_four_commands_on_the_peers_benchmark(monkeypatch, tmp_path) -> None:
+    data, robot = BENCH / "clean52", str(BENCH / "robot.urdf")
+    assert run(monkeypatch, "new", str(tmp_path / "arm"), "--robot", robot, "--data", str(data / "calib.csv"),
+               "--validation", str(data / "valid.csv"), "--units", "rad,m") == 0  # fmt: skip
+    results = tmp_path / "arm" / "results"
+    assert run(monkeypatch, "calibrate", str(tmp_path / "arm"), "--out", str(results)) == 0
+    assert run(monkeypatch, "export", str(results), "--urdf", robot, "--out", str(tmp_path / "new.urdf")) == 0
+    assert run(monkeypatch, "report", str(results)) == 0
+    own = json.loads((results / "result.json").read_text())["validation"]["rms_mm"]
+    rows = table(data / "valid.csv")[1]
+    left = rms_mm(rows[:, :3] - urdf_points(tmp_path / "new.urdf", rows[:, 3:]))
+    assert left == pytest.approx(own, abs=1e-9)
+    assert left < 0.0297  # the best of the peers
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real measurements of ../shared/data are not here")
+@pytest.mark.parametrize(
+    ("name", "robot", "limit"),
+    [("ur5_jacobi", "ur5", 0.113), ("irb120_wu", "", 0.223), ("rokae_lmpytorch", "", 0.099), ("wam_jacobi", "", 2.34)],
+)
+def test_real_measurements(monkeypatch, tmp_path, name: str, robot: str, limit: float) -> None:
+    """The guesses do as well as the problem files that were written by hand (RMS in ../shared/data/README.md)."""
+    source, folder = REAL / name, tmp_path / "arm"
+    assert run(monkeypatch, "new", str(folder), "--robot", robot or str(source / "robot.toml"), "--data",
+               str(source / "identification.csv"), "--validation", str(source / "validation.csv")) == 0  # fmt: skip
+    assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "results")) == 0
+    assert json.loads((folder / "results" / "result.json").read_text())["validation"]["rms_mm"] < limit
+    assert run(monkeypatch, "export", str(folder / "results"), "--mdh", str(tmp_path / "arm.csv")) == 0
+    assert ro.read_mdh(tmp_path / "arm.csv").dof == ro.load_result(folder / "results").robot.dof
+    assert run(monkeypatch, "report", str(folder / "results")) == 0
+
+
+# --- new ---------------------------------------------------------------------------------------------------
+
+
+def test_held_out_rows_are_whole_configurations_drawn_by_the_seed(monkeypatch, cell, tmp_path) -> None:
+    header, rows = table(cell / "measured.csv")
+    twice = np.repeat(rows, 2, axis=0)
+    twice[1::2, :3] += 1e-6
+    write_csv(tmp_path / "twice.csv", header, twice)
+    split = []
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        robot, data = str(cell / "arm.urdf"), str(tmp_path / "twice.csv")
+        assert run(monkeypatch, "new", str(tmp_path / name), "--robot", robot, "--data", data, "--units", "rad,m",
+                   "--hold-out", "0.25", "--seed", seed) == 0  # fmt: skip
+        sets = [table(tmp_path / name / f"{role}.csv")[1] for role in ("identification", "validation")]
+        labels = [set(part[:, 0].astype(int)) for part in sets]
+        assert labels[0] | labels[1] == set(range(1, 81))
+        assert len(labels[1]) == 20
+        assert not labels[0] & labels[1]
+        assert {(k + 1) // 2 for k in labels[0]}.isdisjoint({(k + 1) // 2 for k in labels[1]})
+        split.append(labels[1])
+    assert split[0] == split[1] != split[2]
+
+
+def test_every_guess_is_what_auto_means(cell, made) -> None:
+    stated, text = ro.load(made), (made / "problem.toml").read_text()
+    auto = made.parent / "auto"
+    auto.mkdir()
+    for path in made.glob("*.*"):
+        (auto / path.name).write_text(path.read_text())
+    line = next(line for line in text.splitlines() if line.startswith("identify"))
+    (auto / "problem.toml").write_text(text.replace(line, 'identify = "auto"'))
+    assert set(stated.problem.parameters.free.names) == set(ro.load(auto).problem.parameters.free.names)
+    content = read_toml(made / "problem.toml")
+    assert content["base"]["x_mm"] == 0.0
+    assert content["tool"]["x_mm"] == pytest.approx(1e3 * TOOL[0, 3])
+    drawn = ro.read_urdf(cell / "arm.urdf")
+    assert np.array_equal(stated.problem.robot.mdh, drawn.robot.mdh)
+
+
+def test_an_instrument_elsewhere_is_found(monkeypatch, cell, tmp_path) -> None:
+    """The base comes from the data, is not the robot's, and does not go into its URDF."""
+    header, rows = table(cell / "measured.csv")
+    turn = Rotation.from_euler("xyz", [0.1, -0.2, 2.0])
+    rows[:, :3] = turn.apply(rows[:, :3]) + np.array([2.0, -1.0, 0.5])
+    write_csv(tmp_path / "far.csv", header, rows)
+    assert run(monkeypatch, "new", str(tmp_path / "arm"), "--robot", str(cell / "arm.urdf"), "--data",
+               str(tmp_path / "far.csv"), "--units", "rad,m") == 0  # fmt: skip
+    assert read_toml(tmp_path / "arm" / "problem.toml")["base"] == "auto"
+    assert run(monkeypatch, "calibrate", str(tmp_path / "arm"), "--out", str(tmp_path)) == 0
+    source, target = ["--urdf", str(cell / "arm.urdf")], tmp_path / "by_rule.urdf"
+    assert run(monkeypatch, "export", str(tmp_path), *source, "--out", str(target)) == 0
+    by_rule = target.read_text()
+    for option, there in (("--no-base", False), ("--base", True)):
+        target = tmp_path / f"{option}.urdf"
+        assert run(monkeypatch, "export", str(tmp_path), *source, "--out", str(target), option) == 0
+        near = rms_mm(rows[:, :3] - urdf_points(target, rows[:, 3:])) < 0.1
+        assert near == there
+    assert by_rule == (tmp_path / "--no-base.urdf").read_text()
+
+
+def test_names_that_people_use() -> None:
+    names = {
+        "J1 [deg]": "q1_deg", "axis_2(rad)": "q2_rad", "joint03": "q3_rad", "Theta_4": "q4_rad", "q5": "q5_rad",
+        "A6 degrees": "q6_deg", "X": "x_mm", "measured_y": "y_mm", "pos_z (m)": "z_m", "quat_w": "qw", "Name": "label",
+        "reflector": "marker", "sigma_mm": "sigma_mm", "effort_1": "tau1_Nm",
+    }  # fmt: skip
+    source = {name: ["1"] for name in (*names, "temperature", "timestamp")}
+    found = rename(source, ARM, pose, parse_units("rad,mm,Nm"))
+    assert list(found.columns) == list(names.values())
+    assert found.left_out == ("temperature", "timestamp")
+    assert found.was["q1_deg"] == "J1 [deg]"
+    assert "sigma_mm" not in found.was
+
+
+def test_joints_may_count_from_zero_or_have_the_files_names() -> None:
+    zero = rename({f"q{i}": ["1"] for i in range(6)}, ARM, position, parse_units("deg"))
+    assert list(zero.columns) == [f"q{i}_deg" for i in range(1, 7)]
+    assert zero.was["q1_deg"] == "q0"
+    joints = ["pan", "lift", "elbow", "w1", "w2", "w3"]
+    named = rename({name: ["1"] for name in reversed(joints)}, ARM, position, parse_units("rad"), joints)
+    assert list(named.columns) == [f"q{i}_rad" for i in range(6, 0, -1)]
+
+
+# --- validate, export, compensate --------------------------------------------------------------------------
+
+
+def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp_path) -> None:
+    arguments = ["validate", str(made / "results"), str(cell / "later.csv"), "--units", "rad,m"]
+    assert run(monkeypatch, *arguments, "--limit", "0.1", "--out", str(tmp_path / "rows.csv")) == 0
+    said = capsys.readouterr().out
+    assert "No row is beyond" in said
+    result, rows = ro.load_result(made / "results"), table(cell / "later.csv")[1]
+    error = np.linalg.norm(rows[:, :3] - result.forward(rows[:, 3:])[:, :3, 3], axis=1)
+    for figure in (error.mean(), np.sqrt(np.mean(error**2)), error.max()):
+        assert f"{1e3 * figure:.4f}" in said
+    with (tmp_path / "rows.csv").open() as stream:
+        written = list(csv.DictReader(stream))
+    assert [float(row["error_mm"]) for row in written] == pytest.approx(1e3 * error, abs=1e-6)
+    assert run(monkeypatch, *arguments, "--limit", "0.01") == 1
+
+
+def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, cell, made, tmp_path) -> None:
+    header, rows = table(cell / "later.csv")
+    rows[7, 1] += 5e-4
+    write_csv(tmp_path / "later.csv", [*header, "temperature"], np.hstack([rows, rows[:, :1]]))
+    arguments = ["validate", str(made / "results"), str(tmp_path / "later.csv"), "--units", "rad,m"]
+    assert run(monkeypatch, *arguments, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["beyond"] == ["8"]
+    assert run(monkeypatch, *arguments) == 0
+    said = capsys.readouterr().out
+    assert "allows: 8 (" in said
+    assert "left out: temperature." in said
+
+
+def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:
+    """Of 40 sets of 50 new rows each with the declared noise, hardly one has a row beyond its bound."""
+    problem, truth = simulated(("theta?", "d?", "a?", "tool_[xyz]", "base_*"), noise=5e-5, seed=1)
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    rng, named = np.random.default_rng(2), 0
+    for _ in range(40):
+        q = rng.uniform(-2, 2, (50, 6))
+        there = problem.on(ro.Dataset.of(q, np.zeros((50, 3)), 5e-5))
+        y = -there.residual(truth).reshape(-1, 3) + 5e-5 * rng.normal(size=(50, 3))
+        named += bool(validate(result, ro.Dataset.of(q, y, 5e-5)).beyond)
+    assert named <= 3  # 40 sets at 1 %: more than three has a probability of 1e-3
+
+
+def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path) -> None:
+    outs = ["--mdh", str(tmp_path / "arm.json"), "--robodk", str(tmp_path / "dk.csv"), "--out", str(tmp_path / "o")]
+    assert run(monkeypatch, "export", str(made / "results"), "--urdf", str(cell / "arm.urdf"), *outs, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["written"] == [str(tmp_path / "o"), str(tmp_path / "arm.json"), str(tmp_path / "dk.csv")]
+    assert np.array_equal(ro.read_mdh(tmp_path / "arm.json").mdh, ro.load_result(made / "results").robot.mdh)
+    (tmp_path / "ros.yaml").write_text(YAML_PLAIN)
+    outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
+    sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
+    assert run(monkeypatch, "export", str(made / "results"), *sources, *outs) == 2  # of another robot
+    assert "a robot whose parameters were identified from this file's" in capsys.readouterr().err
+    assert not (tmp_path / "again.json").exists()
+    assert not (tmp_path / "both").exists()
+
+
+def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
+    (tmp_path / "calibration.conf").write_text(CONF)
+    nominal = ro.read_robot(Path(ro.__file__).parent / "robots" / "ur10.toml")
+    problem, _ = simulated(robot=nominal, identify=("alpha?", "a?", "theta?", "d?", "beta[23]"), size=0.3)
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    result.save(tmp_path / "result.json")
+    assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
+               "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
+    assert "alpha1 and a1" in capsys.readouterr().out
+    read, q = ro.read_ur_calibration(tmp_path / "new.conf", nominal), np.random.default_rng(0).uniform(-2, 2, (9, 6))
+    mdh = result.robot.mdh.copy()
+    mdh[0, :2] = nominal.mdh[0, :2]  # where the base is, not how the robot is
+    there = ro.forward_kinematics(replace(nominal, mdh=mdh), q)
+    found = ro.forward_kinematics(read.robot, q)
+    bridge = np.linalg.inv(there) @ found  # one constant tool, read as such
+    assert np.abs(bridge - bridge[0]).max() < 1e-9
+
+
+def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, made, tmp_path) -> None:
+    write_csv(tmp_path / "go.csv", [f"q{i}_deg" for i in range(1, 7)], np.degrees(table(cell / "later.csv")[1][:9, 3:]))
+    out, arguments = tmp_path / "commands.csv", ["compensate", str(made / "results"), str(tmp_path / "go.csv")]
+    assert run(monkeypatch, *arguments, "--out", str(out), "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["corrected"]["position"]["max_mm"] < 1e-4
+    assert document["nominal"]["position"]["mean_mm"] > 0.5
+    with out.open() as stream:
+        assert [row["status"] for row in csv.DictReader(stream)] == ["ok"] * 9
+    assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "0.01") == 1
+
+
+FORMULATIONS = {
+    "squared": ro.tikhonov,
+    "robust": ro.robust,
+    "lasso": ro.lasso,
+    "a script's": ro.Formulation("own", loss=lambda r: cp.sum(cp.huber(r, 1.5)), penalty=cp.sum_squares),
+}
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+def test_uncertainty_of_compensation_survives_the_file(tmp_path, name: str) -> None:
+    problem, _ = simulated(("theta?", "d?", "tool_[xyz]"), configurations=25, noise=5e-5)
+    live = ro.calibrate(problem, FORMULATIONS[name], 0.5)
+    live.save(tmp_path / "result.json")
+    q = np.random.default_rng(1).uniform(-2, 2, (5, 6))
+    std = [ro.compensate(result, q).std for result in (live, ro.load_result(tmp_path))]
+    assert np.array_equal(np.isfinite(std[0]), np.isfinite(std[1]))
+    assert np.isfinite(std[0]).all() == (name != "lasso")
+    finite = np.isfinite(std[0])
+    assert std[1][finite] == pytest.approx(std[0][finite], rel=1e-9)
+
+
+# --- what is refused ---------------------------------------------------------------------------------------
+
+NEW = ["new", "made", "--robot", "arm.urdf", "--data", "measured.csv", "--units", "rad,m"]
+RESULT = ["results"]
+BAD = {
+    "no units": (NEW[:6], ["measured.csv", "columns without a unit (x1, y1", "--units", "mm,deg"]),
+    "half the units": ([*NEW[:6], "--units", "m"], ["columns without a unit (joint_1", "such as deg"]),
+    "unknown unit": ([*NEW[:7], "grad,m"], ["--units", "'grad'", "mrad"]),
+    "two units": ([*NEW[:7], "m,mm"], ["--units", "m and mm"]),
+    "no such robot": ([*NEW[:3], "ur55", *NEW[4:]], ["'ur55'", "ur5"]),
+    "no such robot file": ([*NEW[:3], "arm.toml", *NEW[4:]], ["arm.toml", "no such file"]),
+    "no such data": ([*NEW[:5], "measurd.csv", *NEW[6:]], ["measurd.csv", "mean measured.csv"]),
+    "no such measurement": ([*NEW, "--measurement", "posn"], ["'posn'", "position"]),
+    "missing measurement": ([*NEW, "--measurement", "cable"], ["measured.csv", "no column for 'distance'"]),
+    "folder is there": (["new", "results", *NEW[2:]], ["results", "nothing is overwritten"]),
+    "two validations": ([*NEW, "--hold-out", "0.2", "--validation", "later.csv"], ["one of them"]),
+    "all held out": ([*NEW, "--hold-out", "1"], ["--hold-out", "between 0 and 1"]),
+    "bad validation": ([*NEW, "--validation", "broken.csv"], ["broken.csv", "row 2", "'nan'"]),
+    "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
+    "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
+    "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
+    "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', of angles or of a rotation vector"]),
+    "no positions": ([*NEW[:5], "joints.csv", *NEW[6:]], ["joints.csv", "no positions", "--measurement"]),
+    "option unknown": ([*NEW, "--unit", "m"], ["No such option", "--units"]),
+    "no result": (["validate", "nothing", "later.csv"], ["nothing", "the file: found nothing"]),
+    "not a result": (["validate", "other.json", "later.csv"], ["other.json", "no result of rpim-opt"]),
+    "bad row": (["validate", *RESULT, "broken.csv", "--units", "rad,m"], ["broken.csv", "row 2", "'nan'"]),
+    "no unit of new rows": (["validate", *RESULT, "later.csv"], ["later.csv", "without a unit"]),
+    "limit": (["validate", *RESULT, "later.csv", "--units", "rad,m", "--limit", "0"], ["--limit", "greater than zero"]),
+    "another kind": (["validate", *RESULT, "later.csv", "--measurement", "pose"], ["'pose'", "position"]),
+    "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
+    "nowhere to export": (["export", *RESULT, "--urdf", "arm.urdf"], ["--out", "arm.urdf"]),
+    "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["the original stays"]),
+    "tip that moves": (
+        ["export", *RESULT, "--urdf", "bare.urdf", "--out", "made", "--tool"],
+        ["moves the tip 'link_6'", "a fixed joint"],
+    ),
+    "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "off by"]),
+    "ending of a table": (["export", *RESULT, "--mdh", "made.txt"], ["made.txt", "ending in .toml"]),
+    "two files in one": (["export", *RESULT, "--mdh", "made.csv", "--robodk", "made.csv"], ["made.csv", "two files"]),
+    "unwritable": (
+        ["export", *RESULT, "--mdh", "made.csv", "--robodk", "arm.urdf/dk.csv"],
+        ["arm.urdf/dk.csv", "cannot be written"],
+    ),
+    "no reflector": (["export", *RESULT, "--mdh", "made.csv", "--marker", "B"], ["marker", "'B'"]),
+    "no targets": (["compensate", *RESULT, "nothing.csv"], ["nothing.csv", "the file: found nothing"]),
+    "bad tool": (["compensate", *RESULT, "joints.csv", "--units", "rad", "--tool", "1,2"], ["--tool", "six numbers"]),
+    "targets without unit": (["compensate", *RESULT, "joints.csv"], ["joints.csv", "without a unit", "such as deg"]),
+}  # fmt: skip
+
+
+@pytest.fixture
+def desk(cell: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with good and bad files."""
+    for path in (*cell.iterdir(), made / "results" / "result.json"):
+        (tmp_path / path.name).write_text(path.read_text())
+    (tmp_path / "results").mkdir()
+    (tmp_path / "result.json").rename(tmp_path / "results" / "result.json")
+    header, rows = table(cell / "measured.csv")
+    write_csv(tmp_path / "points.csv", ["x1", "y1", "z1", "x2", *header[4:]], rows)
+    write_csv(tmp_path / "turns.csv", [*header, "rx", "ry", "rz"], np.hstack([rows, rows[:, :3]]))
+    write_csv(tmp_path / "twice.csv", [*header, "X"], np.hstack([rows, rows[:, :1]]))
+    write_csv(tmp_path / "joints.csv", header[3:], rows[:, 3:])
+    broken = rows[:9].copy()
+    broken[1, 2] = np.nan
+    write_csv(tmp_path / "broken.csv", header, broken)
+    (tmp_path / "other.json").write_text("{}")
+    (tmp_path / "bare.urdf").write_text(urdf_text(ARM.mdh, TOOL, fixed=False))
+    longer = ARM.mdh.copy()
+    longer[2, MDH.index("a")] += 0.2
+    (tmp_path / "other.urdf").write_text(urdf_text(longer, TOOL))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk, case) -> None:
+    arguments, expected = BAD[case]
+    before = {path: path.read_bytes() for path in desk.rglob("*") if path.is_file()}
+    for as_json in ([], ["--json"]):
+        assert run(monkeypatch, *arguments, *as_json) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        text = json.loads(said.err)["error"] if as_json else said.err
+        if as_json:
+            assert list(json.loads(said.err)) == ["error"]
+        for part in expected:
+            assert part in text, text
+        if "No such option" not in text:
+            assert text.strip().endswith(".")
+            assert "\n" not in text.strip()
+    assert {path: path.read_bytes() for path in desk.rglob("*") if path.is_file()} == before
+    assert not list(desk.glob("made*"))
+
+
+def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
+    monkeypatch.setattr("rpim_opt.conic.Conic.solve", lambda *_: ("out of luck", np.zeros(0), np.zeros(0)))
+    assert run(monkeypatch, "calibrate", str(made), "--formulation", "robust", "--json") == 3
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "out of luck" in json.loads(said.err)["error"]
+
+
+def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
+    problem, _ = simulated(("theta?", "ratio2"), configurations=20)
+    ro.calibrate(problem, ro.tikhonov, 1.0).save(tmp_path / "result.json")
+    assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 2
+    assert "found ratio2" in capsys.readouterr().err
+    assert not (tmp_path / "arm.csv").exists()
+
+
+# --- JSON, completion, help --------------------------------------------------------------------------------
+
+DOCUMENTS = {
+    "new": (NEW, {"written", "rows", "notes"}),
+    "inspect": (["inspect", "paper_arm"], {"joints", "measured", "observability", "warnings"}),
+    "calibrate": (["calibrate", "paper_arm"], {"parameters", "errors", "weight", "converged", "remarks"}),
+    "report": (["report", *RESULT], {"written"}),
+    "validate": (["validate", *RESULT, "later.csv", "--units", "rad,m"], {"nominal", "identified", "axes", "rows"}),
+    "export": (["export", *RESULT, "--mdh", "made.csv"], {"written", "notes"}),
+    "compensate": (["compensate", *RESULT, "joints.csv", "--units", "rad"], {"corrected", "rows"}),
+    "simulate": (["simulate", "position", "--out", "made"], {"written"}),
+    "design": (["design", "paper_arm", "--count", "8", "--table", "go.csv"], {"criterion", "gap", "configurations"}),
+    "robots": (["robots"], {"robots"}),
+}
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_every_command_has_a_document(monkeypatch, capsys, desk, name) -> None:
+    arguments, keys = DOCUMENTS[name]
+    rows = np.random.default_rng(0).uniform(-90, 90, (30, 6))
+    write_csv(desk / "go.csv", [f"q{i}_deg" for i in range(1, 7)], rows)
+    assert run(monkeypatch, *arguments, "--json") == 0
+    said = capsys.readouterr()
+    document = json.loads(said.out, parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+    assert keys <= set(document)
+    assert said.err == ""
+
+
+def test_the_document_of_a_calibration_has_the_tables_figures(monkeypatch, capsys) -> None:
+    assert run(monkeypatch, "calibrate", "paper_arm") == 0
+    text = capsys.readouterr().out
+    assert run(monkeypatch, "calibrate", "paper_arm", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["errors"]) == 11
+    for row in document["errors"]:
+        digits = 3 if row.get("printed") else 4
+        assert f"{row['what']}" in text
+        assert f"{row['mean_mm']:.{digits}f}" in text
+    for p in document["parameters"]:
+        assert f"{p['deviation']:+.4f}" in text
+    for remark in document["remarks"]:
+        assert remark in text
+
+
+def test_commands_complete_in_a_shell() -> None:
+    environment = {
+        **os.environ, "_RPIM_OPT_COMPLETE": "complete_bash", "COMP_WORDS": "rpim-opt va", "COMP_CWORD": "1",
+    }  # fmt: skip
+    script = "import sys; sys.argv = ['rpim-opt']; from rpim_opt.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["validate"]
+
+
+def test_help_states_the_exit_codes(monkeypatch, capsys) -> None:
+    assert run(monkeypatch, "--help") == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "0 done; 1 a limit or gate failed" in text
+    assert "2 unusable input; 3 no solution found" in text
+    assert "--install-completion" in text
