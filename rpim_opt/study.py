@@ -254,9 +254,14 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
 
 
 def _commit() -> str:
-    command = ["git", "-C", str(studies_folder()), "describe", "--always", "--dirty"]
+    git = ["git", "-C", str(studies_folder().parent)]
+    changes = ["status", "--porcelain", "--untracked-files=no", "--", ".", ":!studies/results"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        commit, changed = (
+            subprocess.run([*git, *what], capture_output=True, text=True, check=True).stdout.strip()
+            for what in (["describe", "--always"], changes)
+        )
+        return f"{commit}-dirty" if changed else commit  # results of other studies are no change of this one
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
