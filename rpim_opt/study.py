@@ -239,7 +239,8 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     figure = Figure(figsize=(7, 0.32 * len(values) + 0.9), layout="constrained")
     ax = figure.add_subplot()
     for y, (name, found) in enumerate(reversed(list(values.items()))):
-        ax.semilogx(found, [y] * len(found), "o", ms=3, alpha=min(1.0, 5 / len(found) ** 0.5), color="C0", mew=0)
+        dots = ax.semilogx(found, [y] * len(found), "o", ms=3, alpha=min(1.0, 5 / len(found) ** 0.5), color="C0", mew=0)
+        dots[0].set_rasterized(len(found) > 50)  # thousands of dots would make megabytes of SVG
         middle = sorted(found)[len(found) // 2]
         ax.semilogx([middle], [y], "|", ms=11, mew=2, color="C3")
         ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
