@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -241,10 +243,13 @@ def compensate(
         raise InputError("largest", f"{largest}", "a correction greater than zero")
     turned = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
     cell = _Cell.of(result, pose if turned else position, tool, marker, base, torque is not None)
-    parts = []
-    for start in range(0, len(targets.label), BLOCK):
+
+    def part(start: int) -> dict[str, Array]:
         rows = [None if v is None else v[start : start + BLOCK] for v in (targets.q, targets.poses, targets.torque)]
-        parts.append(cell.compensated(rows[0], rows[1], rows[2], largest))
+        return cell.compensated(rows[0], rows[1], rows[2], largest)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        parts = list(pool.map(part, range(0, len(targets.label), BLOCK)))
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Compensation(robot, targets.label, **{**whole, "status": tuple(whole["status"].tolist())})
 
