@@ -154,6 +154,11 @@ class Calibration:
         record
             Title, validation data and input files, as in ``load(...).record``; the calibration's own by default.
 
+        Raises
+        ------
+        InputError
+            For a `PartitionedProblem`, whose measurements the file cannot repeat.
+
         Examples
         --------
         >>> import rpim_opt as ro
@@ -162,6 +167,8 @@ class Calibration:
         >>> ro.load_result("result.json").record.title
         "The paper's cooperative manipulator"
         """
+        if not self.problem.complete:
+            raise InputError("save", "measurements in parts", "measurements in memory, which the file repeats")
         path = Path(path) / "result.json" if Path(path).is_dir() else Path(path)
         write_json(path, content(self if record is None else replace(self, record=record)))
 
@@ -336,6 +343,8 @@ class Calibration:
     @cached_property
     def equations(self) -> int:
         """How many equations the fit rests on: all m, with a robust loss those that it trusts."""
+        if self.linear.stands_for is not None:
+            return self.linear.stands_for
         return int(np.count_nonzero(np.any(self.linear.A != 0, axis=1) | (self.linear.b != 0)))
 
     @cached_property
@@ -490,7 +499,7 @@ class Calibration:
             if self.formulation.constraints:
                 at_low, at_high = z <= box[0] + 1e-9, z >= box[1] - 1e-9
                 g = np.where((at_low & (g > 0)) | (at_high & (g < 0)), 0.0, g)
-            start = self.problem.linearize(np.zeros_like(self.x))
+            start = in_parts(self.problem).linearize(np.zeros_like(self.x))
             gradient = float(np.linalg.norm(g) / max(float(np.linalg.norm(2 * start.A.T @ start.b)), 1e-300))
         step = float(np.linalg.norm(self._again.z - z) / (1 + np.linalg.norm(z)))
         return Certificate(gradient, step, program.violation(z))
@@ -650,13 +659,14 @@ def calibrate(
     0.024 mm. Converged after 4 passes.
     """
     elsewhere = relocated(problem) if start is None else None
-    problem, formulation = in_parts(elsewhere or problem).for_loss(formulation)
+    problem, asked = elsewhere or problem, formulation
+    solved, formulation = in_parts(problem).for_loss(asked)
     scale = problem.parameters.free.scale
     begin = np.zeros(len(scale)) if start is None else np.asarray(start, dtype=float)
     if begin.shape != scale.shape or not np.isfinite(begin).all():
         raise InputError("start", f"shape {begin.shape}", f"{len(scale)} deviations, finite, one a parameter")
     z = begin / scale
-    model = problem.linearize(scale * z)
+    model = solved.linearize(scale * z)
     fixed = None if callable(weight) else float(weight)
     if model.equations < len(z) and (formulation.penalty is None or fixed == 0):
         found = f"{model.equations} equations for {len(z)} parameters"
@@ -683,7 +693,7 @@ def calibrate(
                 raise error.naming(names) from None
             step = estimate.z - z
             length, room = float(np.linalg.norm(step)), 1 + float(np.linalg.norm(z))
-            candidate = program.on(problem.linearize(scale * (z + step)))
+            candidate = program.on(solved.linearize(scale * (z + step)))
             after = _objective(candidate, z + step, lam)
             if after <= before * (1 + 1e-9) or not start_feasible or length <= tolerance * room:
                 break
@@ -710,7 +720,7 @@ def calibrate(
             message = "Not converged: the steps no longer get shorter; the data hardly decide, give a larger weight."
     if elsewhere:
         message += " Frames were stated far from where the data put them; their deviations count from there."
-    return Calibration(problem, formulation, scale * z, lam, selection, converged, message, tuple(history), program)
+    return Calibration(problem, asked, scale * z, lam, selection, converged, message, tuple(history), program)
 
 
 def _objective(program: ConvexProgram, z: Array, weight: float) -> float:

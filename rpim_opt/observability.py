@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
+from rpim_opt.exceptions import InputError
 from rpim_opt.problem import CalibrationProblem
 from rpim_opt.robot import Array, Robot
 
@@ -100,6 +101,8 @@ def observe(problem: CalibrationProblem, x: Array | None = None) -> Observabilit
     >>> f"{found.rank} of {len(found.names)} directions are seen, condition {found.condition:.3g}"
     '20 of 26 directions are seen, condition 2.87e+03'
     """
+    if not problem.complete:
+        raise InputError("observe", "measurements in parts", "one of them: problem.on(part)")
     x = np.zeros(len(problem.parameters.free)) if x is None else x
     model, free = problem.linearize(x), problem.parameters.free
     _, s, _ = model.svd

@@ -183,6 +183,16 @@ class CalibrationProblem:
         """
         return CalibrationProblem(self.robot, replace(self.parameters, identified=identified), self.data)
 
+    @property
+    def complete(self) -> bool:
+        """Whether ``data`` are all the measurements, as everywhere but in a `PartitionedProblem`.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.complete
+        True
+        """
+        return True
+
     def for_loss(self, formulation: Any) -> tuple[CalibrationProblem, Any]:
         """Return the problem and the formulation that `calibrate` solves: these, unless the data come in parts.
 

@@ -55,6 +55,8 @@ class PartitionedProblem(CalibrationProblem):
     >>> problem = ro.PartitionedProblem(whole.robot, whole.parameters, halves[0](), tuple(halves))
     >>> problem.linearize(0 * whole.parameters.free.nominal).equations
     120
+    >>> problem.complete
+    False
     >>> formulation = problem.for_loss(ro.robust)[1]  # majorized by a squared loss
     >>> formulation.loss_over
     'equation'
@@ -65,6 +67,11 @@ class PartitionedProblem(CalibrationProblem):
     parts: tuple[Part, ...] = ()
     compute: Callable[..., Iterable[Any]] = map
     loss: Formulation | None = field(default=None)
+
+    @property
+    def complete(self) -> bool:
+        """False: ``data`` are the first part."""
+        return False
 
     def linearize(self, x: Array) -> LinearModel:
         """Return the reduced linear model around the deviations x (n,) [SI], of all parts."""
@@ -95,7 +102,7 @@ class PartitionedProblem(CalibrationProblem):
 def in_parts(problem: CalibrationProblem) -> CalibrationProblem:
     """Return the problem as it is solved: in parts of whole configurations where it has more than `KEPT` equations."""
     equations = sum(len(block.row) * len(block.measurement.components) for block in problem.data.blocks)
-    if type(problem) is not CalibrationProblem or equations <= KEPT:
+    if not problem.complete or equations <= KEPT:
         return problem
     order = np.argsort(problem.data.configuration, kind="stable")
     starts = np.flatnonzero(np.diff(problem.data.configuration[order], prepend=-1))

@@ -87,7 +87,13 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     assert here.converged
     assert here.weight == pytest.approx(there.weight, rel=1e-5)  # the search for it ends at 1e-6
     again = ro.calibrate(partitioned(whole, parts), ro.tikhonov, there.weight)
-    np.testing.assert_allclose(again.x, ro.calibrate(whole, ro.tikhonov, there.weight).x, rtol=0, atol=1e-13)
+    fixed = ro.calibrate(whole, ro.tikhonov, there.weight)
+    np.testing.assert_allclose(again.x, fixed.x, rtol=0, atol=1e-13)
+    assert again.equations == fixed.equations == 3 * PARTS * ROWS
+    assert again.noise_variance == pytest.approx(fixed.noise_variance, rel=1e-9)
+    assert 0.9 < again.noise_variance < 1.1  # as simulated
+    np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
+    assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
 
 
 def test_bounds_on_parts(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
@@ -104,6 +110,8 @@ def test_robust_losses_are_reweighted_to_the_same_minimum(whole: CalibrationProb
     there = ro.calibrate(rows, ro.robust, 1.0)
     here = ro.calibrate(partitioned(rows, bad), ro.robust, 1.0, max_iterations=200)
     assert here.converged
+    assert here.formulation is ro.robust
+    assert not any("squared loss" in line for line in here.remarks())
     assert (np.abs(here.x - there.x) / there.problem.parameters.free.scale).max() < 2e-6  # as exact as Clarabel's
     assert all(b.objective <= a.objective * (1 + 1e-9) for a, b in zip(here.history, here.history[1:], strict=False))
     squared = ro.calibrate(rows, ro.tikhonov, 1.0)
@@ -121,7 +129,8 @@ def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monke
     result = ro.calibrate(whole, ro.tikhonov, 1.0)
     monkeypatch.undo()
     np.testing.assert_allclose(result.x, ro.calibrate(whole, ro.tikhonov, 1.0).x, rtol=0, atol=1e-13)
-    assert len(result.errors()) == len(whole.data)
+    assert result.problem is whole  # parts are how it is solved, not what was asked
+    assert result.equations == 3 * len(whole.data)
 
 
 def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
@@ -129,6 +138,10 @@ def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Datas
     for rule in (ro.leave_one_out, ro.k_fold, ro.two_step, ro.ncp):
         with pytest.raises(ro.InputError, match="triangle"):
             ro.calibrate(problem, ro.tikhonov, rule)
+    with pytest.raises(ro.InputError, match="measurements in parts"):
+        ro.observe(problem)
+    with pytest.raises(ro.InputError, match="measurements in parts"):
+        ro.calibrate(problem, ro.tikhonov, 1.0).save("nowhere.json")
     with pytest.raises(ro.InputError, match="measurements in parts"):
         ro.calibrate(problem, ro.Formulation("worst", loss=ro.minimax.loss, penalty=ro.minimax.penalty), 1.0)
 
