@@ -154,7 +154,10 @@ def _recognised(
     path: Path, measurement: str | None, arm: Described, units: Mapping[str, str]
 ) -> tuple[Measurement, Renamed]:
     """Return what a table measures, and the table under our names."""
-    source = read_columns(path)
+    try:
+        source = read_columns(path)
+    except InputError as error:
+        raise error.within(path) from None
 
     def renamed(kind: Measurement) -> Renamed:
         try:

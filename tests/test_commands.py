@@ -390,6 +390,7 @@ BAD = {
     "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
     "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
     "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', of angles or of a rotation vector"]),
+    "no rows": ([*NEW[:5], "empty.csv", *NEW[6:]], ["empty.csv", "a header and no rows"]),
     "no positions": ([*NEW[:5], "joints.csv", *NEW[6:]], ["joints.csv", "no positions", "--measurement"]),
     "option unknown": ([*NEW, "--unit", "m"], ["No such option", "--units"]),
     "no result": (["validate", "nothing", "later.csv"], ["nothing", "the file: found nothing"]),
@@ -431,6 +432,7 @@ def desk(cell: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     write_csv(tmp_path / "turns.csv", [*header, "rx", "ry", "rz"], np.hstack([rows, rows[:, :3]]))
     write_csv(tmp_path / "twice.csv", [*header, "X"], np.hstack([rows, rows[:, :1]]))
     write_csv(tmp_path / "joints.csv", header[3:], rows[:, 3:])
+    write_csv(tmp_path / "empty.csv", header, rows[:0])
     broken = rows[:9].copy()
     broken[1, 2] = np.nan
     write_csv(tmp_path / "broken.csv", header, broken)
