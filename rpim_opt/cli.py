@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from threading import Timer
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rpim_opt.exceptions import InputError, NoSolutionFound, RpimError
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
+from rpim_opt.show.console import fail, left_out_line, progress, show, written_line, written_to
+from rpim_opt.show.options import corrected_files, require_positive, tool_frame
+
+if TYPE_CHECKING:
+    from rpim_opt.calibration.result import Calibration
+    from rpim_opt.store.instances import Instance
 
 HELP = """Robot calibration by convex optimization.
 
@@ -22,9 +26,8 @@ From a table of measurements to a corrected robot: new, calibrate, export, repor
 Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found.
 """
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
-USAGE: Any = next(
-    c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
-)  # click's, or typer's own copy
+# click's, or typer's own copy, depending on typer's version
+USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 Problem = Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")]
 Variant = Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")]
@@ -55,31 +58,31 @@ def new(
     as_json: Json = False,
 ) -> None:
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
-    with _progress():
-        from rpim_opt.files import refused
-        from rpim_opt.starting import new_problem
+    with progress():
+        from rpim_opt.basics.files import refused
+        from rpim_opt.store.starting import new_problem
 
         with refused(folder):
             made = new_problem(
                 folder, robot, data, measurement=measurement, units=units, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip,
             )  # fmt: skip
-    _show(made, {"written": [made.folder], "rows": made.rows, "notes": made.notes}, as_json)
+    show(made, {"written": [made.folder], "rows": made.rows, "notes": made.notes}, as_json)
 
 
 @app.command()
 def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) -> None:
     """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
-    with _progress() as say:
-        from rpim_opt.inspection import inspect
-        from rpim_opt.instances import load
+    with progress() as say:
+        from rpim_opt.problem.inspection import inspect
+        from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
         say("inspecting")
         found = inspect(instance.problem)
     head = {"title": instance.title, "source": instance.source}
-    _show(f"{instance.title}\n{instance.source}\n\n{found}", {**head, **found.content()}, as_json)
+    show(f"{instance.title}\n{instance.source}\n\n{found}", {**head, **found.content()}, as_json)
 
 
 @app.command()
@@ -90,36 +93,32 @@ def calibrate(
         str | None, typer.Option(help="How to choose the weight: reml, l_curve, gcv, k_fold, ..., or a number.")
     ] = None,
     formulation: Annotated[
-        str | None, typer.Option(help="Instead of the file's: tikhonov, robust, bounded, ...")
+        str | None,
+        typer.Option(
+            help="Instead of the file's: least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, "
+            "group_lasso."
+        ),
     ] = None,
     refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
     profile: Annotated[bool, typer.Option(help="Say where the time went.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Calibrate a problem: print the parameters and the errors before and after, write result.json.
+    """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
     Exit code 1 if it did not converge.
     """
-    with _progress() as say:
-        from rpim_opt.calibration import calibrate
-        from rpim_opt.files import refused
-        from rpim_opt.instances import load, parse_formulation, parse_weight
-        from rpim_opt.phases import clock
-        from rpim_opt.summary import describe, describe_times, summary
+    with progress() as say:
+        from rpim_opt.basics.phases import clock
+        from rpim_opt.show.summary import describe, describe_times, summary
+        from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
-        weight = instance.weight if select is None else parse_weight(select)
-        say("choosing the weight")
-        posed = instance.formulation if formulation is None else parse_formulation(formulation)
         with clock() as running:
-            result = calibrate(
-                instance.problem, posed, weight,
-                progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
-            )  # fmt: skip
+            result = _calibrated(instance, select, formulation, say)
             times = dict(running.rows())
-        result, without = replace(result, record=instance.record), []
+        without: list[str] = []
         if refit and result.flagged:
             say("calibrating without the distrusted rows")
             without = [flag.label for flag in result.flagged]
@@ -129,14 +128,50 @@ def calibrate(
     if without:
         text = f"Refitted without {', '.join(without)}.\n\n{text}"
     if profile:
-        text, found = f"{text}\n\n{describe_times(times)}", {**found, "seconds": times}
-    if out is not None:
-        with refused(out / "result.json"):
-            result.save(out / "result.json")
-        text += f"\n\nWritten: {out / 'result.json'}"
-    _show(text, {**found, "refitted_without": without, "written": [out / "result.json"] if out else []}, as_json)
+        text = f"{text}\n\n{describe_times(times)}"
+        found = {**found, "seconds": times}
+    written = _saved(result, out)
+    for file in written:
+        text += f"\n\nWritten: {file}"
+    show(text, {**found, "refitted_without": without, "written": written}, as_json)
     if not result.converged:
         raise typer.Exit(1)
+
+
+def _calibrated(
+    instance: Instance, select: str | None, formulation: str | None, say: Callable[[str], None]
+) -> Calibration:
+    """Calibrate as a problem's file says, or as the options say instead."""
+    from rpim_opt.calibration.loop import calibrate
+    from rpim_opt.store.named import named_formulation, named_weight
+
+    weight = instance.weight
+    if select:
+        weight = named_weight(select)
+    posed = instance.formulation
+    if formulation:
+        posed = named_formulation(formulation)
+    say("choosing the weight")
+    result = calibrate(
+        instance.problem,
+        posed,
+        weight,
+        progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
+    )
+    return replace(result, record=instance.record)
+
+
+def _saved(result: Calibration, out: Path | None) -> list[Path]:
+    """Write a result's file where a folder is given."""
+    from rpim_opt.basics.files import refused
+    from rpim_opt.store.result_file import save_result
+
+    if out is None:
+        return []
+    file = out / "result.json"
+    with refused(file):
+        save_result(result, file)
+    return [file]
 
 
 @app.command()
@@ -146,10 +181,10 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write a result as one HTML page that works offline, for whoever has to believe it."""
-    with _progress() as say:
-        from rpim_opt.files import refused
-        from rpim_opt.report import write_report
-        from rpim_opt.results import load_result
+    with progress() as say:
+        from rpim_opt.basics.files import refused
+        from rpim_opt.show.report import write_report
+        from rpim_opt.store.result_file import load_result
 
         say("reading the result")
         loaded = load_result(result)
@@ -157,7 +192,7 @@ def report(
         out = out or (result if result.is_dir() else result.parent) / "report.html"
         with refused(out):
             write_report(loaded, out)
-    _show(f"Written: {out}", {"written": [out]}, as_json)
+    show(f"Written: {out}", {"written": [out]}, as_json)
 
 
 @app.command()
@@ -171,21 +206,21 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named."""
-    with _progress() as say:
-        from rpim_opt.results import load_result
-        from rpim_opt.validation import read_measurements, validate
+    with progress() as say:
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.validation import read_measurements, validate
 
-        _require_positive("--limit", limit)
+        require_positive("--limit", limit)
         say("reading the result")
         loaded = load_result(result)
         rows, left_out = read_measurements(loaded, data, measurement, units)
         found = validate(loaded, rows)
-    text = str(found) + _left(left_out)
-    document = {**found.content(), "left_out": left_out, "limit_mm": limit, "written": _written(out, found.csv())}
+    text = str(found) + left_out_line(left_out)
+    document = {**found.content(), "left_out": left_out, "limit_mm": limit, "written": written_to(out, found.csv())}
     failed = limit is not None and 1e3 * found.largest > limit
     if limit is not None:
         text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
-    _show(text + _named(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
+    show(text + written_line(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
     if failed:
         raise typer.Exit(1)
 
@@ -214,11 +249,11 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the identified robot for other tools: all files that are asked for, or none."""
-    with _progress() as say:
-        from rpim_opt.exchange.export import export_ur_calibration, export_urdf, found_by, write_all
-        from rpim_opt.exchange.plain import write_robodk, write_robot
-        from rpim_opt.exchange.universal_robots import write_ur_kinematics
-        from rpim_opt.results import load_result
+    with progress() as say:
+        from rpim_opt.robot.plain import write_robodk, write_robot
+        from rpim_opt.robot.ur_kinematics import write_ur_kinematics
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.export import export_ur_calibration, export_urdf, found_by, write_all
 
         say("reading the result")
         loaded = load_result(result)
@@ -229,17 +264,15 @@ def export(
             (ur_kinematics, lambda target: write_ur_kinematics(ur_kinematics or "", robot, target)),
             (ur_calibration, lambda target: export_ur_calibration(loaded, ur_calibration or "", target)),
         ]
-        targets = _targets([source for source, _ in corrected if source], out)
-        plain = ((mdh, partial(write_robot, robot)), (robodk, partial(write_robodk, robot)))
-        writers = [(targets[source], write) for source, write in corrected if source]
-        writers += [(target, write) for target, write in plain if target]
+        plain = [(mdh, partial(write_robot, robot)), (robodk, partial(write_robodk, robot))]
+        writers = [*corrected_files(corrected, out), *((target, write) for target, write in plain if target)]
         if not writers:
             accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, one or several"
             raise InputError("export", "nothing to write", accepted)
         notes = write_all(writers)
     written = [target for target, _ in writers]
     text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
-    _show(text, {"written": written, "notes": notes}, as_json)
+    show(text, {"written": written, "notes": notes}, as_json)
 
 
 @app.command()
@@ -259,14 +292,15 @@ def compensate(
     as_json: Json = False,
 ) -> None:
     """Correct joint commands so that the real robot goes where the nominal one would."""
-    with _progress() as say:
-        from rpim_opt.compensation import compensate, read_targets
-        from rpim_opt.measurement import pose
-        from rpim_opt.naming import parse_units, rename
-        from rpim_opt.results import load_result
-        from rpim_opt.tables import read_columns
+    with progress() as say:
+        from rpim_opt.basics.tables import read_columns
+        from rpim_opt.data.models import pose
+        from rpim_opt.data.naming import parse_units, rename
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.compensation import compensate
+        from rpim_opt.use.targets import read_targets
 
-        _require_positive("--limit", limit)
+        require_positive("--limit", limit)
         say("reading the result")
         loaded = load_result(result)
         robot = loaded.problem.robot
@@ -278,11 +312,12 @@ def compensate(
         say("compensating")
         found = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
-            tool=_tool(tool), marker=marker or "", base=base, largest=largest,
+            tool=tool_frame(tool), marker=marker or "", base=base, largest=largest,
         )  # fmt: skip
     document = {**found.content(), "left_out": named.left_out, "limit_mm": limit}
-    document["written"] = _written(out, found.csv())
-    _show(str(found) + _left(named.left_out) + (_named(out) or "\n" + found.csv().rstrip("\n")), document, as_json)
+    document["written"] = written_to(out, found.csv())
+    text = str(found) + left_out_line(named.left_out) + _written_or_shown(out, found.csv())
+    show(text, document, as_json)
     if limit is not None and 1e3 * found.position_error.max() > limit:
         raise typer.Exit(1)
 
@@ -295,12 +330,12 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
-    from rpim_opt.files import refused
-    from rpim_opt.simulation import write_simulation
+    from rpim_opt.basics.files import refused
+    from rpim_opt.store.simulation import write_simulation
 
     with refused(out or problem):
         written = write_simulation(problem, seed, out)
-    _show("\n".join(f"Written: {path}" for path in written), {"written": written}, as_json)
+    show("\n".join(f"Written: {path}" for path in written), {"written": written}, as_json)
 
 
 @app.command()
@@ -315,21 +350,24 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose the configurations to measure next, from candidates, by optimal design."""
-    with _progress() as say:
-        from rpim_opt.design import choose, joint_cells, random_candidates, read_candidates
-        from rpim_opt.instances import load
-        from rpim_opt.tables import csv_text
+    with progress() as say:
+        from rpim_opt.basics.tables import csv_text
+        from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
+        from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem)
         robot = instance.problem.robot
-        q = random_candidates(robot, candidates, seed) if table is None else read_candidates(table, robot)
+        if table is None:
+            q = random_candidates(robot, candidates, seed)
+        else:
+            q = read_candidates(table, robot)
         found = choose(instance.problem, q, count, criterion, progress=say)
     columns = joint_cells(robot, q[found.chosen], found.chosen)
     text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap,
-                "configurations": columns, "written": _written(out, text)}  # fmt: skip
-    _show(str(found) + (_named(out) or "\n" + text.rstrip("\n")), document, as_json)
+                "configurations": columns, "written": written_to(out, text)}  # fmt: skip
+    show(str(found) + _written_or_shown(out, text), document, as_json)
 
 
 @app.command()
@@ -351,7 +389,8 @@ def study(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from rpim_opt.study import regressions, run_study
+    from rpim_opt.study.report import regressions
+    from rpim_opt.study.runner import run_study
 
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=as_json) as bar:
@@ -360,118 +399,32 @@ def study(
             name, quick, workers, scheduler, resume, redraw, out,
             progress=lambda done, every: bar.update(task, completed=done, total=every),
         )  # fmt: skip
-    worse = regressions(name, quick, report.metrics) if gate else []
+    worse: list[str] = []
+    if gate:
+        worse = regressions(name, quick, report.metrics)
     text = f"{report.text}\n\nWritten: {folder}"
-    _show(text, {"report": report.text, "metrics": report.metrics, "worse": worse, "written": [folder]}, as_json)
+    show(text, {"report": report.text, "metrics": report.metrics, "worse": worse, "written": [folder]}, as_json)
     if worse:
-        _fail("\n".join(f"Worse: {line}" for line in worse), 1)
+        fail("\n".join(f"Worse: {line}" for line in worse), 1)
 
 
 @app.command()
 def robots(as_json: Json = False) -> None:
     """List the ready robots that a problem file may name."""
-    from rpim_opt.instances import find_robot
-    from rpim_opt.instances import robots as names
-    from rpim_opt.robot import read_robot
-    from rpim_opt.text import table
+    from rpim_opt.basics.text import table
+    from rpim_opt.robot.library import find_robot
+    from rpim_opt.robot.library import robots as names
+    from rpim_opt.robot.mdh import read_robot
 
     ready = {name: read_robot(find_robot(name)) for name in names()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
     text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
-    _show(text, {"robots": rows}, as_json)
+    show(text, {"robots": rows}, as_json)
 
 
-# --- what they share ---------------------------------------------------------------------------------------
-
-
-def _show(text: object, document: dict[str, Any], as_json: bool) -> None:
-    """Print one or the other."""
-    if as_json:
-        from rpim_opt.files import json_text
-
-        text = json_text(document).rstrip("\n")
-    print(text)  # noqa: T201
-
-
-def _fail(text: str, code: int) -> None:
-    """Say on stderr what is wrong, as JSON where that was asked for, and end."""
-    if "--json" in sys.argv:
-        from rpim_opt.files import json_text
-
-        text = json_text({"error": text}).rstrip("\n")
-    print(text, file=sys.stderr)  # noqa: T201
-    sys.exit(code)
-
-
-def _written(path: Path | None, text: str) -> list[Path]:
-    """Write a text where a path is given."""
-    from rpim_opt.files import refused, write_text
-
-    if path is None:
-        return []
-    with refused(path):
-        write_text(path, text)
-    return [path]
-
-
-def _named(path: Path | None) -> str:
-    return f"\nWritten: {path}" if path else ""
-
-
-def _left(columns: Sequence[str]) -> str:
-    return f"\nColumns that were left out: {', '.join(columns)}." if columns else ""
-
-
-def _require_positive(where: str, value: float | None) -> None:
-    if value is not None and not value > 0:
-        raise InputError(where, f"{value:g}", "a number greater than zero [mm]")
-
-
-def _targets(sources: list[Path], out: Path | None) -> dict[Path, Path]:
-    """Return where every corrected file goes: ``--out``, or a file of the same name in that folder."""
-    if not sources:
-        return {}
-    if out is None:
-        raise InputError("--out", "nothing", f"where to write the corrected {sources[0].name}")
-    folder = len(sources) > 1 or out.is_dir()
-    targets = {source: out / source.name if folder else out for source in sources}
-    for source, target in targets.items():
-        if target.resolve() == source.resolve():
-            raise InputError("--out", f"the original, {source}", "another place: the original stays")
-    return targets
-
-
-def _tool(text: str | None) -> list[float] | None:
-    """Return a tool [m, rad] from six numbers in mm and degrees."""
-    from math import radians
-
-    if text is None:
-        return None
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6:
-        raise InputError("--tool", f"'{text}'", "six numbers: x,y,z [mm], roll,pitch,yaw [deg]")
-    return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
-    """Show what is going on, once it has taken a second, where a person is watching."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    status = console.status("starting")
-    timer = Timer(1.0, status.start)
-    timer.daemon = True
-    if console.is_terminal:
-        timer.start()
-    try:
-        yield lambda text: status.update(text)
-    finally:
-        timer.cancel()
-        status.stop()
+def _written_or_shown(out: Path | None, text: str) -> str:
+    """Return the line that says where a table is, or the table."""
+    return written_line(out) or "\n" + text.rstrip("\n")
 
 
 def main() -> None:
@@ -482,8 +435,8 @@ def main() -> None:
         if "--json" not in sys.argv:
             error.show()
             sys.exit(error.exit_code)
-        _fail(error.format_message(), error.exit_code)
+        fail(error.format_message(), error.exit_code)
     except NoSolutionFound as error:
-        _fail(str(error), 3)
+        fail(str(error), 3)
     except RpimError as error:
-        _fail(str(error), 2)
+        fail(str(error), 2)

@@ -1,0 +1,4 @@
+from .exceptions import InputError as InputError
+from .exceptions import NoSolutionFound as NoSolutionFound
+from .exceptions import RowError as RowError
+from .exceptions import RpimError as RpimError

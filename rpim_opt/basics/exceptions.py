@@ -1,0 +1,194 @@
+"""Errors: each names the culprit, what was found, what is accepted, and the remedy."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+
+class RpimError(Exception):
+    """Base of every error that this package raises on purpose.
+
+    >>> import rpim_opt as ro
+    >>> try:
+    ...     ro.load("paper_arm", variant="bound")
+    ... except ro.basics.RpimError as error:
+    ...     print(type(error).__name__)
+    InputError
+    """
+
+
+class InputError(RpimError):
+    """Something a user wrote cannot be used.
+
+    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes.
+
+    Parameters
+    ----------
+    where
+        The key, column, row or argument.
+    found, accepted
+        What stands there, and what could.
+    file
+        The file it stands in; None where there is none.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> error = ro.InputError("key joint 2.d_mm", "'long'", "a finite number")
+    >>> print(error.within("robot.toml"))
+    robot.toml, key joint 2.d_mm: found 'long', accepted: a finite number.
+    """
+
+    def __init__(self, where: str, found: str, accepted: str, file: object = None):
+        self.file = file
+        self.where = where
+        self.found = found
+        self.accepted = accepted
+        place = f"{file}, {where}" if file else where
+        super().__init__(f"{place}: found {found}, accepted: {accepted}.")
+
+    def within(self, file: object) -> InputError:
+        """Return the same error with the file it occurred in, unless it names one already."""
+        return self if self.file else InputError(self.where, self.found, self.accepted, file)
+
+
+class RowError(InputError):
+    """A row of a table is wrong, and the table's reader knows what the row is called.
+
+    Parameters
+    ----------
+    row
+        Its number, from 0.
+    found, accepted
+        As `InputError` has them.
+
+    Examples
+    --------
+    >>> from rpim_opt.basics.exceptions import RowError
+    >>> error = RowError(3, "a quaternion of norm 2", "norm 1")
+    >>> print(error)
+    row 4: found a quaternion of norm 2, accepted: norm 1.
+    >>> print(error.named("row P4"))
+    row P4: found a quaternion of norm 2, accepted: norm 1.
+    """
+
+    def __init__(self, row: int, found: str, accepted: str):
+        super().__init__(f"row {row + 1}", found, accepted)
+        self.row = row
+
+    def named(self, where: str) -> InputError:
+        """Return the same error with the row's name."""
+        return InputError(where, self.found, self.accepted)
+
+
+class Conflict(NamedTuple):
+    """What contradicts what: by how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
+
+    Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
+    names of demands that cannot hold together, of which any one less would do.
+    """
+
+    parameters: dict[str, float]
+    configurations: dict[Any, float]
+    constraints: tuple[str, ...] = ()
+
+
+class NoSolutionFound(RpimError):
+    """A convex program was not solved; its parameters, kept as attributes, are the evidence.
+
+    Parameters
+    ----------
+    formulation
+        Its name.
+    weight
+        At which it was to be solved.
+    status
+        How the solver ended, ``"infeasible"`` for instance.
+    conflict
+        What contradicts what; None where that is not known.
+    advice
+        What may help, where nothing contradicts anything.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> tight = problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5})
+    >>> exact = ro.Formulation("all within a sigma", largest=1.0, constraints=(ro.within_tolerance,))
+    >>> try:
+    ...     ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), exact)
+    ... except ro.NoSolutionFound as error:
+    ...     print(error.status, *error.conflict.parameters)  # whose tolerances contradict the measurements
+    infeasible a3 a4 d5 d6
+    """
+
+    def __init__(
+        self, formulation: str, weight: float, status: str, conflict: Conflict | None = None, advice: str = ""
+    ):
+        self.formulation = formulation
+        self.weight = weight
+        self.status = status
+        self.conflict = conflict
+        self.advice = advice
+        text = f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; "
+        super().__init__(
+            text + (_contradiction(conflict) or advice or "change the weight, or give it constraints") + "."
+        )
+
+    def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
+        """Return the same error with names for the configurations' numbers.
+
+        >>> import rpim_opt as ro
+        >>> from rpim_opt.basics.exceptions import Conflict
+        >>> error = ro.NoSolutionFound("mine", 1e-3, "infeasible", Conflict({}, {3: 1.5}))
+        >>> error.naming({3: "P4"}).conflict.configurations
+        {'P4': 1.5}
+        """
+        if not self.conflict:
+            return self
+        rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
+
+        def rename(demand: str) -> str:
+            what, _, rest = demand.partition(" ")
+            number, _, tail = rest.partition(" ")
+            if what == "configuration" and number.isdigit():
+                return f"configuration {names.get(int(number), number)} {tail}"
+            return demand
+
+        named = self.conflict._replace(configurations=rows, constraints=tuple(map(rename, self.conflict.constraints)))
+        return NoSolutionFound(self.formulation, self.weight, self.status, named, self.advice)
+
+
+def _contradiction(conflict: Conflict | None) -> str:
+    if conflict is None:
+        return ""
+    parts = []
+    if conflict.constraints:
+        parts.append(f"these cannot hold together: {', '.join(conflict.constraints)}")
+    if conflict.parameters or conflict.configurations:
+        parts.append(_loosening(conflict))
+    return "; ".join(parts)
+
+
+def _loosening(conflict: Conflict) -> str:
+    """Say which bounds of parameters, or of configurations, would have to give way."""
+    bounds = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in conflict.parameters.items())
+    rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in conflict.configurations.items())
+    if bounds and rows:
+        return f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}"
+    return f"loosening {bounds or rows} would do"
+
+
+def choices(found: str, known: Iterable[str], many: int = 24) -> str:
+    """List what is known; of more than ``many`` what resembles ``found``, and how many others there are."""
+    names = list(known)
+    close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
+    shown = names
+    if len(names) > many:
+        shown = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
+        shown = [name for name in names if name in shown]
+    listed = ", ".join(shown) if names else "nothing"
+    more = f" and {len(names) - len(shown)} others" if len(shown) < len(names) else ""
+    return f"{listed}{more} (did you mean {' or '.join(close)}?)" if close else listed + more

@@ -1,0 +1,201 @@
+"""Files at the border: TOML in, checked against a model; JSON out, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import to_jsonable_python
+
+from rpim_opt.basics.exceptions import InputError, RpimError, choices
+from rpim_opt.basics.units import UNITS, number, quantities
+
+Length = Annotated[float, "length"]
+Angle = Annotated[float, "angle"]
+
+
+class Misfit(ValueError):
+    """A key that a table cannot have: pydantic adds where it stands."""
+
+    def __init__(self, key: str, found: str, accepted: str):
+        super().__init__(found)
+        self.key = key
+        self.found = found
+        self.accepted = accepted
+
+
+class Table(BaseModel):
+    """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
+
+    A field annotated ``Length`` or ``Angle`` (or listing both) is given under its name plus a unit.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    @classmethod
+    def _dimensions(cls) -> dict[str, tuple[str, ...]]:
+        known = {unit.dimension for unit in UNITS.values()}
+        return {
+            name: tuple(m for m in field.metadata if m in known)
+            for name, field in cls.model_fields.items()
+            if any(m in known for m in field.metadata)
+        }
+
+    @model_validator(mode="before")
+    @classmethod
+    def _to_si(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        dimensions = cls._dimensions()
+        plain = [name for name in cls.model_fields if name not in dimensions]
+        others = {key: value for key, value in table.items() if key not in plain}
+        si = _quantities(others, dimensions, plain)
+        kept = {key: value for key, value in table.items() if key not in others}
+        return kept | si
+
+
+def _quantities(table: dict[str, Any], dimensions: dict[str, tuple[str, ...]], plain: list[str]) -> dict[str, Any]:
+    """Return the quantities of a table [SI]; a stem may stand there once, whatever its unit."""
+    try:
+        values = quantities(table, dimensions, convert=_scaled, also=plain)
+    except InputError as error:
+        key = ""
+        if error.where.startswith("key "):
+            key = error.where.removeprefix("key ")
+        raise Misfit(key, error.found, error.accepted) from None
+    si: dict[str, Any] = {}
+    for (stem, _), value in values.items():
+        if stem in si:
+            raise Misfit(stem, "the same quantity twice", "one of them")
+        si[stem] = value
+    return si
+
+
+def _scaled(value: Any, where: str, si: float) -> Any:
+    if isinstance(value, list):
+        return [_scaled(v, where, si) for v in value]
+    return number(value, where) * si
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return a TOML file's content.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is no TOML (with line and column).
+    """
+    text = _text(path, "*.toml")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("the TOML text", str(error), "TOML 1.0", path) from None
+
+
+def _text(path: Path, alike: str) -> str:
+    """Return a file's text, or say what the folder holds that is ``alike``."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        near = sorted(p.name for p in path.parent.glob(alike)) if path.parent.is_dir() else []
+        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+
+
+def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
+    """Return ``content`` as ``model``, or raise an InputError for the first thing that does not fit."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        misfit = (first.get("ctx") or {}).get("error")
+        where = _where(first["loc"])
+        if isinstance(misfit, Misfit):
+            where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
+            raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
+        if first["type"] == "missing":
+            raise InputError(f"key {where}", "nothing", "this key is required", file) from None
+        wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
+
+
+def _where(loc: tuple[int | str, ...]) -> str:
+    """Format pydantic's location the way a person counts: ``joint 3.a``."""
+    text = ""
+    for part in loc:
+        text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    write_text(path, _json(content))
+
+
+def json_text(content: Any) -> str:
+    """Return any content as JSON: arrays as lists, paths as texts, what is not finite as null."""
+    return _json(to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: value.tolist()))
+
+
+def _json(content: Any) -> str:
+    """Return JSON; a row of numbers stands on one line.
+
+    A text cannot be taken for such a row, since JSON escapes its line breaks.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False)
+    return re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text) + "\n"
+
+
+def read_json(path: Path) -> Any:
+    """Return a JSON file's content.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is no JSON (with line and column).
+    """
+    text = _text(path, "*.json")
+    try:
+        return json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text so that ``path`` holds either the whole new text or what it held before."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+@contextmanager
+def refused(path: object) -> Iterator[None]:
+    """Turn what the system refuses while ``path`` is written into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RpimError(f"{path}: cannot be written: {error}.") from None
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write bytes so that ``path`` holds either all of them or what it held before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

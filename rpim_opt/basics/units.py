@@ -1,0 +1,153 @@
+"""Units at the border: names carry them as a suffix (``d_mm``, ``q1_deg``), inside everything is SI."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+from rpim_opt.basics.exceptions import InputError, choices
+
+
+class Unit(NamedTuple):
+    """A unit's dimension and its size in SI."""
+
+    dimension: str
+    si: float
+
+
+UNITS = {
+    "m": Unit("length", 1.0),
+    "mm": Unit("length", 1e-3),
+    "um": Unit("length", 1e-6),
+    "m2": Unit("length2", 1.0),
+    "mm2": Unit("length2", 1e-6),
+    "um2": Unit("length2", 1e-12),
+    "rad": Unit("angle", 1.0),
+    "mrad": Unit("angle", 1e-3),
+    "urad": Unit("angle", 1e-6),
+    "rad2": Unit("angle2", 1.0),
+    "mrad2": Unit("angle2", 1e-6),
+    "m_rad": Unit("length angle", 1.0),
+    "mm_mrad": Unit("length angle", 1e-6),
+    "deg": Unit("angle", math.pi / 180),
+    "Nm": Unit("torque", 1.0),
+    "ppm": Unit("ratio", 1e-6),
+    "rad_per_Nm": Unit("compliance", 1.0),
+    "mrad_per_Nm": Unit("compliance", 1e-3),
+}
+
+DISPLAY = {
+    "length": "mm",
+    "angle": "deg",
+    "torque": "Nm",
+    "ratio": "ppm",
+    "compliance": "mrad_per_Nm",
+}
+"""The unit in which a dimension is shown and written."""
+
+
+def accepted_units(dimension: str) -> list[str]:
+    """Return the suffixes that a quantity of this dimension may carry."""
+    return [name for name, unit in UNITS.items() if unit.dimension == dimension]
+
+
+def display(dimension: str) -> tuple[str, float]:
+    """Return the unit for showing a dimension and its size in SI."""
+    name = DISPLAY[dimension]
+    return name, UNITS[name].si
+
+
+def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
+    """Return the columns in which joint values are written, with their unit's size in SI.
+
+    >>> from rpim_opt.basics.units import joint_columns
+    >>> joint_columns(["angle", "length"])
+    {'q1_deg': 0.017453292519943295, 'q2_mm': 0.001}
+    """
+    units = (display(dimension) for dimension in dimensions)
+    return {f"q{i}_{unit}": si for i, (unit, si) in enumerate(units, start=1)}
+
+
+def split_unit(name: str) -> tuple[str, Unit | None]:
+    """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None where there is none.
+
+    >>> from rpim_opt.basics.units import split_unit
+    >>> split_unit("q1_deg")[0]
+    'q1'
+    >>> split_unit("base_rx_mrad")[1].dimension
+    'angle'
+    >>> split_unit("label")
+    ('label', None)
+    """
+    for suffix in sorted(UNITS, key=len, reverse=True):
+        if name.endswith("_" + suffix):
+            return name.removesuffix("_" + suffix), UNITS[suffix]
+    return name, None
+
+
+def with_unit(stem: str, dimension: str, count: int = 9) -> list[str]:
+    """Return the names that a quantity may have at the border: ``d_m, d_mm, d_um``; itself where it has no unit."""
+    return [f"{stem}_{unit}" for unit in accepted_units(dimension)[:count]] or [stem]
+
+
+def spelled(stem: str, dimensions: Iterable[str], count: int = 9) -> list[str]:
+    """Return the names of a quantity that may have one of several dimensions."""
+    return [name for dimension in dimensions for name in with_unit(stem, dimension, count)]
+
+
+def number(value: Any, where: str) -> float:
+    """Return a finite number, or say what stands in its place."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(where, repr(value), "a finite number")
+    return float(value)
+
+
+def quantities(
+    table: Mapping[str, Any],
+    dimensions: Mapping[str, tuple[str, ...]],
+    where: str = "",
+    convert: Callable[[Any, str, float], Any] = lambda value, key, si: number(value, key) * si,
+    also: Iterable[str] = (),
+) -> dict[tuple[str, str], Any]:
+    """Read a table of quantities whose keys carry units.
+
+    Parameters
+    ----------
+    table
+        For instance ``{"x_mm": 1.0, "rx_deg": 90}``.
+    dimensions
+        The accepted stems with their dimensions, ``{"x": ("length",), "rx": ("angle",)}``.
+    where
+        What to call the table in an error.
+    convert
+        From a value, its key and the unit's size to SI; a finite number by default.
+    also
+        Keys to list as accepted beside these.
+
+    Returns
+    -------
+    SI values by (stem, dimension).
+
+    Raises
+    ------
+    InputError
+        For an unknown key, a missing or wrong unit, a value that is no finite number.
+    """
+    result = {}
+    for key, value in table.items():
+        place = f"{where}, key {key}" if where else f"key {key}"
+        stem, unit = split_unit(key)
+        if stem not in dimensions:
+            names = _accepted(dimensions)
+            raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
+        if unit is None or unit.dimension not in dimensions[stem]:
+            raise InputError(place, "no unit that fits", ", ".join(spelled(stem, dimensions[stem])))
+        if (stem, unit.dimension) in result:
+            raise InputError(place, "the same quantity twice", "one of them")
+        result[stem, unit.dimension] = convert(value, place, unit.si)
+    return result
+
+
+def _accepted(dimensions: Mapping[str, tuple[str, ...]]) -> list[str]:
+    return [name for stem, of in dimensions.items() for name in spelled(stem, of, 3)]

@@ -1,0 +1,159 @@
+"""The columns that a table of measurements may have, and their numbers in SI."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.tables import Columns, numbers, texts
+from rpim_opt.basics.units import spelled, split_unit, with_unit
+from rpim_opt.data.models import Measurement
+from rpim_opt.robot.mdh import Robot
+
+Numbers = dict[tuple[str, str], Array]
+"""Columns of numbers [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
+SPREADS = ("sigma", "u95")
+"""Stems of standard and expanded uncertainties."""
+
+
+def text_columns(kind: Measurement) -> list[str]:
+    """Return the columns of names that a table may have."""
+    names = ["label", "configuration", "marker", "fixture"]
+    if kind.points == 2:
+        names.append("to_marker")
+    return names
+
+
+def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
+    """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
+    joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
+    plain = {**joints, **kind.columns, **torques}
+    for form, _ in kind.forms:
+        plain |= form
+    if kind.points == 2:
+        plain |= {f"to_{stem}": dimension for stem, dimension in {**joints, **torques}.items()}
+    known = {stem: [dimension] for stem, dimension in plain.items()}
+    return known | _spread_columns(kind)
+
+
+def _spread_columns(kind: Measurement) -> dict[str, list[str]]:
+    """Return the columns in which a row states its own uncertainty."""
+    known: dict[str, list[str]] = {}
+    for spread in SPREADS:
+        known[spread] = sorted(set(kind.components.values()))
+        known |= {f"{spread}_{name}": [dimension] for name, dimension in kind.components.items()}
+    components = list(kind.components.items())
+    for i, (a, of_a) in enumerate(components):
+        for b, of_b in components[i:]:
+            known[f"cov_{a}_{b}"] = [f"{of_a}2" if of_a == of_b else f"{of_a} {of_b}"]
+    return known
+
+
+def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str]) -> Numbers:
+    """Return the columns of numbers [SI]; refuse those that are unknown, in two units, or missing."""
+    known = number_columns(robot, kind)
+    names = text_columns(kind)
+    columns: Numbers = {}
+    for name in table:
+        if name not in names:
+            _add(columns, name, table[name], known, names, label)
+    for stem in _required(columns, robot, kind):
+        if (stem, "") not in columns:
+            accepted = " or ".join(with_unit(stem, known[stem][0]))
+            raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
+    return columns
+
+
+def _add(
+    columns: Numbers,
+    name: str,
+    cells: Sequence[Any],
+    known: Mapping[str, Sequence[str]],
+    names: Sequence[str],
+    label: Sequence[str],
+) -> None:
+    """Add a column of numbers in SI."""
+    stem, unit = split_unit(name)
+    dimension = unit.dimension if unit else ""
+    si = unit.si if unit else 1.0
+    _require_known(name, stem, dimension, known, names)
+    if (stem, dimension) in columns:
+        raise InputError("the header", f"column '{stem}' in two units", "one of them")
+    values = si * numbers(cells, label, name)
+    if stem.startswith(SPREADS):
+        _require_positive(values, si, name, label)
+    columns[stem, dimension] = values
+    if len(known[stem]) == 1:
+        columns[stem, ""] = values
+
+
+def _require_known(
+    name: str, stem: str, dimension: str, known: Mapping[str, Sequence[str]], names: Sequence[str]
+) -> None:
+    if stem not in known:
+        others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
+        accepted = [each for key, dimensions in others.items() for each in spelled(key, dimensions, 1)]
+        raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
+    if dimension not in known[stem]:
+        raise InputError(
+            "the header", f"column '{name}' without a unit that fits", ", ".join(spelled(stem, known[stem]))
+        )
+
+
+def _require_positive(values: Array, si: float, name: str, label: Sequence[str]) -> None:
+    if not (values > 0).all():
+        row = label[int(np.argmin(values > 0))]
+        raise InputError(f"row {row}, column {name}", f"{values.min() / si:g}", "an uncertainty greater than zero")
+
+
+def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
+    """Return the stems that must be there: joints, measured values, and whole groups of what is there in part."""
+    joints = [f"q{i}" for i in range(1, robot.dof + 1)]
+    torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
+    required = [*joints, *values_form(columns, kind)[0]]
+    groups = [torques]
+    if kind.points == 2:
+        groups += [_second(joints), _second(torques)]
+    for group in groups:
+        if any((stem, "") in columns for stem in group):
+            required += group
+    return required
+
+
+def _second(stems: Sequence[str]) -> list[str]:
+    return [f"to_{stem}" for stem in stems]
+
+
+def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:
+    """Return the columns that state the measured values, and the function from them to y."""
+    for form, convert in kind.forms:
+        if all((stem, "") in columns for stem in form):
+            return list(form), convert
+    return list(kind.columns), lambda y: y
+
+
+def labels(table: Columns, N: int) -> tuple[str, ...]:
+    """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
+    if "label" not in table:
+        label = tuple(str(i) for i in range(1, N + 1))
+    else:
+        label = texts(table["label"], "label")
+        _require_unique(label)
+    for column in ("marker", "to_marker", "fixture", "configuration"):
+        for i, name in enumerate(texts(table.get(column, ()), column)):
+            if not name:
+                raise InputError(f"row {label[i]}, column {column}", "''", "a name")
+    return label
+
+
+def _require_unique(label: Sequence[str]) -> None:
+    seen: set[str] = set()
+    for i, name in enumerate(label, start=1):
+        if not name or name in seen:
+            raise InputError(f"row {i}, column label", f"'{name}'", "a label that no other row has")
+        seen.add(name)

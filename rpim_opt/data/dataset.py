@@ -1,0 +1,255 @@
+"""Measured data: joint values, measured values and their covariance, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.models import Measurement, position
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows of a dataset that one function evaluates: one measurement model, the same reflectors and fixture.
+
+    Parameters
+    ----------
+    measurement
+        What the instrument sees.
+    q
+        (N, p, dof) joint values of the controller [rad or m] at the p points of a row.
+    y
+        (N, c) measured values [SI], in the order of the measurement's columns.
+    covariance
+        (N, k, k) of the residual's components [SI], or (1, k, k) when it is the same for all rows.
+    row
+        (N,) which row of the dataset each one is.
+    markers
+        The reflector of each point; ``""`` for the only one.
+    fixture
+        Which anchor, plane or sphere; ``""`` for the only one.
+    torque
+        (N, p, dof) joint torques of the controller's joints [Nm], or None.
+    """
+
+    measurement: Measurement
+    q: Array
+    y: Array
+    covariance: Array
+    row: np.ndarray
+    markers: tuple[str, ...] = ("",)
+    fixture: str = ""
+    torque: Array | None = None
+
+    def take(self, index: np.ndarray, row: np.ndarray) -> Block:
+        """Return the entries at ``index``, which become the rows ``row``."""
+        covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
+        torque = None if self.torque is None else self.torque[index]
+        return replace(self, q=self.q[index], y=self.y[index], covariance=covariance, row=row, torque=torque)
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Rows of measurements, of one kind or several.
+
+    Parameters
+    ----------
+    blocks
+        The rows, grouped by what evaluates them.
+    label
+        N row labels, unique.
+    configuration
+        (N,) number of the configuration a row belongs to: rows of one configuration stay together
+        in cross-validation.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> data = ro.load("paper_arm").problem.data
+    >>> len(data), data.q.shape, data.label[:3]
+    (9, (9, 6), ('T2-1', 'T2-2', 'T2-3'))
+    >>> data.take([2, 0]).label, data.without({"T2-1"}).label[:2]
+    (('T2-3', 'T2-1'), ('T2-2', 'T2-3'))
+    """
+
+    blocks: tuple[Block, ...]
+    label: tuple[str, ...]
+    configuration: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+    @property
+    def q(self) -> Array:
+        """Joint values of the controller at every row's first point, (N, dof) [rad or m]."""
+        q = np.empty((len(self), self.blocks[0].q.shape[2]))
+        for block in self.blocks:
+            q[block.row] = block.q[:, 0]
+        return q
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
+        """Return the rows at ``index`` (K,), in that order; a row may be taken more than once."""
+        index = np.asarray(index, dtype=int)
+        owner = np.empty(len(self), dtype=int)
+        place = np.empty(len(self), dtype=int)
+        for i, block in enumerate(self.blocks):
+            owner[block.row] = i
+            place[block.row] = np.arange(len(block.row))
+        blocks = []
+        for i, block in enumerate(self.blocks):
+            row = np.flatnonzero(owner[index] == i)
+            if len(row):
+                blocks.append(block.take(place[index[row]], row))
+        return Dataset(tuple(blocks), tuple(self.label[i] for i in index), self.configuration[index])
+
+    def without(self, labels: Collection[str]) -> Dataset:
+        """Return the rows whose label is not among ``labels``."""
+        return self.take([i for i, label in enumerate(self.label) if label not in labels])
+
+    def configurations(self, count: int, seed: int) -> Dataset:
+        """Return the rows of some configurations drawn at random.
+
+        Parameters
+        ----------
+        count
+            How many configurations.
+        seed
+            Of the draw: the same seed gives the same rows.
+
+        Raises
+        ------
+        InputError
+            For a count below 1 or above the number of configurations.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("markers").problem.data  # three reflectors: three rows a configuration
+        >>> len(data), len(data.configurations(5, seed=0))
+        (75, 15)
+        """
+        known = np.unique(self.configuration)
+        if not 0 < count <= len(known):
+            raise InputError("count", f"{count}", f"1 to {len(known)} configurations")
+        drawn = np.random.default_rng(seed).choice(known, count, replace=False)
+        return self.take(np.flatnonzero(np.isin(self.configuration, drawn)))
+
+    @classmethod
+    def of(
+        cls, q: Array, y: Array, sigma: float | Array, label: tuple[str, ...] = (), measurement: Measurement = position
+    ) -> Dataset:
+        """Return a dataset from arrays.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m]; (N, p, dof) where a row involves p points.
+        y
+            (N, c) measured values [SI].
+        sigma
+            One standard deviation [SI] for all components of the residual, or their covariance, (k, k) or (N, k, k).
+        label
+            N row labels; numbers from 1 by default.
+        measurement
+            What the instrument sees.
+
+        Raises
+        ------
+        InputError
+            For shapes that do not fit together, numbers that are not finite, or a deviation that is not positive.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> data = ro.Dataset.of(np.zeros((2, 6)), [[0.3, 0.0, 0.6], [0.3, 0.1, 0.6]], sigma=3e-5)
+        >>> len(data), data.label
+        (2, ('1', '2'))
+        """
+        q = np.asarray(q, dtype=float)
+        y = np.asarray(y, dtype=float)
+        if q.ndim == 2:
+            q = q[:, None]
+        _require_shapes(q, y, measurement)
+        N = len(q)
+        rows = np.arange(N)
+        covariance = _covariance(sigma, N, len(measurement.components))
+        block = Block(measurement, q, y, covariance, rows, ("",) * measurement.points)
+        return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
+
+    @classmethod
+    def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
+        """Return several datasets as one.
+
+        Rows of different parts belong to the same configuration when their joint values are equal.
+
+        Parameters
+        ----------
+        parts
+            The datasets, of a robot.
+        names
+            What precedes the labels of each part, ``name:label``, where labels occur twice.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("paper_arm").problem.data
+        >>> twice = ro.Dataset.together([data, data], ["morning", "evening"])
+        >>> len(twice), twice.label[0], len(set(twice.configuration))
+        (18, 'morning:T2-1', 9)
+        """
+        blocks: list[Block] = []
+        configuration = []
+        rows = 0
+        count = 0
+        for part in parts:
+            blocks += [replace(block, row=block.row + rows) for block in part.blocks]
+            configuration.append(part.configuration + count)
+            rows += len(part)
+            count += int(part.configuration.max()) + 1
+        whole = cls(tuple(blocks), _unique_labels(parts, names), np.concatenate(configuration))
+        return replace(whole, configuration=_joined(whole, count))
+
+
+def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:
+    points = measurement.points
+    columns = len(measurement.columns)
+    fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (columns,)
+    if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
+        accepted = f"finite numbers, {points} x dof joint and {columns} measured values a row"
+        raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
+
+
+def _covariance(sigma: float | Array, N: int, k: int) -> Array:
+    """Return covariances (1 or N, k, k) from one standard deviation, or from covariances."""
+    covariance = np.array(sigma, dtype=float)
+    wrong = False
+    if covariance.ndim == 0:
+        wrong = not sigma > 0
+        covariance = covariance**2 * np.eye(k)
+    if covariance.ndim == 2:
+        covariance = covariance[None]
+    if wrong or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
+        raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
+    return covariance
+
+
+def _unique_labels(parts: Sequence[Dataset], names: Sequence[str]) -> tuple[str, ...]:
+    labels = [label for part in parts for label in part.label]
+    if len(set(labels)) < len(labels):
+        labels = [f"{name}:{label}" for name, part in zip(names, parts, strict=True) for label in part.label]
+    return tuple(labels)
+
+
+def _joined(data: Dataset, count: int) -> np.ndarray:
+    """Return the rows' configurations (N,), of which those with rows at equal joint values become one."""
+    stop = np.unique(data.q, axis=0, return_inverse=True)[1]
+    first = np.full(len(data), len(data))
+    np.minimum.at(first, stop, data.configuration)
+    joined = np.full(count, count)
+    np.minimum.at(joined, data.configuration, first[stop])
+    return joined[data.configuration]

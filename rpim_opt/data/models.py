@@ -1,0 +1,182 @@
+"""What an instrument sees: measurement models, symbolic in CasADi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.rotations import (
+    from_angles,
+    from_matrices,
+    quaternion,
+    rotation_between,
+    turned,
+    unit_quaternions,
+)
+from rpim_opt.data.starts import anchor_start, plane_start, sphere_start
+from rpim_opt.robot.kinematics import FRAME_DIMENSION
+
+
+def _difference(y: Any, modelled: Any) -> Any:
+    return y - modelled
+
+
+def _sum(modelled: Array, error: Array) -> Array:
+    return modelled + error
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A measurement model: the residual of a row is ``minus(y, model(T, **own))``.
+
+    Parameters
+    ----------
+    name
+        What a problem file calls it.
+    model
+        ``model(*T, **own)``: the modelled values (c, 1), from the transform T (4 x 4) of the reflector in the
+        instrument's frame, one for each point, and the measurement's own parameters by name.
+    columns
+        The columns of a data table that hold the measured values y, name to dimension: ``{"x": "length"}``
+        stands for a column ``x_mm`` or ``x_m``; dimension ``""`` for one without unit. None for a constraint,
+        whose measured value is zero.
+    components
+        The components of the residual, name to dimension, in order; the columns by default. Their names are
+        the keys of the noise per axis (``sigma_x_mm``, ``[noise] x_mm``).
+    noise
+        The keys of the noise common to all components of a dimension: ``{"position": "length"}`` stands for
+        ``[noise] position_mm``; ``{"distance": "length"}`` by default.
+    parameters
+        The measurement's own parameters, name to dimension; ``anchor_x`` is given as ``x`` of a table ``[anchor]``.
+    frames
+        The prefixes of those parameters that are frames, six each: the model gets one transform instead.
+    points
+        How many points of the robot a row involves: 2 for the distance between two.
+    minus, plus
+        Measured minus modelled (k, 1), symbolic; and its inverse on rows of numbers, ``plus(modelled, e) = y``
+        with ``minus(y, modelled) = e``, for simulations. Difference and sum by default.
+    start
+        ``start(points, y)``: own parameters by name from nominal positions (N, 3) in the instrument's frame and
+        measured values (N, c), in closed form.
+    forms
+        Other columns in which a table may state the values, each with the function to y (N, c).
+    prepare
+        Checks and normalizes y (N, c); raises `RowError` for a row that is wrong.
+
+    Examples
+    --------
+    A probe that reads heights alone. On the nominal robot, residuals of such readings are zero.
+
+    >>> import rpim_opt as ro
+    >>> height = ro.data.Measurement("height", model=lambda T: T[2, 3], columns={"z": "length"})
+    >>> arm = ro.load("paper_arm").problem
+    >>> z = ro.robot.forward_kinematics(arm.robot, arm.data.q)[:, 2, 3]
+    >>> probed = arm.on(ro.Dataset.of(arm.data.q, z[:, None], sigma=1e-5, measurement=height))
+    >>> bool(abs(probed.residual(0 * arm.parameters.free.nominal)).max() < 1e-12)
+    True
+    """
+
+    name: str
+    model: Callable[..., Any]
+    columns: Mapping[str, str]
+    components: Mapping[str, str] = field(default_factory=dict)
+    noise: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    frames: tuple[str, ...] = ()
+    points: int = 1
+    minus: Callable[[Any, Any], Any] = _difference
+    plus: Callable[[Array, Array], Array] = _sum
+    start: Callable[[Array, Array], Mapping[str, float]] | None = None
+    forms: tuple[tuple[Mapping[str, str], Callable[[Array], Array]], ...] = ()
+    prepare: Callable[[Array], Array] = lambda y: y
+
+    def __post_init__(self) -> None:
+        if not self.components:
+            object.__setattr__(self, "components", self.columns)
+        if not self.noise:
+            object.__setattr__(self, "noise", {"distance": "length"})
+
+    def __reduce__(self) -> Any:
+        """Ready measurements travel to other processes by name, so that they stay the same there."""
+        known = MEASUREMENTS.get(self.name) is self
+        return (_ready, (self.name,)) if known else super().__reduce__()
+
+
+def _ready(name: str) -> Measurement:
+    return MEASUREMENTS[name]
+
+
+def of_fixture(parameter: str, fixture: str) -> str:
+    """Return the name of an own parameter at one of several fixtures: ``anchor_x`` of A is ``anchor_A_x``."""
+    table, _, rest = parameter.partition("_")
+    return f"{table}_{fixture}_{rest}" if fixture else parameter
+
+
+_XYZ = {"x": "length", "y": "length", "z": "length"}
+_TURN = {"rx": "angle", "ry": "angle", "rz": "angle"}
+_MATRIX = {f"r{i}{j}": "" for i in (1, 2, 3) for j in (1, 2, 3)}
+_DISTANCE = {"distance": "length"}
+
+
+def _origin(T: Any) -> Any:
+    return T[:3, 3]
+
+
+position = Measurement("position", _origin, _XYZ, noise={"position": "length"})
+"""A reflector's position in the instrument's frame: r = y - p."""
+
+pose = Measurement(
+    "pose",
+    model=lambda T: ca.vertcat(_origin(T), quaternion(T)),
+    columns=_XYZ | {"qw": "", "qx": "", "qy": "", "qz": ""},
+    components=_XYZ | _TURN,
+    noise={"position": "length", "orientation": "angle"},
+    minus=lambda y, m: ca.vertcat(y[:3] - m[:3], rotation_between(y[3:], m[3:])),
+    plus=turned,
+    forms=((_XYZ | _TURN, from_angles), (_XYZ | _MATRIX, from_matrices)),
+    prepare=unit_quaternions,
+)
+"""Position and orientation in the instrument's frame: r = (y - p, log(R_measured R')), about the instrument's axes."""
+
+cable = Measurement(
+    "cable",
+    model=lambda T, anchor_x, anchor_y, anchor_z, length_0: (
+        ca.norm_2(_origin(T) - ca.vertcat(anchor_x, anchor_y, anchor_z)) + length_0
+    ),
+    columns=_DISTANCE,
+    parameters={"anchor_x": "length", "anchor_y": "length", "anchor_z": "length", "length_0": "length"},
+    start=anchor_start,
+)
+"""Distance to a fixed anchor a (draw-wire, cable): r = y - |p - a| - l, with l the reading at zero distance."""
+
+distance = Measurement("distance", lambda T1, T2: ca.norm_2(_origin(T2) - _origin(T1)), _DISTANCE, points=2)
+"""Distance between two points, of two configurations or two reflectors (paper, Eq. 21; ballbar): r = y - |p2 - p1|."""
+
+plane = Measurement(
+    "plane",
+    model=lambda T, plane: ca.dot(plane[:3, 2], _origin(T) - plane[:3, 3]),
+    columns={},
+    components=_DISTANCE,
+    parameters={f"plane_{c}": d for c, d in FRAME_DIMENSION.items()},
+    frames=("plane",),
+    start=plane_start,
+)
+"""A point on a plane, given as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
+
+sphere = Measurement(
+    "sphere",
+    model=lambda T, sphere_x, sphere_y, sphere_z, sphere_r: (
+        ca.norm_2(_origin(T) - ca.vertcat(sphere_x, sphere_y, sphere_z)) - sphere_r
+    ),
+    columns={},
+    components=_DISTANCE,
+    parameters={"sphere_x": "length", "sphere_y": "length", "sphere_z": "length", "sphere_r": "length"},
+    start=sphere_start,
+)
+"""A point on a sphere of radius R about c: r = R - |p - c|."""
+
+MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere)}

@@ -1,0 +1,166 @@
+"""Tables of measurements become a dataset, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, RowError
+from rpim_opt.basics.tables import Columns, read_columns, texts
+from rpim_opt.data.columns import Numbers, labels, numeric, values_form
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.spread import covariances, declared_noise
+from rpim_opt.robot.mdh import Robot
+
+
+def read_data(
+    source: Any, robot: Robot, noise: Mapping[str, Any] | None = None, measurement: Measurement = position
+) -> Dataset:
+    """Return the measurements of a table.
+
+    Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
+
+    - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default);
+    - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere);
+    - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
+      (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
+    - ``tau1_Nm``, ... (joint torques);
+    - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``.
+
+    Parameters
+    ----------
+    source
+        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column names
+        to cells.
+    robot
+        Its joints' number and types decide the joint columns.
+    noise
+        Standard deviations where no column states them: ``{"position_mm": 0.03}``, ``{"x_mm": 0.03, ...}``, and
+        ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker (`LaserTracker`), added to them.
+    measurement
+        Decides the columns of measured values.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the row or column, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> table = {"q1_deg": [0, 90], "q2_deg": [0, 30], "x_mm": [401, 2], "y_mm": [0, 400], "z_mm": [0, 1]}
+    >>> data = ro.read_data(table, arm, {"position_mm": 0.05})
+    >>> data.q.round(3).tolist(), data.blocks[0].y[0].tolist()  # [rad], [m]
+    ([[0.0, 0.0], [1.571, 0.524]], [0.401, 0.0, 0.0])
+    """
+    declared = declared_noise(noise or {}, measurement)  # outside: a mistake there is not the table's
+    try:
+        return _dataset(read_columns(source), robot, declared, measurement)
+    except InputError as error:
+        raise error.within(source if isinstance(source, str | Path) else None) from None
+
+
+def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Measurement) -> Dataset:
+    N = len(next(iter(table.values())))
+    label = labels(table, N)
+    columns = numeric(table, robot, kind, label)
+    y = _measured(columns, kind, label, N)
+    whole = Block(
+        kind,
+        q=_joint_values(columns, robot, kind, N),
+        y=y,
+        covariance=covariances(columns, declared, kind, y, label),
+        row=np.arange(N),
+        torque=_torques(columns, robot, kind, N),
+    )
+    markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
+    _require_two_points(whole, markers, label)
+    configuration = _configurations(table, whole.q)
+    if not {"marker", "to_marker", "fixture"} & set(table):
+        return Dataset((replace(whole, markers=("",) * kind.points),), label, configuration)
+    blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
+    return Dataset(blocks, label, configuration)
+
+
+def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:
+    """Return columns side by side, (N, len(stems))."""
+    if not stems:
+        return np.empty((N, 0))
+    return np.column_stack([columns[stem, ""] for stem in stems])
+
+
+def _joint_values(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
+    """Return the joint values (N, p, dof); the second point is in the same configuration unless it states its own."""
+    joints = [f"q{i}" for i in range(1, robot.dof + 1)]
+    points = [_several(columns, joints, N)]
+    if kind.points == 2 and ("to_q1", "") in columns:
+        points.append(_several(columns, [f"to_{stem}" for stem in joints], N))
+    elif kind.points == 2:
+        points.append(points[0])
+    return np.stack(points, axis=1)
+
+
+def _torques(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array | None:
+    """Return the joint torques (N, p, dof); the second point's are the first one's unless it states its own."""
+    if ("tau1", "") not in columns:
+        return None
+    torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
+    points = [_several(columns, torques, N)]
+    if kind.points == 2 and ("to_tau1", "") in columns:
+        torques = [f"to_{stem}" for stem in torques]
+    if kind.points == 2:
+        points.append(_several(columns, torques, N))
+    return np.stack(points, axis=1)
+
+
+def _measured(columns: Numbers, kind: Measurement, label: Sequence[str], N: int) -> Array:
+    stems, convert = values_form(columns, kind)
+    try:
+        return kind.prepare(convert(_several(columns, stems, N)))
+    except RowError as error:
+        raise error.named(f"row {label[error.row]}") from None
+
+
+def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
+    """Return the texts of the first of the columns that is there, or N empty ones."""
+    for column in columns:
+        if column in table:
+            return texts(table[column], column)
+    return ("",) * N
+
+
+def _require_two_points(whole: Block, markers: Sequence[Sequence[str]], label: Sequence[str]) -> None:
+    """Refuse a distance from a point to itself."""
+    if whole.measurement.points != 2:
+        return
+    for i, name in enumerate(label):
+        if markers[0][i] == markers[1][i] and np.array_equal(whole.q[i, 0], whole.q[i, 1]):
+            found = "twice the same reflector in the same configuration"
+            raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
+
+
+def _configurations(table: Columns, q: Array) -> np.ndarray:
+    """Return the number of every row's configuration: as stated, or by equal joint values."""
+    if "configuration" in table:
+        return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    return np.unique(q.reshape(len(q), -1), axis=0, return_inverse=True)[1]
+
+
+def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[str]) -> tuple[Block, ...]:
+    """Return the rows grouped by reflectors and fixture, in the order of their first rows."""
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, key in enumerate(zip(*markers, fixture, strict=True)):
+        groups.setdefault(key, []).append(i)
+    blocks = []
+    for (*names, place), rows in groups.items():
+        index = np.array(rows)
+        blocks.append(replace(whole.take(index, index), markers=tuple(names), fixture=place))
+    return tuple(blocks)

@@ -1,0 +1,59 @@
+"""Where measurements come from, when they were used, and by which versions."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+
+from rpim_opt.data.dataset import Dataset
+
+PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Where a calibration's data come from, and what was kept apart.
+
+    Parameters
+    ----------
+    title, source
+        What was calibrated, and where every figure comes from.
+    validation
+        Measurements that no step of the calibration saw.
+    files
+        SHA-256 of the input files, by name.
+    excluded
+        Rows that were left out, label to reason.
+    simulated
+        Whether the measurements are simulated.
+    made
+        When, UTC (ISO 8601).
+    versions
+        Of the packages that made it, by name.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> record = ro.data.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})
+    >>> record.made, sorted(record.dated().versions)[:3]
+    ('', ['casadi', 'clarabel', 'cvxpy-base'])
+    """
+
+    title: str = ""
+    source: str = ""
+    validation: Dataset | None = None
+    files: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    simulated: bool = False
+    made: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def dated(self) -> Record:
+        """Return the record with today's date and versions, unless it has some."""
+        if self.made:
+            return self
+        versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+        return replace(self, made=datetime.now(UTC).isoformat(timespec="seconds"), versions=versions)

@@ -1,0 +1,93 @@
+"""Orientations as tables state them, as a residual compares them, and as noise turns them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import RowError
+
+
+def quaternion(T: Any) -> Any:
+    """Return the unit quaternion (w, x, y, z), up to its sign, of a transform's rotation; regular everywhere.
+
+    The symmetric matrix 4 q q' is linear in the entries of R; its column with the largest diagonal entry,
+    normalized, is the quaternion and never shorter than 2 before (Shepperd 1978, J. Guidance and Control 1:223).
+    """
+    R = T[:3, :3]
+    t = R[0, 0] + R[1, 1] + R[2, 2]
+    x = R[2, 1] - R[1, 2]
+    y = R[0, 2] - R[2, 0]
+    z = R[1, 0] - R[0, 1]
+    xy = R[0, 1] + R[1, 0]
+    xz = R[0, 2] + R[2, 0]
+    yz = R[1, 2] + R[2, 1]
+    columns = [
+        ca.vertcat(1 + t, x, y, z),
+        ca.vertcat(x, 1 + 2 * R[0, 0] - t, xy, xz),
+        ca.vertcat(y, xy, 1 + 2 * R[1, 1] - t, yz),
+        ca.vertcat(z, xz, yz, 1 + 2 * R[2, 2] - t),
+    ]
+    best = columns[0]
+    size = columns[0][0]
+    for i in (1, 2, 3):
+        larger = columns[i][i] > size
+        best = ca.if_else(larger, columns[i], best)
+        size = ca.if_else(larger, columns[i][i], size)
+    return best / ca.sqrt(ca.sumsqr(best))
+
+
+def rotation_between(p: Any, q: Any) -> Any:
+    """Return the rotation vector [rad] of R(p) R(q)' for unit quaternions: the exact logarithm up to pi."""
+    w = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3]
+    x = -p[0] * q[1] + p[1] * q[0] - p[2] * q[3] + p[3] * q[2]
+    y = -p[0] * q[2] + p[1] * q[3] + p[2] * q[0] - p[3] * q[1]
+    z = -p[0] * q[3] - p[1] * q[2] + p[2] * q[1] + p[3] * q[0]
+    sign = ca.if_else(w < 0, -1, 1)
+    w = sign * w
+    v = sign * ca.vertcat(x, y, z)
+    n2 = ca.sumsqr(v)
+    small = n2 < 1e-12
+    n = ca.sqrt(ca.if_else(small, 1, n2))  # the branch not taken must have derivatives too
+    return ca.if_else(small, 2 / w * (1 - n2 / (3 * w**2)), 2 * ca.atan2(n, w) / n) * v
+
+
+def turned(y: Array, e: Array) -> Array:
+    """Move poses (N, 7) by e (N, 6), the positions and then the rotations about the instrument's axes."""
+    rotation = Rotation.from_rotvec(e[:, 3:]) * Rotation.from_quat(y[:, [4, 5, 6, 3]])
+    return np.hstack([y[:, :3] + e[:, :3], _w_first(rotation)])
+
+
+def _w_first(rotation: Rotation) -> Array:
+    return rotation.as_quat()[:, [3, 0, 1, 2]]
+
+
+def unit_quaternions(y: Array) -> Array:
+    """Return poses (N, 7) with normalized quaternions; refuse what is none."""
+    norm = np.linalg.norm(y[:, 3:], axis=1)
+    wrong = np.flatnonzero(np.abs(norm - 1) > 1e-3)
+    if len(wrong):
+        row = int(wrong[0])
+        raise RowError(row, f"a quaternion of norm {norm[row]:.4g}", "norm 1 within 0.001, w first")
+    return np.hstack([y[:, :3], y[:, 3:] / norm[:, None]])
+
+
+def from_angles(y: Array) -> Array:
+    """Return poses (N, 7) from roll, pitch, yaw (N, 6), R = Rz Ry Rx."""
+    return np.hstack([y[:, :3], _w_first(Rotation.from_euler("xyz", y[:, 3:]))])
+
+
+def from_matrices(y: Array) -> Array:
+    """Return poses (N, 7) from matrices, row by row (N, 12); refuse what is no rotation."""
+    R = y[:, 3:].reshape(-1, 3, 3)
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
+    if len(wrong):
+        row = int(wrong[0])
+        found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
+        raise RowError(row, found, "a rotation within 0.001, determinant 1")
+    return np.hstack([y[:, :3], _w_first(Rotation.from_matrix(R))])

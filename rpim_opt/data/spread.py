@@ -1,0 +1,138 @@
+"""How uncertain measured values are: what a row states of itself, else what is declared for all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import quantities, with_unit
+from rpim_opt.data.columns import Numbers
+from rpim_opt.data.models import Measurement
+from rpim_opt.data.tracker import LaserTracker
+
+TRACKER = {
+    "range": ("length", "ratio"),
+    "transverse": ("length",),
+    "angle": ("angle",),
+    "x": ("length",),
+    "y": ("length",),
+    "z": ("length",),
+}
+"""The keys of ``[noise.tracker]`` and their dimensions."""
+DEFINITE = 1e-9
+"""A correlation matrix whose smallest eigenvalue is not above this is no covariance."""
+
+
+def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
+    """Return what holds where a table states no uncertainty: standard deviations [SI], perhaps a ``tracker``."""
+    declared: dict[str, Any] = {}
+    if noise.get("tracker") is not None:
+        declared["tracker"] = _tracker(noise["tracker"], kind)
+    plain = {key: value for key, value in noise.items() if key != "tracker"}
+    accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
+    for (stem, _), value in quantities(plain, accepted, "table noise").items():
+        if not value > 0:
+            raise InputError(f"table noise, key {stem}", f"{value:g}", "a standard deviation > 0")
+        declared[stem] = value
+    return declared
+
+
+def _tracker(stated: Any, kind: Measurement) -> LaserTracker:
+    if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
+        raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
+    given = quantities(stated, TRACKER, "table noise.tracker")
+    terms = {"range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in given.items()}
+    if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
+        raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
+    return LaserTracker(**terms)
+
+
+def covariances(
+    columns: Numbers, declared: Mapping[str, Any], kind: Measurement, y: Array, label: Sequence[str]
+) -> Array:
+    """Return the covariances of the residual's components [SI], (N, k, k) or (1, k, k) where all rows are alike.
+
+    A standard deviation that a row states of itself replaces the declared one and the tracker's part of it.
+    """
+    k = len(kind.components)
+    instrument = _instrument(declared.get("tracker"), kind, y)
+    spread = []
+    own = np.zeros(k, dtype=bool)
+    for i, (name, dimension) in enumerate(kind.components.items()):
+        value = _stated(columns, name, dimension)
+        own[i] = value is not None
+        if value is None:
+            value = _declared(columns, declared, kind, name, seen=bool(instrument[:, i, i].any()))
+        spread.append(np.atleast_1d(value))
+    deviation = np.stack(np.broadcast_arrays(*spread), axis=1)
+    covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(~own, ~own)
+    covariance = _with_stated(covariance, columns, list(kind.components), len(y))
+    _require_definite(covariance, label)
+    return covariance
+
+
+def _instrument(tracker: LaserTracker | None, kind: Measurement, y: Array) -> Array:
+    k = len(kind.components)
+    if tracker is None:
+        return np.zeros((1, k, k))
+    instrument = np.zeros((len(y), k, k))
+    axes = [list(kind.columns).index(axis) for axis in "xyz"]
+    instrument[:, :3, :3] = tracker.covariance(y[:, axes])
+    return instrument
+
+
+def _stated(columns: Numbers, name: str, dimension: str) -> Array | None:
+    """Return the standard deviations that rows state: of this component before those of all of its dimension."""
+    sources = (
+        ((f"sigma_{name}", ""), 1.0),
+        (("sigma", dimension), 1.0),
+        ((f"u95_{name}", ""), 0.5),  # expanded uncertainties have coverage factor 2
+        (("u95", dimension), 0.5),
+    )
+    for key, factor in sources:
+        if key in columns:
+            return factor * columns[key]
+    return None
+
+
+def _declared(columns: Numbers, declared: Mapping[str, Any], kind: Measurement, name: str, seen: bool) -> float:
+    """Return the declared standard deviation of a component, zero where the instrument or a column has it all."""
+    dimension = kind.components[name]
+    common = next((key for key, of in kind.noise.items() if of == dimension), "")
+    value = declared.get(name, declared.get(common))
+    if value is not None:
+        return value
+    if not seen and (f"cov_{name}_{name}", "") not in columns:
+        column = with_unit(f"sigma_{name}", dimension, 2)[-1]
+        accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
+        raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
+    return 0.0
+
+
+def _with_stated(covariance: Array, columns: Numbers, names: list[str], N: int) -> Array:
+    """Return the covariances with the entries that columns ``cov_x_y_mm2`` state."""
+    pairs = [(a, b) for a in names for b in names if (f"cov_{a}_{b}", "") in columns]
+    if not pairs:
+        return covariance
+    k = len(names)
+    whole = np.broadcast_to(covariance, (N, k, k)).copy()
+    for a, b in pairs:
+        i = names.index(a)
+        j = names.index(b)
+        whole[:, i, j] = columns[f"cov_{a}_{b}", ""]
+        whole[:, j, i] = whole[:, i, j]
+    return whole
+
+
+def _require_definite(covariance: Array, label: Sequence[str]) -> None:
+    unit = np.sqrt(np.einsum("nii->ni", covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :]))
+    smallest = np.linalg.eigvalsh(correlation)[:, 0]
+    if not (smallest > DEFINITE).all():
+        row = label[int(np.argmin(smallest > DEFINITE))]
+        raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")

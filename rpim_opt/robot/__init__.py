@@ -1,0 +1,5 @@
+"""The machine as its drawing says, and its kinematics."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,17 @@
+from .chain import Described as Described
+from .chain import without_beta as without_beta
+from .kinematics import forward_kinematics as forward_kinematics
+from .library import robots as robots
+from .mdh import Robot as Robot
+from .mdh import read_robot as read_robot
+from .model import model_parameters as model_parameters
+from .parameters import Parameters as Parameters
+from .plain import read_mdh as read_mdh
+from .plain import write_robodk as write_robodk
+from .plain import write_robot as write_robot
+from .ur_calibration import read_ur_calibration as read_ur_calibration
+from .ur_calibration import write_ur_calibration as write_ur_calibration
+from .ur_kinematics import read_ur_kinematics as read_ur_kinematics
+from .ur_kinematics import write_ur_kinematics as write_ur_kinematics
+from .urdf import read_urdf as read_urdf
+from .urdf import write_urdf as write_urdf

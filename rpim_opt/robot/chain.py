@@ -1,0 +1,254 @@
+"""Any serial chain as modified DH with Hayati's beta, and identified parameters back on the chain's own frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, link, numeric_frame
+from rpim_opt.robot.mdh import MDH, Robot
+
+NEAR_PARALLEL = 0.1
+"""Axes nearer to parallel than this [rad] get Hayati's beta, as `observability.near_parallel` proposes."""
+ANOTHER_ARM = 0.1
+"""A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
+SAME_PLACE = (0.01, 0.1)
+"""Two frames nearer than this [m], [rad] are one and the same, known twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """A robot as a file describes it: what the file calls the tip is at base @ MDH chain(q) @ tool.
+
+    Parameters
+    ----------
+    robot
+        The arm.
+    base, tool
+        (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them.
+    names
+        The file's names of the joints.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> arm = ro.robot.Described(robot, base=[0, 0, 0.5, 0, 0, 0], tool=[0, 0, 0.1, 0, 0, 0])
+    >>> ro.robot.model_parameters(arm.robot, arm.base, {"": arm.tool}).identify(["base_z", "tool_z"]).free.nominal
+    array([0.5, 0.1])
+    """
+
+    robot: Robot
+    base: Array
+    tool: Array
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Joints about axes of their own frames: O_1 J_1(q_1) O_2 J_2(q_2) ... O_n J_n(q_n) tail.
+
+    Parameters
+    ----------
+    origins
+        (n, 4, 4) transforms O_i from the frame of joint i-1 to that of joint i at rest.
+    axes
+        (n, 3) unit vectors that the joints turn about or move along.
+    tail
+        (4, 4) transform from the last joint's frame to the tip.
+    """
+
+    origins: Array
+    axes: Array
+    tail: Array
+
+    @classmethod
+    def about_z(cls, origins: Sequence[Array], tail: Array) -> Chain:
+        """Return a chain whose axes are all z."""
+        return cls(np.array(origins), np.tile([0.0, 0.0, 1.0], (len(origins), 1)), tail)
+
+
+def same_place(one: Array, other: Array) -> bool:
+    """Return whether two frames (6,) are within `SAME_PLACE`."""
+    T = np.linalg.inv(numeric_frame(one)) @ numeric_frame(other)
+    angle = Rotation.from_matrix(T[:3, :3]).magnitude()
+    return bool(np.linalg.norm(T[:3, 3]) < SAME_PLACE[0] and angle < SAME_PLACE[1])
+
+
+def placed(place: Array) -> str:
+    """Say a frame (6,)."""
+    values = [*(1e3 * place[:3]), *np.degrees(place[3:])]
+    return " ".join(f"{name} {value + 0.0:.3f}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg"
+
+
+def describe(
+    chain: Chain, near: Array | None = None, parallel: float = NEAR_PARALLEL
+) -> tuple[Array, Array, Array, Array]:
+    """Return the MDH table (n, 5), base (4, 4), tool (4, 4), and what ties the chain's frames to the table's.
+
+    Joint i+1 is reached from joint i by Rot(z, theta_i) Trans(z, d_i) Rot(y, beta_i) Rot(x, alpha_i+1)
+    Trans(x, a_i+1): six numbers for a line have one freedom to spare. Where the axes cross at more than
+    ``parallel`` [rad], beta_i = 0 and x is the common normal (Craig). Otherwise d_i = 0 and x is the perpendicular
+    from frame i's origin to the next axis, which beta_i tilts out of the plane (Hayati 1983): every number stays
+    finite and changes little with the axes. Of the two directions of x the one nearer to theta_i = 0 is taken.
+
+    The base has the first axis as z and is where that axis is nearest to the chain's start; it is the identity
+    where that axis is the start's z. The last MDH frame is the last joint's own, turned so that its axis is z.
+
+    Parameters
+    ----------
+    chain
+        The joints.
+    near
+        (n, 5) table whose theta (up to half a turn) and, where axes are parallel, d are wanted instead of zero.
+    parallel
+        Angle [rad] below which axes count as near parallel.
+
+    Returns
+    -------
+    The fourth, G (n, 4, 4), is constant: frame of joint i = MDH frame i before its Rot(y, beta_i), times G_i.
+    """
+    n = len(chain.axes)
+    near = np.zeros((n, 5)) if near is None else near
+    table = np.zeros((n, 5))
+    G = np.zeros((n, 4, 4))
+    turns = np.array([_to_axis(axis) for axis in chain.axes])
+    start = chain.origins[0] @ turns[0]
+    coaxial = np.abs(start[:2, 2:]).max() < 1e-12 and start[2, 2] > 0
+    # C_i commutes with joint i's motion: Rot(z) Trans(z)
+    C = np.linalg.inv(start) if coaxial else link_of(d=-start[:3, 2] @ start[:3, 3])
+    base = np.eye(4) if coaxial else start @ C
+    for i in range(n - 1):
+        step = turns[i].T @ chain.origins[i + 1] @ turns[i + 1]
+        theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, near[i, 2], near[i, 3], parallel)
+        table[i, 2:] = theta, d, beta
+        table[i + 1, :2] = alpha, a
+        G[i] = np.linalg.inv(C @ link_of(theta=theta, d=d)) @ turns[i].T
+        C = np.linalg.inv(step) @ C @ link_of(theta=theta, d=d, beta=beta) @ link_of(alpha=alpha, a=a)
+    table[-1, 2:4] = _turned(-np.arctan2(C[1, 0], C[0, 0]), near[-1, 2]), -C[2, 3]
+    G[-1] = turns[-1].T
+    return table + 0.0, base, turns[-1].T @ chain.tail, G
+
+
+def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Array], Array]:
+    """Return the origins and tail that give other MDH parameters, base and tool on the frames of `describe`.
+
+    With the MDH frame i before Rot(y, beta_i) times G_i as the frame of joint i::
+
+        O_i  = G_i-1^-1 Rot(y, beta_i-1) Rot(x, alpha_i) Trans(x, a_i) Rot(z, theta_i) Trans(z, d_i) G_i
+        tail = G_n^-1 Rot(y, beta_n) tool
+
+    (O_1 with the base in place of G_0^-1.) What joint i's own zero and place are wrong by moves the frame of link i.
+    """
+    before = [base, *(np.linalg.inv(g) @ link_of(beta=row[4]) for g, row in zip(G, table, strict=True))]
+    origins = [b @ link_of(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
+    return origins, before[-1] @ tool
+
+
+def require_same_arm(robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path) -> None:
+    """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints, or another drawing."""
+    if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, np.eye(len(joint_types))):
+        found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")
+        raise InputError("joints of the robot", found, f"those of the file, {', '.join(joint_types)}", file)
+    deviation = np.abs(robot.mdh - table)
+    deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
+    joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
+    if deviation[joint, column] > ANOTHER_ARM:
+        found = f"{MDH[column]}{joint + 1} off by {deviation[joint, column]:.3g} m or rad"
+        accepted = "a robot whose parameters were identified from this file's"
+        raise InputError("robot", found, accepted, file)
+
+
+def without_beta(robot: Robot) -> Robot:
+    """Return the same arm in four numbers a joint: every Hayati parameter zero, common normals throughout.
+
+    Where axes are nearly parallel the common normal, and with it d of both joints, may be hundreds of metres away.
+
+    Raises
+    ------
+    InputError
+        For a beta after the last joint, which belongs to the tool, or axes so nearly parallel that the
+        four numbers lose more than 1e-9 m or rad.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> mdh = [[0, 0, 0, 0, 0.001], [0, 0.4, 0, 0, 0]]  # the second axis is tilted by a milliradian
+    >>> arm = ro.robot.Robot("two links", np.array(mdh))
+    >>> plain = ro.robot.without_beta(arm)
+    >>> plain.mdh[:, 3].round(3)  # d [m]: the common normal is far away
+    array([-400.,  400.])
+    >>> q = np.array([[0.3, -0.5]])
+    >>> bool(np.allclose(ro.robot.forward_kinematics(plain, q), ro.robot.forward_kinematics(arm, q)))
+    True
+    """
+    table = robot.mdh
+    n = robot.dof
+    if table[-1, 4]:
+        raise InputError("robot", f"beta{n} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint")
+    before = [np.eye(4), *(link_of(beta=row[4]) for row in table[:-1])]
+    origins = [b @ link_of(*row[:4]) for b, row in zip(before, table, strict=True)]
+    origins[0] = link_of(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
+    plain = describe(Chain.about_z(origins, np.eye(4)), table, 1e-10)[0]
+    plain[0, :2] = table[0, :2]
+    plain[:, 4] = 0.0
+    result = replace(robot, mdh=plain)
+    q = np.random.default_rng(0).uniform(-1, 1, (20, n))
+    lost = float(np.abs(forward_kinematics(result, q) - forward_kinematics(robot, q)).max())
+    if lost > 1e-9:
+        raise InputError("robot", f"axes too nearly parallel (loses {lost:.1g})", "a table with beta", robot.name)
+    return result
+
+
+def link_of(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
+    """Return the link's transform (4, 4) as numbers."""
+    return ca.DM(link(*(float(v) for v in (alpha, a, theta, d, beta)))).full()
+
+
+def _to_axis(axis: Array) -> Array:
+    """Return the smallest turn (4, 4) that takes z to a unit vector."""
+    T = np.eye(4)
+    v = np.cross([0.0, 0.0, 1.0], axis)
+    s = float(np.linalg.norm(v))
+    turn = v / s if s > 0 else np.array([1.0, 0.0, 0.0])  # to -z: about x
+    T[:3, :3] = Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
+    return T
+
+
+def _step(M: Array, theta0: float, d0: float, parallel: float) -> tuple[float, float, float, float, float]:
+    """Return theta, d, beta, alpha, a that reach the z axis of M, as `describe` says."""
+    v = M[:3, 2]
+    p = M[:3, 3]
+    sine = np.hypot(v[0], v[1])
+    if sine > np.sin(parallel):
+        x = np.array([-v[1], v[0], 0.0]) / sine
+        d = p[2] + v[2] * (-p[:2] @ v[:2]) / sine**2
+        a = p @ x
+    else:
+        d = d0
+        foot = p - [0, 0, d]
+        foot = foot - (foot @ v) * v
+        a = float(np.linalg.norm(foot))
+        a, x = (a, foot / a) if a > 1e-11 else (0.0, np.array([np.cos(theta0), np.sin(theta0), 0.0]))
+        x = x - (x @ v) * v  # a short a leaves x inexact
+        x = x / np.linalg.norm(x)
+    if x[:2] @ [np.cos(theta0), np.sin(theta0)] < -1e-9:
+        x = -x
+        a = -a
+    theta = np.arctan2(x[1], x[0])
+    beta = np.arctan2(-x[2], np.hypot(x[0], x[1]))
+    w = np.linalg.inv(link_of(theta=theta, beta=beta))[:3, :3] @ v
+    return _turned(theta, theta0), float(d), float(beta), float(np.arctan2(-w[1], w[2])), float(a)
+
+
+def _turned(angle: float, near: float) -> float:
+    """Return the angle plus the full turns that bring it nearest to another."""
+    return float(angle + 2 * np.pi * np.round((near - angle) / (2 * np.pi)))

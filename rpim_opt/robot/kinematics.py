@@ -1,0 +1,228 @@
+"""Symbolic kinematics in CasADi: homogeneous transforms, the MDH chain, frames.
+
+Every function takes and returns CasADi ``SX`` (numbers are welcome) and builds 4 x 4 matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.robot.mdh import MDH, Robot
+
+FRAME = ("x", "y", "z", "rx", "ry", "rz")
+"""A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
+
+FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
+
+JOINT_EXTRAS = {"ratio": "ratio", "ecc_cos": "angle", "ecc_sin": "angle", "compliance": "compliance"}
+"""Parameters of a joint beyond its MDH row, with their dimensions; all are zero in a nominal robot."""
+
+CHUNK = 256
+"""Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
+
+Symbol = Any  # ca.SX or a number: CasADi ships no types
+
+
+def rotation_x(angle: Symbol) -> ca.SX:
+    """Rot(x, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0])
+
+
+def rotation_y(angle: Symbol) -> ca.SX:
+    """Rot(y, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0])
+
+
+def rotation_z(angle: Symbol) -> ca.SX:
+    """Rot(z, angle)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    return _rows([c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0])
+
+
+def translation(x: Symbol = 0, y: Symbol = 0, z: Symbol = 0) -> ca.SX:
+    """Trans(x, y, z)."""
+    return _rows([1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z])
+
+
+def _rows(*rows: Sequence[Symbol]) -> ca.SX:
+    return ca.vertcat(*(ca.horzcat(*row) for row in rows), ca.horzcat(0, 0, 0, 1))
+
+
+def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> ca.SX:
+    """Return Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta), the paper's Eq. (1)."""
+    along_x = rotation_x(alpha) @ translation(x=a)
+    along_z = rotation_z(theta) @ translation(z=d)
+    return along_x @ along_z @ rotation_y(beta)
+
+
+def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
+    """Return Rz(rz) Ry(ry) Rx(rx): roll, pitch, yaw about fixed axes, as in URDF."""
+    return rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx)
+
+
+def roll_pitch_yaw(R: Array) -> Array:
+    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx.
+
+    Roll is read off what yaw leaves, so that the three give R back near a pitch of 90 degrees too, where they lose
+    their meaning one by one.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0]) if np.hypot(R[1, 0], R[0, 0]) > 1e-12 else np.arctan2(-R[0, 1], R[1, 1])
+    c, s = np.cos(yaw), np.sin(yaw)
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])), yaw])
+
+
+def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> ca.SX:
+    """Return a frame displaced from its nominal place.
+
+    The deviation (x, y, z, rx, ry, rz) is along and about the axes of the *parent* frame::
+
+        origin = nominal origin + (x, y, z)
+        R      = R(rx, ry, rz) R(nominal)
+
+    so that it is regular wherever the nominal frame points: adding to roll, pitch and yaw
+    instead would be singular at a nominal pitch of 90 degrees.
+    """
+    origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
+    return translation(*origin) @ rotation_rpy(*deviation[3:]) @ rotation_rpy(*nominal[3:])
+
+
+def numeric_frame(place: Sequence[float] | Array) -> Array:
+    """Return the transform (4, 4) of a frame's six numbers."""
+    return _frame()([float(v) for v in place]).full()
+
+
+@lru_cache(maxsize=1)
+def _frame() -> ca.Function:
+    numbers = ca.SX.sym("place", 6)
+    return ca.Function("frame", [numbers], [frame(ca.vertsplit(numbers))])
+
+
+def frame_numbers(T: Array) -> Array:
+    """Return the six numbers of a transform (4, 4), the inverse of `numeric_frame`."""
+    return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
+
+
+def motion(kind: str, i: int, q: Symbol, torque: Symbol, value: Callable[[str], Symbol]) -> Symbol:
+    """Return by how much joint i has moved [rad or m].
+
+    ``value("ratio2")`` gives the parameters::
+
+        (1 + ratio) q + ecc_cos cos q + ecc_sin sin q + compliance torque        revolute
+        (1 + ratio) q                                                            prismatic
+
+    for the model's joint value q [rad or m] and the joint's torque [Nm].
+    """
+    moved = (1 + value(f"ratio{i}")) * q
+    if kind == "revolute":
+        moved += value(f"ecc_cos{i}") * ca.cos(q) + value(f"ecc_sin{i}") * ca.sin(q) + value(f"compliance{i}") * torque
+    return moved
+
+
+def transforms(
+    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
+) -> list[ca.SX]:
+    """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
+
+    ``value("alpha2")`` gives the parameters; joints move by `motion`.
+    """
+    T = ca.SX.eye(4)
+    after = []
+    for i, kind in enumerate(joint_types, start=1):
+        alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
+        moved = motion(kind, i, q[i - 1], torque[i - 1], value)
+        T = T @ (
+            link(alpha, a, theta + moved, d, beta) if kind == "revolute" else link(alpha, a, theta, d + moved, beta)
+        )
+        after.append(T)
+    return after
+
+
+def chain(
+    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
+) -> ca.SX:
+    """Return the transform from the robot's base to its flange; arguments as for `transforms`."""
+    return transforms(joint_types, q, torque, value)[-1]
+
+
+@lru_cache(maxsize=32)
+def _flange(joint_types: tuple[str, ...]) -> ca.Function:
+    """Build the flange's transform from the table, row by row, and joint values: once for all arms of a kind."""
+    dof = len(joint_types)
+    table, q = ca.SX.sym("mdh", dof * len(MDH)), ca.SX.sym("q", dof)
+    names = [f"{column}{i}" for i in range(1, dof + 1) for column in MDH]
+    value = dict(zip(names, ca.vertsplit(table), strict=True))
+    T = chain(joint_types, ca.vertsplit(q), (0,) * dof, lambda name: value.get(name, ca.SX(0)))
+    return ca.Function("flange", [table, q], [T])
+
+
+def forward_kinematics(robot: Robot, q: Array) -> Array:
+    """Return the transforms (N, 4, 4) from the robot's base to its flange, the product of the links of `Robot`.
+
+    Parameters
+    ----------
+    robot
+        The arm; base and tool are no part of it.
+    q
+        (N, dof) joint values of the controller [rad or m].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> ro.robot.forward_kinematics(arm, np.array([[0, 0], [np.pi / 2, 0]]))[:, :3, 3].round(9)
+    array([[0.4, 0. , 0. ],
+           [0. , 0.4, 0. ]])
+    """
+    configurations = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
+    function = _flange(tuple(robot.joint_types))
+    return call_rows(function, [robot.mdh.ravel()], configurations)[0].reshape(-1, 4, 4).transpose(0, 2, 1)
+
+
+def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+    """Evaluate a CasADi function on every row of a table, many in one call, without copies.
+
+    Parameters
+    ----------
+    function
+        Inputs: one column for each of ``shared``, then one column that changes with the row.
+    shared
+        Inputs that are the same for all rows.
+    rows
+        (N, k), one input column a row.
+
+    Returns
+    -------
+    For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
+    """
+    results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
+    arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
+    buffers: dict[int, Any] = {}
+    for start in range(0, len(rows), CHUNK):
+        part = slice(start, start + CHUNK)
+        N = len(rows[part])
+        if N not in buffers:
+            buffers[N] = _mapped(function, len(shared), N).buffer()
+            for i, values in enumerate(arguments[:-1]):
+                buffers[N][0].set_arg(i, values.data)
+        buffer, trigger = buffers[N]
+        buffer.set_arg(len(shared), arguments[-1][part].data)
+        for i, values in enumerate(results):
+            buffer.set_res(i, values[part].data)
+        trigger()
+    return results
+
+
+@lru_cache(maxsize=512)
+def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
+    """Return the function of N rows."""
+    return ca.Function.map(function, "rows", "serial", N, list(range(shared)), [], {})

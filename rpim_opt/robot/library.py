@@ -1,0 +1,45 @@
+"""The robot that a problem names: a file of any kind, or one of the ready robots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.robot.chain import Described
+from rpim_opt.robot.plain import read_mdh
+from rpim_opt.robot.urdf import read_urdf
+
+READY = Path(__file__).resolve().parent / "ready"
+
+
+ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
+
+
+def robots() -> list[str]:
+    """Return the names of the ready robots, which a problem file may name: ``robot = "ur5e"``.
+
+    >>> import rpim_opt as ro
+    >>> ro.robots()[-3:]
+    ['ur3e', 'ur5', 'ur5e']
+    """
+    return sorted(p.stem for p in READY.glob("*.toml"))
+
+
+def find_robot(name: str, folder: Path | None = None) -> Path:
+    """Return the file of a robot: one in ``folder``, or a ready robot by name."""
+    if folder is not None and name.endswith(ROBOT_FILES):
+        return folder / name
+    if name in robots():
+        return READY / f"{name}.toml"
+    accepted = "a file .toml, .urdf, .csv or .json, or a ready robot: " + choices(name, robots())
+    file = None if folder is None else folder / "problem.toml"
+    raise InputError("key robot", f"'{name}'", accepted, file)
+
+
+def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
+    """Return the robot of a file, with base and tool where a URDF states them."""
+    if file.suffix == ".urdf":
+        return read_urdf(file, urdf_base, urdf_tip)
+    return Described(read_mdh(file), np.zeros(6), np.zeros(6))

@@ -1,0 +1,97 @@
+"""Every parameter of a model: of the joints, the base, the reflectors and the measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.robot.kinematics import FRAME_DIMENSION, JOINT_EXTRAS
+from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, tool_prefix
+from rpim_opt.robot.parameters import Parameters
+
+Entry = tuple[str, str, float]
+"""Name, dimension and nominal value [SI]."""
+DEFAULT_SCALE = {
+    ("length", "length"): 1e-3,
+    ("angle", "angle"): 1e-3,
+    ("ratio", "ratio"): 1e-3,
+    ("compliance", "compliance"): 1e-5,
+    ("tool", "length"): 10e-3,
+    ("tool", "angle"): 10e-3,
+    ("base", "length"): 100e-3,
+    ("base", "angle"): 100e-3,
+}
+"""Expected size of deviations by (group, dimension), in SI, where a problem states none."""
+
+
+def model_parameters(
+    robot: Robot,
+    base: Sequence[float] | Array = (0.0,) * 6,
+    tools: Mapping[str, Sequence[float] | Array] | None = None,
+    own: Mapping[str, tuple[str, float]] | None = None,
+    own_frames: tuple[str, ...] = (),
+) -> Parameters:
+    """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
+
+    Parameters
+    ----------
+    robot
+        Gives the MDH parameters' nominal values.
+    base
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
+    tools
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
+    own
+        Further parameters, those of the measurement: name to (dimension, nominal value [SI]).
+    own_frames
+        Prefixes of those that are frames, ``plane_``.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parameters = ro.robot.model_parameters(robot, tools={"A": (0, 0, 0.06, 0, 0, 0)})
+    >>> parameters.identify(["d1", "tool_A_z"]).free.nominal
+    array([0.099927, 0.06    ])
+    """
+    entries = list(_of_joints(robot))
+    entries += _of_frame("base_", base)
+    if not tools:
+        tools = {"": (0.0,) * 6}
+    for marker, tool in tools.items():
+        entries += _of_frame(tool_prefix(marker), tool)
+    if own is not None:
+        entries += [(name, dimension, value) for name, (dimension, value) in own.items()]
+    names, dimensions, nominal = zip(*entries, strict=True)
+    # own dimensions of a measurement have no usual size: their unit's
+    scale = [DEFAULT_SCALE.get((group_of(name, dimension), dimension), 1.0) for name, dimension, _ in entries]
+    return Parameters(
+        names,
+        dimensions,
+        np.array(nominal, dtype=float),
+        np.array(scale),
+        np.full(len(names), np.inf),
+        np.zeros(len(names), dtype=bool),
+        own_frames,
+    )
+
+
+def _of_joints(robot: Robot) -> Iterator[Entry]:
+    """Yield the table's parameters row by row, then what the joints have besides, zero on the drawing."""
+    for i, row in enumerate(robot.mdh, start=1):
+        for column, value in zip(MDH, row, strict=True):
+            yield f"{column}{i}", MDH_DIMENSION[column], value
+    for i, kind in enumerate(robot.joint_types, start=1):
+        extras = {"ratio": "ratio"}
+        if kind == "revolute":
+            extras = JOINT_EXTRAS
+        for extra, dimension in extras.items():
+            yield f"{extra}{i}", dimension, 0.0
+
+
+def _of_frame(prefix: str, place: Sequence[float] | Array) -> Iterator[Entry]:
+    for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
+        yield prefix + axis, dimension, value

@@ -1,0 +1,42 @@
+"""A robot's file as it was handed over: its bytes, of which only the numbers that change are replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.robot.kinematics import frame_numbers
+
+LARGEST = 2**24
+"""Bytes that a description may have: a hundred times what the largest public ones need."""
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return a file's content, or say that there is none or too much of it."""
+    try:
+        size = path.stat().st_size if path.is_file() else None
+        if size is None or size > LARGEST:
+            found = "nothing" if size is None else f"{size} bytes"
+            raise InputError("the file", found, f"a file of at most {LARGEST} bytes", path)
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError("the file", str(error), "a readable file", path) from None
+
+
+def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:
+    """Return ``data`` with the bytes from start to end replaced by texts, everything else as it was."""
+    for (start, end), text in sorted(edits.items(), reverse=True):
+        data = data[:start] + text.encode() + data[end:]
+    return data
+
+
+def origin_numbers(T: Array, old: Array) -> tuple[str | None, str | None]:
+    """Return an origin's new xyz and rpy as texts that read back exactly; None for what is as it was."""
+    six = frame_numbers(T) + 0.0  # no negative zeros
+    texts = [" ".join(repr(float(v)) for v in part) for part in (six[:3], six[3:])]
+    moved = np.abs(T[:3, 3] - old[:3, 3]).max() > 1e-14
+    turned = np.abs(T[:3, :3] - old[:3, :3]).max() > 1e-14
+    return texts[0] if moved else None, texts[1] if turned else None

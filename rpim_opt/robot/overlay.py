@@ -1,0 +1,62 @@
+"""Values that a table gives to parameters: by name, by pattern, or to a whole group."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import quantities, split_unit
+from rpim_opt.robot.parameter_names import group_of
+
+PATTERN = re.compile(r"[*?\[]")
+
+
+class Overlay:
+    """The parameters that a table may speak of.
+
+    Parameters
+    ----------
+    names, dimensions
+        Of the parameters, one each.
+    """
+
+    def __init__(self, names: Sequence[str], dimensions: Sequence[str]) -> None:
+        self.names = names
+        self.dimensions = dimensions
+        self.groups = [group_of(name, dimension) for name, dimension in zip(names, dimensions, strict=True)]
+
+    def on(self, values: Array, table: Mapping[str, float], where: str) -> Array:
+        """Return values (P,) [SI] with those of a table in their places; what names fewer parameters goes before."""
+        result = values.copy()
+        given = quantities(table, self._accepted(table), where)
+        for (stem, dimension), value in sorted(given.items(), key=lambda item: self._rank(item[0][0])):
+            if not value > 0:
+                raise InputError(f"{where}, key {stem}", f"{value:g}", "a number greater than zero")
+            result[list(self._places(stem, dimension))] = value
+        return result
+
+    def _accepted(self, table: Mapping[str, float]) -> dict[str, tuple[str, ...]]:
+        """Return what keys may name, with the dimensions that it has: groups, names, and the table's own patterns."""
+        stems: dict[str, set[str]] = {}
+        for name, group, dimension in zip(self.names, self.groups, self.dimensions, strict=True):
+            stems.setdefault(group, set()).add(dimension)
+            stems.setdefault(name, set()).add(dimension)
+        for key in filter(PATTERN.search, table):
+            stem, _ = split_unit(key)
+            met = [d for name, d in zip(self.names, self.dimensions, strict=True) if fnmatchcase(name, stem)]
+            stems.setdefault(stem, set()).update(met)
+        return {stem: tuple(sorted(dimensions)) for stem, dimensions in stems.items()}
+
+    def _rank(self, stem: str) -> int:
+        """Return the order in which keys are carried out: groups, patterns, names."""
+        if stem in self.names:
+            return 2
+        return int(PATTERN.search(stem) is not None)
+
+    def _places(self, stem: str, dimension: str) -> Iterator[int]:
+        for i, name in enumerate(self.names):
+            if self.dimensions[i] == dimension and (stem == self.groups[i] or fnmatchcase(name, stem)):
+                yield i

@@ -1,0 +1,2 @@
+from . import plot as plot
+from .report import write_report as write_report

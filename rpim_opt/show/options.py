@@ -1,0 +1,54 @@
+"""What options of the command line mean, and what they may not be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import radians
+from pathlib import Path
+from typing import Any
+
+from rpim_opt.basics.exceptions import InputError
+
+Writer = tuple[Path, Callable[[Path], Any]]
+"""A file, and what is to be done with it."""
+
+
+def require_positive(where: str, value: float | None) -> None:
+    """Refuse a limit that nothing can keep."""
+    if value is not None and not value > 0:
+        raise InputError(where, f"{value:g}", "a number greater than zero [mm]")
+
+
+def corrected_files(writers: Sequence[tuple[Path | None, Callable[[Path], Any]]], out: Path | None) -> list[Writer]:
+    """Return the corrected files that are asked for: where they go, and what writes them."""
+    asked = [(source, write) for source, write in writers if source]
+    if not asked:
+        return []
+    targets = _targets([source for source, _ in asked], out)
+    return [(target, write) for target, (_, write) in zip(targets, asked, strict=True)]
+
+
+def _targets(sources: Sequence[Path], out: Path | None) -> list[Path]:
+    """Return where every corrected file goes: ``--out``, or a file of the same name in that folder."""
+    if out is None:
+        raise InputError("--out", "nothing", f"where to write the corrected {sources[0].name}")
+    targets = [out]
+    if len(sources) > 1 or out.is_dir():
+        targets = [out / source.name for source in sources]
+    for source, target in zip(sources, targets, strict=True):
+        if target.resolve() == source.resolve():
+            raise InputError("--out", f"the original, {source}", "another place: the original stays")
+    return targets
+
+
+def tool_frame(text: str | None) -> list[float] | None:
+    """Return a tool [m, rad] from six numbers in mm and degrees."""
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 6:
+        raise InputError("--tool", f"'{text}'", "six numbers: x,y,z [mm], roll,pitch,yaw [deg]")
+    return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]

@@ -1,0 +1,101 @@
+"""A report that somebody else can check: one HTML page that works offline, with figures, evidence and provenance."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from rpim_opt.basics.files import write_text
+from rpim_opt.basics.markup import html, tag
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.show.section_errors import errors_section
+from rpim_opt.show.section_evidence import convergence_section, distrusted_section, identifiability_section
+from rpim_opt.show.section_parameters import parameters_section
+from rpim_opt.show.section_provenance import provenance_section
+from rpim_opt.show.section_space import space_section
+from rpim_opt.show.section_summary import summary_section
+from rpim_opt.show.section_weight import weight_section
+
+HERE = Path(__file__).resolve().parent
+
+
+def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
+    """Write a report of a calibration: one HTML file that needs no network.
+
+    For whoever has to believe the result: a summary in one sentence and three figures; then errors before and after,
+    in space too, how the weight was chosen, the parameters with intervals and tolerances, what the data cannot tell
+    apart, distrusted rows, convergence, and where the data come from. Every text of a user's file is shown as text.
+
+    Parameters
+    ----------
+    calibration
+        As `calibrate` or `load_result` return it.
+    path
+        The file; whole or not written at all.
+    validation
+        Measurements that no step of the calibration saw; those of the calibration's record by default.
+
+    Raises
+    ------
+    InputError
+        For validation data that do not belong to the problem, or measurements without a length.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
+    >>> ro.show.write_report(result, "report.html", instance.validation)
+    >>> "0.032" in Path("report.html").read_text(encoding="utf-8")
+    True
+    """
+    record = calibration.record.dated()
+    record = record if validation is None else replace(record, validation=validation)
+    write_text(Path(path), page(replace(calibration, record=record)))
+
+
+def page(result: Calibration) -> str:
+    """Return the report as HTML; only its own style and script may run, and nothing can be loaded."""
+    data: dict[str, Any] = {}
+    title = result.record.title or result.problem.robot.name
+    parts = [
+        *summary_section(result),
+        *errors_section(result),
+        *space_section(result, data),
+        *weight_section(result, data),
+        *parameters_section(result),
+        *identifiability_section(result),
+        *distrusted_section(result),
+        *convergence_section(result),
+        *provenance_section(result),
+    ]
+    style = (HERE / "report.css").read_text(encoding="utf-8")
+    script = (HERE / "report.js").read_text(encoding="utf-8")
+    embedded = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no text can end the script element
+    policy = f"default-src 'none'; style-src {_hash(style)}; script-src {_hash(script)}"
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", http_equiv="Content-Security-Policy", content=policy),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("title", f"Calibration: {title}"),
+        tag("style", style),
+    )
+    main = tag(
+        "main",
+        tag("header", tag("p", f"Robot calibration, {result.record.made[:10]}", class_="kind"), tag("h1", title)),
+        *parts,
+    )
+    body = tag("body", main, tag("script", embedded, id="data", type="application/json"), tag("script", script))
+    return "<!doctype html>\n" + html(tag("html", head, body, lang="en")) + "\n"
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"

@@ -1,0 +1,90 @@
+"""The report's evidence: what the data can tell, which rows stand out, how the loop came to rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import RpimError
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.problem.observability import combination, observe
+from rpim_opt.show.pieces import bullets, data_table, figure, mm, section
+from rpim_opt.show.svg import Axis, Chart
+
+
+def identifiability_section(result: Calibration) -> list[Element]:
+    """Return what the data can tell apart at nominal, and along which directions at the solution."""
+    found = observe(result.problem)
+    n = len(found.names)
+    text = f"{found.configurations} configurations, {result.program.model.equations} equations for {n} parameters, "
+    text += f"of which the data determine {found.rank} combinations at nominal."
+    if found.rank < n:
+        text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."
+    told = [f"No measurement changes along {combination(each)} [mm, mrad]." for each in found.redundant]
+    if found.unseen:
+        told.insert(0, f"No measurement depends on {', '.join(found.unseen)}.")
+    indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())
+    condition = f"Condition number of these: {found.condition:.3g}. Observability indices: {indices}."
+    return section(
+        "What the data can tell",
+        tag("p", text),
+        *bullets(told),
+        tag("p", condition),
+        tag("div", _directions(result), class_="figures"),
+    )
+
+
+def _directions(result: Calibration) -> Element:
+    """Return the singular values, what the data say along their directions, and where the penalty takes over."""
+    beta, s, _ = result.program.model.svd
+    k = np.flatnonzero(s > 0)
+    said = np.abs(beta[k])
+    level = float(np.sqrt(result.penalty_weight))
+    every = np.concatenate([s[k], said, [level] if level > 0 else []])
+    x = Axis("direction", (1, max(len(k), 2)))
+    y = Axis("size [sigmas]", (max(float(every.min()), 1e-4), float(every.max())), log=True)
+    chart = Chart("Singular values and what the data say along them", x, y)
+    chart.line(k + 1.0, s[k], "ink")
+    hints = [f"direction {i + 1}: data {abs(beta[i]):.3g}, s {s[i]:.3g}" for i in k]
+    chart.dots(k + 1.0, said, "after", hints)
+    legend = [("ink", "singular value s"), ("after", "data |u'b|")]
+    if level > 0:
+        chart.line([1, max(len(k), 2)], [level, level], "mark")
+        legend.append(("mark", "root of the weight"))
+    caption = (
+        "At the solution: the penalty holds directions below the line; data near 1 are noise (Picard's condition)."
+    )
+    return figure(chart, caption, *legend)
+
+
+def distrusted_section(result: Calibration) -> list[Element]:
+    """Return the rows that stand out, and those that were left out."""
+    rows = [[f.label, f"{f.sigmas:.1f}", mm(f.error_mm), "distrusted, in the data"] for f in result.flagged]
+    rows += [[label, "", "", f"left out: {reason}"] for label, reason in result.record.excluded.items()]
+    if not rows:
+        text = "No row stands out beyond what one good set of data in a hundred would show, and none was left out."
+        return section("Distrusted rows", tag("p", text))
+    head = ["row", "residual [sigmas]", "error [mm]", "what became of it"]
+    return section("Distrusted rows", data_table("Rows that stand out or were left out", head, rows, prose=True))
+
+
+def convergence_section(result: Calibration) -> list[Element]:
+    """Return how the loop came to rest, and the evidence that it is a solution."""
+    rows = [
+        [str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"]
+        for k, it in enumerate(result.history, start=1)
+    ]
+    try:
+        c = result.certificate
+        lines = [] if c.gradient is None else [f"gradient of the nonlinear problem {c.gradient:.1e} of that at nominal"]
+        lines += [
+            f"step that the convex program would still take {c.step:.1e}",
+            f"constraints missed by {c.violation:.1e}",
+        ]
+        said = f"Checked anew at the solution: {', '.join(lines)} (in units of the scales)."
+    except RpimError as error:
+        said = f"The solution cannot be checked anew. {error}"
+    return section(
+        "Convergence", tag("p", f"{result.message} {said}"),
+        data_table("Passes of the loop", ["pass", "objective", "step [scales]", "weight"], rows),
+    )  # fmt: skip

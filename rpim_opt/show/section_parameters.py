@@ -1,0 +1,92 @@
+"""The report's parameters: a table with intervals and tolerances, and a chart of the deviations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.units import display
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import Uncertainty
+from rpim_opt.show.pieces import data_table, figure, section
+from rpim_opt.show.svg import Axis, Chart
+
+
+def parameters_section(result: Calibration) -> list[Element]:
+    """Return the identified parameters with half their intervals, where the formulation has any."""
+    half, note = _intervals(result)
+    free = result.problem.parameters.free
+    head = ["parameter", "nominal", "identified", "deviation", "± (95 %)", "tolerance"]
+    rows = _rows(result, half)
+    if not np.isfinite(free.tolerance).any():
+        head = head[:-1]
+        rows = [row[:-1] for row in rows]
+    own = np.array(free.dimensions)[~free.of_frames]
+    charts = [_deviations(result, dimension, half) for dimension in ("length", "angle") if dimension in own]
+    return section(
+        "Parameters",
+        tag("p", note),
+        tag("div", *charts, class_="figures"),
+        data_table("Identified parameters", head, rows),
+    )
+
+
+def _intervals(result: Calibration) -> tuple[Array, str]:
+    """Return half the intervals (n,) [SI], NaN where there is none, and what they are."""
+    try:
+        uncertainty = Uncertainty(result)
+        low, high = uncertainty.intervals().T
+        note = f"± is half the {uncertainty.confidence:.0%} interval, noise and prior together. "
+        return (high - low) / 2, note + uncertainty.noise_test().verdict
+    except InputError:
+        return np.full(len(result.x), np.nan), "No intervals: the formulation has no covariance."
+
+
+def _rows(result: Calibration, half: Array) -> list[list[str]]:
+    free = result.problem.parameters.free
+    held = {each.name for each in result.held}
+    rows = []
+    for i, row in enumerate(result.parameter_rows()):
+        _, si = display(free.dimensions[i])
+        name = f"{row['name']} [{row['unit']}]"
+        if row["name"] in held:
+            name += ", at its bound"
+        figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}"]
+        spread = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
+        bound = f"±{free.tolerance[i] / si:.4g}" if np.isfinite(free.tolerance[i]) else ""
+        rows.append([name, *figures, spread, bound])
+    return rows
+
+
+def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
+    free = result.problem.parameters.free
+    unit, si = display(dimension)
+    own = np.flatnonzero(~free.of_frames & (np.array(free.dimensions) == dimension))
+    names = [free.names[i] for i in own]
+    x = result.x[own] / si
+    spread = np.nan_to_num(half[own] / si, posinf=0.0)
+    bound = free.tolerance[own] / si
+    stated = bound[np.isfinite(bound)]
+    # an interval that ends far out would hide all others: it is cut at the chart's edge
+    reach = 1.1 * max(
+        float(np.max(np.abs(x))), float(np.median(np.abs(x) + spread)), float(stated.max(initial=0)), 1e-9
+    )
+    axis = Axis(f"deviation [{unit}]", (-reach, reach))
+    chart = Chart(f"Deviations of the {dimension} parameters", axis, Axis("", names=names), 60 + 17 * len(own))
+    chart.line([0, 0], [-0.5, len(own) - 0.5], "zero")
+    for k, name in enumerate(names):
+        chart.line([x[k] - spread[k], x[k] + spread[k]], [k, k], "after")
+        if np.isfinite(bound[k]):
+            for end in (-bound[k], bound[k]):
+                chart.line([end, end], [k - 0.35, k + 0.35], "mark")
+        chart.dots(x[[k]], [k], "after", [f"{name}: {x[k]:+.4f} ± {spread[k]:.4f} {unit}"])
+    legend = [("after", "deviation and interval")]
+    if len(stated):
+        legend.append(("mark", "tolerance"))
+    return figure(
+        chart,
+        f"The robot's own {dimension} parameters against the drawing; intervals beyond the edge are cut.",
+        *legend,
+    )

@@ -1,0 +1,76 @@
+"""The report's provenance: whose measurements, which files, what was minimized, by which versions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Block
+from rpim_opt.show.pieces import data_table, section, sets
+from rpim_opt.store.definition import definition
+
+
+def provenance_section(result: Calibration) -> list[Element]:
+    """Return where the measurements come from and what was minimized."""
+    record = result.record
+    robot = result.problem.robot
+    rows = []
+    for name, data in sets(result).items():
+        for block in data.blocks:
+            what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
+            rows.append([f"{name}, {what}", str(len(block.row)), _noise(block)])
+    facts = {
+        "Source": record.source or "not stated",
+        "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",
+        "Robot": " - ".join(filter(None, [robot.name, f"{robot.dof} joints", robot.source])),
+        "Formulation": f"{result.formulation.name}: {_formulation(result)}",
+        "Made": record.made,
+        "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
+    }
+    caption = "Measurements and their declared standard deviations"
+    tables = [data_table(caption, ["data", "rows", "declared"], rows, prose=True)]
+    if record.files:
+        files = [[name, digest] for name, digest in record.files.items()]
+        tables.append(data_table("Input files", ["file", "SHA-256"], files, prose=True))
+    return section(
+        "Where the data come from",
+        tag("dl", *(tag("div", tag("dt", key), tag("dd", value)) for key, value in facts.items()), class_="facts"),
+        *tables,
+        tag(
+            "p",
+            "All figures on this page were computed from the measurements and parameters of the calibration when "
+            "the page was written.",
+        ),
+    )
+
+
+def _formulation(result: Calibration) -> str:
+    """Return what is minimized, in the words of the result's file."""
+
+    def said(term: Any) -> str:
+        if isinstance(term, list):
+            return f"{term[0]}({', '.join(map(str, term[1:]))})"
+        return term or "a function of a script, not in the file"
+
+    parts = definition(result.formulation)
+    over = "" if parts["penalty_over"] == "none" else f" over {said(parts['penalty_over'])}"
+    text = f"loss {said(parts['loss'])} of each {parts['loss_over']}, penalty {said(parts['penalty'])}{over}"
+    bounds = [said(c) for c in parts["constraints"]]
+    bounds += [] if parts["largest"] is None else [f"no configuration off by more than {parts['largest']:g} sigmas"]
+    return f"{text}, constraints: {', '.join(bounds) or 'none'}"
+
+
+def _noise(block: Block) -> str:
+    """Return the declared standard deviations, by component, as a range where rows differ."""
+    spread = np.sqrt(np.einsum("nii->ni", block.covariance))
+    said: dict[str, list[str]] = {}
+    for i, (name, dimension) in enumerate(block.measurement.components.items()):
+        unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
+        low = spread[:, i].min() / si
+        high = spread[:, i].max() / si
+        figure = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
+        said.setdefault(f"{figure} {unit}".strip(), []).append(name)
+    return "; ".join(f"{figure} ({', '.join(names)})" for figure, names in said.items())

@@ -1,0 +1,65 @@
+"""The report's summary: one sentence, three figures, and what a reader must know."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.show.pieces import bullets, mm, quantity, repeated, sets
+
+
+def summary_section(result: Calibration) -> list[Element]:
+    """Return the summary, of validation data where there are some."""
+    name, data = next(iter(sets(result).items()))
+    before = statistics(result.nominal_errors(data))
+    after = statistics(result.errors(data))
+    if not after["count"]:
+        raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
+    figures = [
+        ("mean before", before["mean_mm"], "before"),
+        ("mean after", after["mean_mm"], "after"),
+        ("largest after", after["max_mm"], "after"),
+    ]
+    cards = [
+        tag("div", tag("dt", label), tag("dd", mm(value), tag("small", " mm")), class_=kind)
+        for label, value, kind in figures
+    ]
+    return [
+        tag("p", _sentence(result, name, before, after), class_="lead" if result.converged else "lead alarm"),
+        tag("dl", *cards, class_="cards"),
+        *bullets(_notes(result, name), "notes"),
+    ]
+
+
+def _sentence(result: Calibration, name: str, before: dict[str, Any], after: dict[str, Any]) -> str:
+    n = after["count"]
+    where = f"On {n} measurements that the calibration did not see"
+    if name != "validation":
+        where = f"On the {n} measurements that the calibration itself used (none were kept apart to check it)"
+    ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
+    moves = "rises"
+    times = ""
+    if ratio > 1:
+        moves = "falls"
+        times = f", by a factor of {ratio:.1f}" if ratio < 10 else f", by a factor of {ratio:.0f}"
+    means = f"from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
+    sentence = f"{where}, the mean {quantity(result)} {moves} {means}{times}."
+    if not result.converged:
+        return f"This calibration did not converge and should not be used. {sentence}"
+    return sentence
+
+
+def _notes(result: Calibration, name: str) -> list[str]:
+    notes = []
+    if result.record.simulated:
+        notes.append("The measurements are simulated.")
+    notes += [line for line in result.remarks() if line != result.message or not result.converged]
+    if name == "identification":
+        notes.append("Without validation data the errors elsewhere in the workspace are not known to be as small.")
+    again = repeated(result)
+    if again:
+        notes.append(f"{again} validation rows repeat configurations of the identification: they are no check.")
+    return notes

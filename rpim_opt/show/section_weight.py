@@ -1,0 +1,133 @@
+"""The report's weight: the L-curve with every selector's choice, and what each would have given."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import NoSolutionFound
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.program import Estimate
+from rpim_opt.convex.select import compare
+from rpim_opt.convex.selection import Selection, weight_grid
+from rpim_opt.show.pieces import data_table, figure, mm, section, sets
+from rpim_opt.show.svg import Axis, Chart
+
+TITLE = "Weight of the penalty"
+VANISHED = 1e-4
+"""Penalties below this part of the middle one are not drawn: a lasso has nothing left there."""
+
+
+class Path(NamedTuple):
+    """Solutions over the weight (k,): roots of loss and penalty, and mean errors [mm] on some measurements."""
+
+    weight: Array
+    residual: Array
+    solution: Array
+    error: list[float]
+    of: str
+
+    def at(self, weight: float) -> int:
+        """Return which solution is the one at a weight."""
+        return int(np.argmin(np.abs(np.log(self.weight / weight))))
+
+
+def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
+    """Return how the weight was chosen; what the page's slider needs goes into ``embedded``."""
+    said = tag("p", result.weight_sentence())
+    formulation = result.formulation
+    if formulation.penalty is None or not formulation.solvable or result.weight <= 0:
+        return section(TITLE, said)
+    given = Selection(result.weight, "given", np.array([]), np.array([]), True)
+    chosen = {**compare(result.program), result.selector: result.selection or given}
+    path = _path(result, chosen)
+    places = {name: path.at(choice.weight) for name, choice in chosen.items() if choice.weight > 0}
+    chart, x, y = _curve(path, places, result.selector)
+    k = places[result.selector]
+    embedded["curve"] = {
+        "weight": path.weight.tolist(),
+        "residual": path.residual.tolist(),
+        "solution": path.solution.tolist(),
+        "error": path.error,
+        "of": path.of,
+        "takers": _takers(places),
+        "chosen": k,
+        "x": x(path.residual).tolist(),
+        "y": y(path.solution).tolist(),
+    }
+    slider = tag("input", type="range", id="weight", min=0, max=len(path.weight) - 1, value=k)
+    drawn = figure(
+        chart,
+        "Each point is the solution at one weight: little penalty above left, much below right.",
+        ("mark", "chosen"),
+        ("other", "other selectors"),
+    )
+    label = tag("label", "Weight", slider)
+    side = tag("div", label, tag("output", id="weight-says", for_="weight"), class_="side")
+    table = data_table(
+        "What each selector takes, from the identification data alone",
+        ["selector", "weight", f"mean error, {path.of} [mm]", "why"],
+        _choices(path, chosen, places, result.selector),
+        prose=True,
+    )
+    return section(TITLE, said, tag("div", drawn, side, class_="figures"), table)
+
+
+def _path(result: Calibration, chosen: Mapping[str, Selection]) -> Path:
+    """Solve over a grid of weights and at those that were chosen."""
+    program = result.program
+    grid = weight_grid(program, 80 if program.closed_form else 30)
+    estimates: list[Estimate] = []
+    for weight in np.unique([*grid, *(choice.weight for choice in chosen.values() if choice.weight > 0)]):
+        with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
+            estimates += program.path([weight])
+    name, data = next(iter(sets(result).items()))
+    problem = result.problem.on(data)
+    scale = result.problem.parameters.free.scale
+    return Path(
+        np.array([estimate.weight for estimate in estimates]),
+        np.sqrt([estimate.loss for estimate in estimates]),
+        np.sqrt([estimate.penalty for estimate in estimates]),
+        [1e3 * float(np.nanmean(problem.errors(scale * estimate.z))) for estimate in estimates],
+        name,
+    )
+
+
+def _curve(path: Path, places: Mapping[str, int], selector: str) -> tuple[Chart, Axis, Axis]:
+    residual = path.residual
+    solution = path.solution
+    shown = solution > VANISHED * float(np.median(solution))
+    x = Axis("root of the loss (residual norm) [sigmas]", (max(residual.min(), 1e-9), residual.max()), log=True)
+    y = Axis("root of the penalty [scales]", (solution[shown].min(), solution.max()), log=True)
+    chart = Chart("L-curve: misfit against size of the deviations", x, y, 330)
+    chart.line(residual[shown], solution[shown], "ink")
+    others = {name: k for name, k in places.items() if name != selector}
+    at = list(others.values())
+    chart.dots(residual[at], solution[at], "other", list(others))
+    k = places[selector]
+    chart.dots(residual[[k]], solution[[k]], "mark", [f"chosen, {selector}"], r=6)
+    cursor = {"cx": f"{float(x(residual[k])):g}", "cy": f"{float(y(solution[k])):g}"}
+    chart.add("circle", id="cursor", r=9, class_="cursor", **cursor)
+    return chart, x, y
+
+
+def _takers(places: Mapping[str, int]) -> dict[str, str]:
+    """Return who takes which solution."""
+    takers: dict[int, list[str]] = {}
+    for rule, place in places.items():
+        takers.setdefault(place, []).append("the chosen weight" if rule == "given" else rule)
+    return {str(place): ", ".join(names) for place, names in takers.items()}
+
+
+def _choices(path: Path, chosen: Mapping[str, Selection], places: Mapping[str, int], selector: str) -> list[list[str]]:
+    rows = []
+    for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
+        name = f"{rule} (chosen)" if rule == selector else rule
+        mean = mm(path.error[places[rule]]) if rule in places else ""
+        rows.append([name, f"{choice.weight:.3g}", mean, choice.note or "given"])
+    return rows

@@ -1,0 +1,106 @@
+"""The figures that a metrologist reads after a calibration, as a document and as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.text import table
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.store.content import figures, sets
+
+KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
+
+
+def describe_times(seconds: Mapping[str, float]) -> str:
+    """Return the seconds of a calibration's phases as a table [ms]."""
+    whole = sum(seconds.values())
+    rows = [[phase, f"{1e3 * each:.2f}", f"{each / whole:.0%}"] for phase, each in seconds.items()]
+    return table(["phase", "ms", "share"], [*rows, ["all", f"{1e3 * whole:.2f}", "100%"]])
+
+
+def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return parameters, errors, the weight and where it came from.
+
+    Parameters
+    ----------
+    result
+        The calibration, with title, source and validation data in its record.
+    published
+        Mean errors [mm] that the source prints, by role and method.
+    """
+    record = result.record
+    errors: list[dict[str, Any]] = []
+    angles: list[dict[str, Any]] = []
+    for name, data in sets(result.problem.data, record).items():
+        errors += _errors(result, name, data)
+        errors += [
+            {"what": f"  printed: {method}", "mean_mm": mean, "printed": True}
+            for method, mean in published.get(name, {}).items()
+        ]
+        turn = result.errors(data, "angle")
+        if np.isfinite(turn).any():
+            angles.append({"what": name, **statistics(turn, "mrad")})
+    whole = figures(result)
+    return {
+        "title": record.title,
+        "source": record.source,
+        **{key: whole[key] for key in KEYS},
+        "errors": errors,
+        "orientation": angles,
+        "remarks": _remarks(result),
+    }
+
+
+def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any]]:
+    """Return the errors of every kind of measurement, and those of the rows that are not distrusted."""
+    errors = []
+    several = len(_kinds(result.problem.data)) > 1
+    for kind, rows in _kinds(data).items():
+        which = f"{name}, {kind}" if several else name
+        errors.append({"what": f"{which}, nominal", **statistics(result.nominal_errors(data)[rows])})
+        errors.append({"what": f"{which}, identified", **statistics(result.errors(data)[rows])})
+    if name == "identification" and result.flagged:
+        distrusted = {flag.label for flag in result.flagged}
+        trusted = result.errors(data)[[label not in distrusted for label in data.label]]
+        errors.append({"what": "identification, trusted rows", **statistics(trusted)})
+    return errors
+
+
+def _remarks(result: Calibration) -> list[str]:
+    model = result.program.model
+    count = f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see."
+    remarks = [result.weight_sentence(), count, *result.remarks()]
+    fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
+    if fitted.any():
+        remarks.insert(0, "Nominal: the drawing's robot, frames fitted.")
+    return remarks
+
+
+def describe(result: Calibration, found: Mapping[str, Any]) -> str:
+    """Return the tables of a `summary`."""
+    lines = [f"{found['title']}\n{found['source']}\n", result.parameter_table(), ""]
+    lines.append(table(["error [mm]", "rows", "mean", "RMS", "max"], [_row(e, "mm") for e in found["errors"]]))
+    if found["orientation"]:
+        rows = [_row(e, "mrad") for e in found["orientation"]]
+        lines.append(table(["orientation error [mrad]", "rows", "mean", "RMS", "max"], rows))
+    return "\n".join([*lines, "", *found["remarks"]])
+
+
+def _row(e: Mapping[str, Any], unit: str) -> Sequence[str]:
+    if "printed" in e:
+        return [e["what"], "", f"{e['mean_mm']:.3f}", "", ""]
+    figures = (e[f"{key}_{unit}"] for key in ("mean", "rms", "max"))
+    return [e["what"], str(e["count"]), *("-" if v is None else f"{v:.4f}" for v in figures)]
+
+
+def _kinds(data: Dataset) -> dict[str, list[int]]:
+    """Return the rows of every kind of measurement."""
+    kinds: dict[str, list[int]] = {}
+    for block in data.blocks:
+        kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
+    return kinds

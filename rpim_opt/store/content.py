@@ -1,0 +1,118 @@
+"""What a result file says of a calibration: everything that its figures follow from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.outcome import Kept
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.record import Record
+from rpim_opt.store.definition import defined, definition, forms
+from rpim_opt.store.parts import data_part, finite, parameters_part, robot_part, selection_part
+from rpim_opt.store.schema import FORMAT, VERSION
+
+
+def content(result: Calibration) -> dict[str, Any]:
+    """Return what a file says of a calibration: its figures, and then all that they follow from.
+
+    The figures that a reader looks for are in mm and degrees, what they follow from is in SI.
+    """
+    record = result.record.dated()
+    data = sets(result.problem.data, record)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": record.title,
+        **figures(result),
+        "nominal": {name: statistics(result.nominal_errors(part)) for name, part in data.items()},
+        "rows": {name: _rows(result, part) for name, part in data.items()},
+        "x": result.x.tolist(),
+        "certificate": _certificate(result),
+        "trust": _trust(result),
+        "held": [held._asdict() for held in result.held],
+        "history": [{**vars(each)} for each in result.history],
+        "selection": selection_part(result.selection),
+        "definition": definition(result.formulation),
+        "forms": forms(result),
+        "robot": robot_part(result.problem.robot),
+        "model": parameters_part(result.problem.parameters),
+        "data": {name: data_part(part) for name, part in data.items()},
+        "record": _record(record),
+    }
+
+
+def figures(result: Calibration) -> dict[str, Any]:
+    """Return what a reader looks for first: errors [mm], the weight and where it came from, the parameters."""
+    validation = result.record.validation
+    return {
+        "identification": statistics(result.errors()),
+        "validation": None if validation is None else statistics(result.errors(validation)),
+        "weight": result.weight,
+        "selector": result.selector,
+        "corner": None if result.selection is None else bool(result.selection.interior),
+        "formulation": result.formulation.name,
+        "converged": result.converged,
+        "message": result.message,
+        "iterations": len(result.history),
+        "flagged": [flag.label for flag in result.flagged],
+        "parameters": result.parameter_rows(),
+    }
+
+
+def sets(identification: Dataset, record: Record) -> dict[str, Dataset]:
+    """Return the measurements by name: those of the identification, and those that were kept apart."""
+    data = {"identification": identification}
+    if record.validation is not None:
+        data["validation"] = record.validation
+    return data
+
+
+def _rows(result: Calibration, data: Dataset) -> list[dict[str, Any]]:
+    before = 1e3 * result.nominal_errors(data)
+    after = 1e3 * result.errors(data)
+    rows = zip(data.label, before, after, strict=True)
+    return [{"label": label, "nominal_mm": finite(b), "identified_mm": finite(a)} for label, b, a in rows]
+
+
+def _certificate(result: Calibration) -> dict[str, Any]:
+    found = result.certificate
+    return {**found._asdict(), "step": finite(found.step), "violation": finite(found.violation)}
+
+
+def _trust(result: Calibration) -> dict[str, Any] | None:
+    """Return what a loss of a script made of the rows; a ready one says it again when it is asked."""
+    if defined(result.formulation):
+        return None
+    if result.kept is not None:
+        return _kept(result.kept)
+    try:
+        trust = result.program.trust(result.z)
+    except InputError:  # a loss that no squared one stands for
+        return None
+    if trust is None:
+        return None
+    left_out = np.flatnonzero(~trust.keeps(result.program.model, result.z))
+    return {"factor": float(np.sqrt(trust.factor)), "left_out": left_out.tolist()}
+
+
+def _kept(kept: Kept) -> dict[str, Any] | None:
+    """Return what an earlier file said of it."""
+    if kept.linear is None:
+        return None
+    return {"factor": float(np.sqrt(kept.factor)), "left_out": list(kept.left_out)}
+
+
+def _record(record: Record) -> dict[str, Any]:
+    return {
+        "source": record.source,
+        "files": dict(record.files),
+        "excluded": dict(record.excluded),
+        "simulated": record.simulated,
+        "made": record.made,
+        "versions": dict(record.versions),
+    }

@@ -1,0 +1,171 @@
+"""Problem folders: ``robot.toml``, ``problem.toml`` and tables become a problem with its validation data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import cvxpy as cp
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.selection import Selector
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement
+from rpim_opt.data.record import Record
+from rpim_opt.problem.frames import starting_parameters
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.store.fixtures import place_fixtures
+from rpim_opt.store.named import named_formulation, named_weight
+from rpim_opt.store.observations import Tables, read_tables
+from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """A calibration problem as its folder states it.
+
+    Parameters
+    ----------
+    title, source
+        What it is, and where every figure comes from.
+    problem
+        Robot, parameters and identification data.
+    validation
+        Measurements that no step of the calibration may see; None when there are none.
+    formulation, weight
+        How the folder wants it solved.
+    published
+        Mean errors [mm] that the source prints for the same table, by role (identification,
+        validation) and method, to show beside ours.
+    reference
+        Figures that a run must reproduce, by name: (value, tolerance).
+    simulation
+        How the tables were simulated; empty for real measurements.
+    files
+        SHA-256 of the files that were read, by name.
+    excluded
+        Rows that the folder leaves out, label to reason.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    >>> instance.record.title, instance.excluded["T8-7"], instance.published["validation"]["RPIM"]
+    ("The paper's cooperative manipulator", 'z misprinted, off by 15.0 mm', 0.468)
+    """
+
+    title: str
+    source: str
+    problem: CalibrationProblem
+    validation: Dataset | None
+    formulation: Formulation
+    weight: float | Selector
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+    excluded: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def record(self) -> Record:
+        """What a saved result and its report say of the data: title, source, validation data, files, excluded rows."""
+        return Record(self.title, self.source, self.validation, self.files, self.excluded, bool(self.simulation))
+
+
+def load(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Instance:
+    """Return a problem from its folder, or from the name of one that comes with the package.
+
+    Parameters
+    ----------
+    name
+        A folder with ``problem.toml`` (its format: README, "Your own robot"), that file, or the name of one that comes
+        with the package.
+    variant
+        One of the file's ``[variant.NAME]`` tables, laid over the other keys.
+    measurements
+        Measurement models of your own that the file may name.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the row or key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm", variant="swap")  # the 16 points for the 9, and the other way round
+    >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
+    (16, 9, 'Tikhonov')
+    """
+    stated = read_problem(name, variant, measurements)
+    table = stated.table
+    path = stated.path
+    tables = read_tables(stated)
+    try:
+        problem = _problem(stated, tables)
+        formulation = _formulation(table, problem.parameters, path)
+    except InputError as error:
+        raise error.within(path) from None
+    return Instance(
+        title=table.title,
+        source=table.source,
+        problem=problem,
+        validation=tables.validation,
+        formulation=formulation,
+        weight=named_weight(table.selector, path),
+        published=_published(table, tables, path),
+        reference=_reference(table, path),
+        simulation=table.simulation,
+        files=_hashes(stated, tables),
+        excluded=table.exclude,
+    )
+
+
+def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
+    """Return the problem, whose robot and reflectors the validation data must have, too."""
+    data = tables.identification
+    fixtures = place_fixtures(stated.placed, data)
+    parameters = starting_parameters(stated.robot, data, stated.base, tables.tools, fixtures)
+    problem = CalibrationProblem(stated.robot, stated.chosen(parameters, data), data)
+    if tables.validation is not None:
+        problem.on(tables.validation)
+    return problem
+
+
+def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> Formulation:
+    """Return the formulation with the file's constraints, each of which must fit the parameters."""
+    formulation = named_formulation(table.formulation, path)
+    formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
+    for constraint in formulation.constraints:
+        constraint(cp.Variable(len(parameters.free)), parameters.free)
+    return formulation
+
+
+def _published(table: ProblemTable, tables: Tables, path: Path) -> dict[str, Mapping[str, float]]:
+    for file in table.published:
+        if not (path.parent / file).is_file():
+            raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
+    return {role: table.published.get(files[0], {}) for role, files in tables.files.items() if files}
+
+
+def _reference(table: ProblemTable, path: Path) -> dict[str, tuple[float, float]]:
+    for key, pair in table.reference.items():
+        if len(pair) != 2:
+            raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
+    return {key: (value, spread) for key, (value, spread) in table.reference.items()}
+
+
+def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
+    folder = stated.path.parent
+    drawing = find_robot(stated.table.robot, folder)
+    used = {stated.path.name: stated.path, drawing.name: drawing}
+    for files in tables.files.values():
+        used |= {file: folder / file for file in files}
+    return {name: sha256(file.read_bytes()).hexdigest() for name, file in used.items()}

@@ -1,0 +1,57 @@
+"""What people name in a file or on the command line: a problem, a formulation, a rule for the weight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.convex.formulation import FORMULATIONS, Formulation
+from rpim_opt.convex.select import SELECTORS, Selector
+
+Named = TypeVar("Named")
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def problems_folder() -> Path:
+    """Return the folder of the problems that come with the package: inside it, or beside it in a checkout."""
+    inside = PACKAGE / "problems"
+    return inside if inside.is_dir() else PACKAGE.parent / "problems"
+
+
+def find(name: str | Path) -> Path:
+    """Return the folder of a problem, given its path or the name of one that comes with the package."""
+    path = Path(name)
+    if path.is_file() and path.name == "problem.toml":
+        return path.parent
+    if path.is_dir():
+        return path
+    known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
+    if str(name) in known:
+        return problems_folder() / str(name)
+    accepted = "a folder with problem.toml, or " + choices(str(name), known)
+    raise InputError("the problem", f"no folder '{name}'", accepted)
+
+
+def named_formulation(text: str, file: Path | None = None) -> Formulation:
+    """Return the ready formulation of that name."""
+    return pick(FORMULATIONS, text, "formulation", file)
+
+
+def named_weight(text: str, file: Path | None = None) -> float | Selector:
+    """Return the selector of that name, or the number that the text is."""
+    try:
+        value = float(text)
+    except ValueError:
+        return pick(SELECTORS, text, "selector", file, "a number, ")
+    if not 0 <= value < float("inf"):
+        raise InputError("selector", f"'{text}'", "a finite number, zero or more", file)
+    return value
+
+
+def pick(known: Mapping[str, Named], name: str, what: str, file: Path | None = None, also: str = "") -> Named:
+    """Return ``known[name]``, or list what there is."""
+    if name not in known:
+        raise InputError(f"key {what}", f"'{name}'", also + choices(name, known), file)
+    return known[name]

@@ -1,0 +1,168 @@
+"""Robot, parameters, measurements and the weight's choice as parts of a result file, and back.
+
+Numbers are written with the fewest digits that read back to the same bits; null stands for infinite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.convex.selection import Selection
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import Measurement
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.store.schema import BlockPart, DataPart, ParameterPart, RobotPart, SelectionPart
+
+
+def finite(value: float) -> float | None:
+    """Return a number as a file has it: null where it is infinite or none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def robot_part(robot: Robot) -> dict[str, Any]:
+    """Return a robot as a file holds it."""
+    return {
+        "name": robot.name,
+        "source": robot.source,
+        "mdh": robot.mdh.tolist(),
+        "joint_types": list(robot.joint_types),
+        "joint_map": robot.joint_map.tolist(),
+        "limits": [[finite(value) for value in pair] for pair in robot.limits],
+    }
+
+
+def robot_of(part: RobotPart) -> Robot:
+    """Return the robot that a file holds."""
+    limits = [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in part.limits]
+    mdh = _array(part.mdh, "key robot.mdh", -1, 5)
+    joints = len(part.mdh)
+    joint_map = _array(part.joint_map, "key robot.joint_map", joints, joints)
+    return Robot(part.name, mdh, tuple(part.joint_types), joint_map, np.array(limits), part.source)
+
+
+def parameters_part(parameters: Parameters) -> list[dict[str, Any]]:
+    """Return the model parameters as a file holds them, one entry each."""
+    rows = zip(
+        parameters.names,
+        parameters.dimensions,
+        parameters.nominal,
+        parameters.scale,
+        parameters.tolerance,
+        parameters.identified,
+        strict=True,
+    )
+    return [
+        {
+            "name": name,
+            "dimension": dimension,
+            "nominal": float(nominal),
+            "scale": float(scale),
+            "tolerance": finite(tolerance),
+            "identified": bool(identified),
+        }
+        for name, dimension, nominal, scale, tolerance, identified in rows
+    ]
+
+
+def parameters_of(parts: list[ParameterPart]) -> Parameters:
+    """Return the model parameters that a file holds."""
+    return Parameters(
+        tuple(p.name for p in parts),
+        tuple(p.dimension for p in parts),
+        np.array([p.nominal for p in parts]),
+        np.array([p.scale for p in parts]),
+        np.array([np.inf if p.tolerance is None else p.tolerance for p in parts]),
+        np.array([p.identified for p in parts]),
+    )
+
+
+def data_part(data: Dataset) -> dict[str, Any]:
+    """Return measurements as a file holds them."""
+    return {
+        "label": list(data.label),
+        "configuration": data.configuration.tolist(),
+        "blocks": [_block_part(block) for block in data.blocks],
+    }
+
+
+def _block_part(block: Block) -> dict[str, Any]:
+    return {
+        "measurement": block.measurement.name,
+        "markers": list(block.markers),
+        "fixture": block.fixture,
+        "row": block.row.tolist(),
+        "q": block.q.tolist(),
+        "y": block.y.tolist(),
+        "covariance": block.covariance.tolist(),
+        "torque": None if block.torque is None else block.torque.tolist(),
+    }
+
+
+def data_of(part: DataPart, known: Mapping[str, Measurement]) -> Dataset:
+    """Return the measurements that a file holds, with the measurement models of these names."""
+    blocks = [_block_of(block, known, f"key data.blocks {i}") for i, block in enumerate(part.blocks, start=1)]
+    rows = sorted(row for block in part.blocks for row in block.row)
+    if rows != list(range(len(part.label))) or len(part.configuration) != len(part.label):
+        raise InputError("key data", f"{len(part.label)} labels for other rows", "one label and configuration a row")
+    return Dataset(tuple(blocks), tuple(part.label), np.array(part.configuration))
+
+
+def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> Block:
+    if part.measurement not in known:
+        accepted = f"measurements=[...] with it, or {choices(part.measurement, known)}"
+        raise InputError(f"{where}.measurement", f"'{part.measurement}'", accepted)
+    kind = known[part.measurement]
+    if len(part.markers) != kind.points:
+        raise InputError(f"{where}.markers", f"{len(part.markers)} reflectors", f"{kind.points}, one a point")
+    N = len(part.row)
+    k = len(kind.components)
+    torque = None
+    if part.torque is not None:
+        torque = _array(part.torque, f"{where}.torque", N, kind.points, -1)
+    return Block(
+        kind,
+        q=_array(part.q, f"{where}.q", N, kind.points, -1),
+        y=_array(part.y, f"{where}.y", N, len(kind.columns)),
+        covariance=_array(part.covariance, f"{where}.covariance", -1, k, k),
+        row=np.array(part.row),
+        markers=tuple(part.markers),
+        fixture=part.fixture,
+        torque=torque,
+    )
+
+
+def selection_part(selection: Selection | None) -> dict[str, Any] | None:
+    """Return the choice of the weight as a file holds it, with its evidence."""
+    if selection is None:
+        return None
+    return {
+        **vars(selection),
+        "weights": [float(weight) for weight in selection.weights],
+        "score": [finite(value) for value in selection.score],
+        "interior": bool(selection.interior),
+    }
+
+
+def selection_of(part: SelectionPart | None) -> Selection | None:
+    """Return the choice of the weight that a file holds."""
+    if part is None:
+        return None
+    score = np.array([np.inf if value is None else value for value in part.score])
+    return Selection(part.weight, part.name, np.array(part.weights), score, part.interior, part.note)
+
+
+def _array(values: Any, where: str, *shape: int) -> Array:
+    """Return numbers as an array of a shape (-1: any length), or say that they are none."""
+    try:
+        array = np.array(values, dtype=float)
+    except ValueError:
+        raise InputError(where, "rows of different lengths", f"shape {shape}") from None
+    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
+        raise InputError(where, f"shape {array.shape}", f"shape {shape}")
+    return array

@@ -1,0 +1,226 @@
+"""``problem.toml``: its schema, its variants, and what it states before any table is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import Angle, Length, Table, read_toml, validate
+from rpim_opt.basics.units import split_unit
+from rpim_opt.convex.constraints import Constraint, at_nominal, equal, signed
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.robot.chain import Described
+from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.library import find_robot, read_arm
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.store.named import find, named_formulation, named_weight, pick
+from rpim_opt.store.proposal import proposed
+
+Layout = Literal["named", "robodk"]
+
+
+class FrameTable(Table):
+    """Where a frame is: x, y, z and roll, pitch, yaw about fixed axes."""
+
+    x: Length = 0.0
+    y: Length = 0.0
+    z: Length = 0.0
+    rx: Angle = 0.0
+    ry: Angle = 0.0
+    rz: Angle = 0.0
+
+
+class Observation(Table):
+    """Tables of one kind of measurement: ``[[observation]]``."""
+
+    measurement: str = "position"
+    layout: Layout = "named"
+    identification: str
+    validation: str | None = None
+    noise: dict[str, Any] = Field(default_factory=dict)
+
+
+class Constraints(Table):
+    """What is known of parameters besides their scales: ``[constraints]``."""
+
+    at_nominal: list[str] = Field(default_factory=list)
+    positive: list[str] = Field(default_factory=list)
+    negative: list[str] = Field(default_factory=list)
+    equal: list[list[str]] = Field(default_factory=list)
+
+    def all(self) -> tuple[Constraint, ...]:
+        """Return them as functions of a formulation."""
+        boxes = (
+            (self.at_nominal, at_nominal),
+            (self.positive, partial(signed, 1)),
+            (self.negative, partial(signed, -1)),
+        )
+        made = [make(*patterns) for patterns, make in boxes if patterns]
+        return (*made, *(equal(*names) for names in self.equal))
+
+
+class ProblemTable(Table):
+    """The keys of ``problem.toml``."""
+
+    title: str
+    source: str = ""
+    robot: str = "robot.toml"
+    urdf_base: str | None = None
+    urdf_tip: str | None = None
+    measurement: str = "position"
+    layout: Layout = "named"
+    identification: str | None = None
+    validation: str | None = None
+    observation: list[Observation] = Field(default_factory=list)
+    exclude: dict[str, str] = Field(default_factory=dict)
+    identify: list[str] | Literal["auto"]
+    formulation: str = "tikhonov"
+    selector: str = "reml"
+    noise: dict[str, Any] = Field(default_factory=dict)
+    scale: dict[str, float | int] = Field(default_factory=dict)
+    tolerance: dict[str, float | int] = Field(default_factory=dict)
+    constraints: Constraints = Constraints()
+    base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
+    tool: dict[str, Any] = Field(default_factory=dict)
+    published: dict[str, dict[str, float]] = Field(default_factory=dict)
+    reference: dict[str, list[float]] = Field(default_factory=dict)
+    simulation: dict[str, Any] = Field(default_factory=dict)
+    variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What a problem file states, checked, before any table is read.
+
+    ``placed`` are the tables that place a measurement's anchor, plane or sphere; ``base`` is None for registration.
+    """
+
+    path: Path
+    table: ProblemTable
+    placed: Mapping[str, Any]
+    robot: Robot
+    kinds: Mapping[str, Measurement]
+    observations: tuple[Observation, ...]
+    tools: Mapping[str, tuple[float, ...]]
+    base: tuple[float, ...] | None
+
+    def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
+        """Return the parameters with the file's scales and tolerances, and those identified that it names."""
+        table = self.table
+        parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
+        patterns = table.identify
+        if patterns == "auto":
+            patterns = proposed(self.robot, parameters, data)
+        return parameters.identify(patterns)
+
+
+def read_problem(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Stated:
+    """Return what a problem file states; arguments and errors as for `load`."""
+    path = find(name) / "problem.toml"
+    kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
+    table, placed = _tables(read_toml(path), variant, kinds, path)
+    observations = _observations(table, path)
+    for each in observations:
+        pick(kinds, each.measurement, "measurement", path)
+    named_formulation(table.formulation, path)
+    named_weight(table.selector, path)
+    arm = _arm(table, path)
+    return Stated(
+        path=path,
+        table=table,
+        placed=placed,
+        robot=arm.robot,
+        kinds=kinds,
+        observations=observations,
+        tools=_tools(table, arm, path),
+        base=_base(table, arm, path),
+    )
+
+
+def _tables(
+    content: dict[str, Any], variant: str | None, kinds: Mapping[str, Measurement], path: Path
+) -> tuple[ProblemTable, dict[str, Any]]:
+    """Return the checked table of the file or of its variant, and apart from it those that place fixtures."""
+    # the file itself must be right, too, whichever variant is asked for
+    split = _split(content, kinds, path)
+    if variant is None:
+        return split
+    variants = content.get("variant", {})
+    if variant not in variants:
+        raise InputError("variant", f"'{variant}'", choices(variant, variants), path)
+    own = {key: value for key, value in content.items() if key != "variant"}
+    return _split(_overlay(own, variants[variant]), kinds, path)
+
+
+def _split(
+    content: dict[str, Any], kinds: Mapping[str, Measurement], path: Path
+) -> tuple[ProblemTable, dict[str, Any]]:
+    fixtures = {name.partition("_")[0] for kind in kinds.values() for name in kind.parameters}
+    placed = {key: value for key, value in content.items() if key in fixtures and isinstance(value, dict)}
+    return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
+
+
+def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the keys of ``over``; tables are merged, anything else is replaced."""
+    merged = dict(base)
+    for key, value in over.items():
+        tables = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
+        merged[key] = _overlay(base[key], value) if tables and value else value  # an empty table clears
+    return merged
+
+
+def _observations(table: ProblemTable, path: Path) -> tuple[Observation, ...]:
+    """Return all observations; one that the top level states comes first."""
+    if table.identification is not None:
+        first = Observation.model_construct(
+            measurement=table.measurement,
+            layout=table.layout,
+            identification=table.identification,
+            validation=table.validation,
+            noise={},
+        )
+        return (first, *table.observation)
+    if not table.observation:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
+    return tuple(table.observation)
+
+
+def _arm(table: ProblemTable, path: Path) -> Described:
+    file = find_robot(table.robot, path.parent)
+    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip):
+        raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    return read_arm(file, table.urdf_base, table.urdf_tip)
+
+
+def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[float, ...]]:
+    """Return where the reflectors start, by marker; one without a name is the only one."""
+    if not table.tool:
+        return {"": tuple(arm.tool)}
+    if any(split_unit(key)[0] in FRAME for key in table.tool):
+        return {"": _frame(table.tool, "tool", path)}
+    return {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
+
+
+def _base(table: ProblemTable, arm: Described, path: Path) -> tuple[float, ...] | None:
+    if table.base == "auto":
+        return None
+    return _frame(table.base, "base", path) if table.base else tuple(arm.base)
+
+
+def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
+    if not isinstance(table, dict):
+        raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
+    try:
+        place = validate(FrameTable, table, path)
+    except InputError as error:
+        where = f"key {where}" + error.where.removeprefix("key").replace(" the top level", "").replace(" ", ".", 1)
+        raise InputError(where, error.found, error.accepted, path) from None
+    return tuple(getattr(place, c) for c in FRAME)

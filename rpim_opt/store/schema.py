@@ -1,0 +1,187 @@
+"""The schema of a result file: what stands under which key, in SI and with every digit."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+FORMAT = "rpim-opt result"
+VERSION = 1
+Vector = list[float]
+Matrix = list[Vector]
+Cube = list[Matrix]
+Term = str | list[Any] | None
+"""A ready function by its name, or by that of its maker and the arguments; None for one that only a script has."""
+
+
+class Part(BaseModel):
+    """What all parts share: no key is converted, none may be infinite."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+
+
+class RobotPart(Part):
+    """The nominal robot."""
+
+    name: str
+    source: str
+    mdh: Matrix
+    joint_types: list[str]
+    joint_map: Matrix
+    limits: list[Annotated[list[float | None], Field(min_length=2, max_length=2)]]
+
+
+class ParameterPart(Part):
+    """One model parameter; no tolerance is an infinite one."""
+
+    name: str
+    dimension: str
+    nominal: float
+    scale: float
+    tolerance: float | None
+    identified: bool
+
+
+class BlockPart(Part):
+    """Rows of one kind of measurement."""
+
+    measurement: str
+    markers: list[str]
+    fixture: str
+    row: list[int]
+    q: Cube
+    y: Matrix
+    covariance: Cube
+    torque: Cube | None
+
+
+class DataPart(Part):
+    """Measurements: labels, configurations and blocks."""
+
+    label: list[str]
+    configuration: list[int]
+    blocks: list[BlockPart]
+
+
+class SetsPart(Part):
+    """Both sets of measurements."""
+
+    identification: DataPart
+    validation: DataPart | None = None
+
+
+class SelectionPart(Part):
+    """How the weight was chosen."""
+
+    weight: float
+    name: str
+    weights: Vector
+    score: list[float | None]
+    interior: bool
+    note: str
+
+
+class QuadraticPart(Part):
+    """A quadratic |L v - c|^2 + constant: L by its diagonal, or whole."""
+
+    diagonal: Vector | None
+    matrix: Matrix | None
+    c: Vector
+    constant: float
+
+
+class FormsPart(Part):
+    """The quadratics that a script's loss (of the residual) and penalty (of z) are."""
+
+    loss: QuadraticPart | None
+    penalty: QuadraticPart | None
+
+
+class DefinitionPart(Part):
+    """What the formulation is."""
+
+    loss: Term
+    penalty: Term
+    constraints: list[Term]
+    loss_over: str
+    penalty_over: Term
+    largest: float | None
+
+
+class PassPart(Part):
+    """One pass of the loop."""
+
+    objective: float
+    step: float
+    weight: float
+    damping: float = 0.0
+
+
+class TrustPart(Part):
+    """What a loss of a script made of the equations: a factor, and those that it left out."""
+
+    factor: float
+    left_out: list[int]
+
+
+class CertificatePart(Part):
+    """How well the conditions of a solution are met."""
+
+    gradient: float | None
+    step: float | None
+    violation: float | None
+    decrease: float | None = None
+
+
+class HeldPart(Part):
+    """A parameter at its bound."""
+
+    name: str
+    bound: float
+    multiplier: float
+    gain: float
+
+
+class RecordPart(Part):
+    """Where the measurements come from."""
+
+    source: str
+    files: dict[str, str]
+    excluded: dict[str, str]
+    simulated: bool
+    made: str
+    versions: dict[str, str]
+
+
+class RowPart(Part):
+    """The errors of one row."""
+
+    label: str
+    nominal_mm: float | None
+    identified_mm: float | None
+
+
+class File(Part):
+    """A result file; what it holds besides follows from this."""
+
+    format: Literal["rpim-opt result"]
+    version: Literal[1]
+    title: str
+    formulation: str
+    definition: DefinitionPart
+    forms: FormsPart | None = None
+    weight: float
+    selection: SelectionPart | None
+    converged: bool
+    message: str
+    history: list[PassPart]
+    x: Vector
+    certificate: CertificatePart | None
+    trust: TrustPart | None
+    held: list[HeldPart]
+    robot: RobotPart
+    model: list[ParameterPart]
+    data: SetsPart
+    record: RecordPart
+    rows: dict[str, list[RowPart]]

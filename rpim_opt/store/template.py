@@ -1,0 +1,155 @@
+"""The text of a new ``problem.toml``: every key with what it means and where it comes from."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement
+from rpim_opt.problem.frames import starting_parameters
+from rpim_opt.problem.placing import locate
+from rpim_opt.robot.chain import Described, placed, same_place
+from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
+from rpim_opt.robot.mdh import MDH
+from rpim_opt.robot.plain import exact, toml
+from rpim_opt.store.proposal import proposed
+
+TEMPLATE = """\
+# Made by rpim-opt new; look at it, then: rpim-opt inspect, rpim-opt calibrate.
+# Names carry units: _mm, _m, _deg, _mrad, _rad. What was guessed says so.
+
+title = {title}
+source = ""                     # who measured what, when and with what: result and report repeat it
+
+robot = {robot}
+# {drawing}
+measurement = {measurement}
+# {columns}
+identification = "identification.csv"
+# {count} rows, from {data}
+{validation}
+
+# What may deviate from the drawing, by name or pattern: alpha, a, theta, d of every joint, Hayati's beta where axes
+# are near parallel, base_x ... base_rz, tool_x ... tool_rz. This is what "auto" means for these data.
+identify = {identify}
+
+formulation = "tikhonov"        # "robust" where rows may be wrong; "bounded" keeps to [tolerance]
+selector = "reml"               # how the penalty's weight is chosen: l_curve, gcv, k_fold, ..., or a number, "0.5"
+{auto}
+# Standard deviation of a measured value, for rows that state none (column sigma_mm). Guessed: a laser tracker, and a
+# robot that repeats well. reml finds the level itself; what counts is how kinds and rows compare.
+[noise]
+{noise}
+
+# Expected size of deviations (prior standard deviation). Guessed: a machined arm, a reflector measured roughly.
+# Single parameters by name: d5_mm, theta3_mrad.
+[scale]
+length_mm = 1.0                 # a, d
+angle_mrad = 1.0                # alpha, theta, beta
+tool_mm = 10.0
+tool_mrad = 10.0
+base_mm = {scale}
+base_mrad = {scale}
+
+# Largest deviation, for the formulation "bounded" alone.
+[tolerance]
+length_mm = 5.0
+angle_mrad = 10.0
+{base}
+# The reflector in the flange frame: {known}.
+{tools}
+
+# Rows to leave out, label = reason:
+# [exclude]
+# {label} = "the reflector was bumped"
+"""
+
+
+def problem_text(
+    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], said: Mapping[str, str]
+) -> tuple[str, list[str]]:
+    """Return the text of ``problem.toml``, and what was guessed in sentences."""
+    markers = sorted({marker for block in rows.blocks for marker in block.markers})
+    tools = dict.fromkeys(markers, arm.tool)
+    base, how = _base(arm, rows, tools)
+    parameters = starting_parameters(arm.robot, rows, base, tools)
+    text = TEMPLATE.format(
+        **said,
+        title=toml(arm.robot.name),
+        measurement=toml(kind.name),
+        identify=toml(_patterns(proposed(arm.robot, parameters, rows), arm.robot.dof)),
+        auto=f'base = "auto"\n# {how}\n' if base is None else "",
+        noise="\n".join(f"{key} = {value}" for key, value in noise.items()),
+        scale="100.0" if base is None else "1.0",
+        base=_base_table(base, how),
+        known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
+        tools="\n".join(_tool_tables(markers, arm.tool)),
+        label=_key(rows.label[0]),
+    )
+    return text, [how]
+
+
+def _base_table(base: Array | None, how: str) -> str:
+    if base is None:
+        return ""
+    about = "# The robot's base in the instrument's frame; rx, ry, rz are roll, pitch, yaw (R = Rz Ry Rx)."
+    return "\n".join(["", about, f"# {how}", "[base]", *_frame(base), ""])
+
+
+def _tool_tables(markers: Sequence[str], place: Array) -> list[str]:
+    lines = []
+    for marker in markers:
+        lines.append(f"[tool.{_key(marker)}]" if marker else "[tool]")
+        lines += _frame(place)
+    return lines
+
+
+def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array]) -> tuple[Array | None, str]:
+    """Return the base to state, None for registration, and why."""
+    if not {block.measurement.name for block in rows.blocks} & {"position", "pose"}:
+        return arm.base, "As the robot's file has it: these measurements do not depend on it."
+    found = locate(arm.robot, rows, tools)[0]
+    if same_place(found, arm.base):
+        offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
+        how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
+        return arm.base, how
+    return None, f"Guessed: the data put the base at {placed(found)}, so the instrument has a frame of its own."
+
+
+def _patterns(names: Sequence[str], dof: int) -> list[str]:
+    """Return names with those of all joints, or of a whole frame, as patterns."""
+    left = list(names)
+    patterns = []
+    for pattern, members in _groups(names, dof).items():
+        if set(members) <= set(left):
+            left = [name for name in left if name not in members]
+            patterns.append(pattern)
+    return [*patterns, *left]
+
+
+def _groups(names: Sequence[str], dof: int) -> dict[str, list[str]]:
+    """Return what patterns stand for: one column of all joints, a whole frame, a frame's place."""
+    groups: dict[str, list[str]] = {}
+    if dof < 10:  # a question mark stands for one digit
+        groups = {f"{column}?": [f"{column}{i}" for i in range(1, dof + 1)] for column in MDH}
+    for prefix in dict.fromkeys(name[: name.rindex("_") + 1] for name in names if "_" in name):
+        groups[f"{prefix}*"] = [prefix + c for c in FRAME]
+        groups[f"{prefix}[xyz]"] = [prefix + c for c in FRAME[:3]]
+    return groups
+
+
+def _frame(place: Array) -> list[str]:
+    lines = []
+    for name, value in zip(FRAME, place, strict=True):
+        unit, (number,) = exact(FRAME_DIMENSION[name], [value])
+        lines.append(f"{name}_{unit} = {number + 0.0!r}")
+    return lines
+
+
+def _key(text: str) -> str:
+    """Return a TOML key."""
+    return text if re.fullmatch(r"[\w-]+", text, re.ASCII) else toml(text)

@@ -1,0 +1,2 @@
+from .report import Metric as Metric
+from .report import Report as Report

@@ -1,0 +1,98 @@
+"""What a study found: a text with figures, and metrics that must not get worse."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import write_json, write_text
+from rpim_opt.study.grid import find_study, load_study, studies_folder
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of a study that must not get worse: its direction, and by how much of the baseline it may vary.
+
+    Parameters
+    ----------
+    better
+        ``"lower"`` or ``"higher"``.
+    tolerance
+        What part of the baseline it may be worse by.
+
+    Examples
+    --------
+    >>> from rpim_opt.study import Metric
+    >>> METRICS = {"mean error [mm]": Metric("lower", 0.1)}  # of a file in the folder studies
+    """
+
+    better: str
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a study found.
+
+    Parameters
+    ----------
+    text
+        Markdown.
+    metrics
+        Figures that a baseline is compared with, by the names of the study's METRICS.
+    figures
+        matplotlib figures by name.
+
+    Examples
+    --------
+    >>> from rpim_opt.study import Report
+    >>> Report("The error falls with the root of the number of poses.", {"mean error [mm]": 0.03}).metrics
+    {'mean error [mm]': 0.03}
+    """
+
+    text: str
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write(folder: Path, question: str, report: Report, made: str) -> None:
+    """Write ``README.md`` with the figures, and ``metrics.json``."""
+    for title, figure in report.figures.items():
+        _draw(folder, title, figure)
+    pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
+    text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
+    write_text(folder / "README.md", text + "\n")
+    write_json(folder / "metrics.json", dict(report.metrics))
+
+
+def _draw(folder: Path, title: str, figure: Any) -> None:
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
+        figure.savefig(folder / f"{title}.svg", metadata={"Date": None})
+    figure.savefig(folder / f"{title}.png")
+
+
+def regressions(name: str, quick: bool, metrics: Mapping[str, float]) -> list[str]:
+    """Return a sentence for every metric that is worse than the committed baseline allows."""
+    path = studies_folder() / "baselines.json"
+    known: dict[str, dict[str, float]] = {}
+    if path.is_file():
+        known = json.loads(path.read_text(encoding="utf-8"))
+    label = f"{name}-quick" if quick else name
+    if label not in known:
+        raise InputError("baseline", f"none for '{label}'", choices(label, known), path)
+    rules = load_study(find_study(name)).METRICS
+    worse = []
+    for metric, baseline in known[label].items():
+        rule = rules[metric]
+        value = metrics.get(metric)
+        sign = 1 if rule.better == "lower" else -1
+        if value is None or not sign * (value - baseline) <= rule.tolerance * abs(baseline):
+            bound = f"{rule.better} is better, tolerance {rule.tolerance:.0%}"
+            worse.append(f"{metric}: found {value}, baseline {baseline}, {bound}")
+    return worse

@@ -1,0 +1,248 @@
+"""The controller's robot beside the identified one: where commands go, and what brings them where they should."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement, position
+from rpim_opt.problem.design import random_candidates
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.kinematics import FRAME, numeric_frame
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import reflectors, tool_prefix
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.use.arm import Arm
+from rpim_opt.use.inverse import attainable, nearest, pinned, ranges, times
+
+REACHED = 1e-7
+"""A target counts as reached when no more than this is left [m, rad]."""
+
+
+BANK = 2000
+TRIALS = 12
+"""Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
+
+
+class Spread(NamedTuple):
+    """What the calibration knows of positions: deviations of the parameters and their covariance, or None."""
+
+    problem: CalibrationProblem
+    x: Array
+    covariance: Array | None
+    marker: str
+
+    def at(self, q: Array, torque: Array | None) -> Array:
+        """Return sqrt(tr J C J') at commands, (N,) [m]."""
+        if self.covariance is None:
+            return np.full(len(q), np.inf)
+        data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
+        loads = None if torque is None else torque[:, None]
+        data = replace(data, blocks=tuple(replace(b, markers=(self.marker,), torque=loads) for b in data.blocks))
+        J = self.problem.on(data).jacobian(self.x)
+        known = np.isfinite(np.diag(self.covariance))
+        C = np.where(np.outer(known, known), self.covariance, 0.0)
+        variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
+        unseen = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
+        return np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+class Known(NamedTuple):
+    """All parameters, their deviations (p,) [SI], and the covariance (n, n) of the identified ones, or None."""
+
+    parameters: Parameters
+    x: Array
+    covariance: Array | None
+
+    @classmethod
+    def of(cls, result: Calibration) -> Known:
+        """Return what a calibration identified; the other parameters do not deviate."""
+        parameters = result.problem.parameters
+        x = np.zeros(len(parameters))
+        x[parameters.identified] = result.x
+        return cls(parameters, x, known_covariance(result))
+
+    def holding(self, prefix: str, tool: Sequence[float] | Array) -> Known:
+        """Return the same with a tool that is known exactly, (6,) x, y, z [m], roll, pitch, yaw [rad]."""
+        own = np.asarray(tool, dtype=float)
+        if own.shape != (6,) or not np.isfinite(own).all():
+            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        at = [self.parameters.names.index(prefix + c) for c in FRAME]
+        nominal = self.parameters.nominal.copy()
+        nominal[at] = own
+        identified = self.parameters.identified.copy()
+        identified[at] = False
+        x = self.x.copy()
+        x[at] = 0.0
+        covariance = self.covariance
+        if covariance is not None:
+            still = identified[self.parameters.identified]
+            covariance = covariance[np.ix_(still, still)]
+        return Known(replace(self.parameters, nominal=nominal, identified=identified), x, covariance)
+
+    def named(self, values: Array) -> dict[str, float]:
+        """Return values (p,) by the parameters' names."""
+        return dict(zip(self.parameters.names, values.tolist(), strict=True))
+
+
+def _reflector(parameters: Parameters, tool: Sequence[float] | Array | None, marker: str) -> str:
+    """Return the reflector that is meant; a tool of one's own takes the first one's place."""
+    known = reflectors(parameters.names)
+    if tool is not None:
+        return known[0]
+    if marker not in known:
+        raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+    return marker
+
+
+def _base(values: Mapping[str, float]) -> Array:
+    return numeric_frame([values[f"base_{c}"] for c in FRAME])
+
+
+class Cell(NamedTuple):
+    """The controller's robot, the identified one, and what the calibration knows of it."""
+
+    robot: Robot
+    kind: Measurement
+    nominal: Arm
+    real: Arm
+    spread: Spread
+
+    @classmethod
+    def of(
+        cls,
+        result: Calibration,
+        kind: Measurement,
+        tool: Sequence[float] | Array | None,
+        marker: str,
+        base: bool,
+        torques: bool,
+    ) -> Cell:
+        """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
+        robot = result.problem.robot
+        known = Known.of(result)
+        reflector = _reflector(known.parameters, tool, marker)
+        prefix = tool_prefix(reflector)
+        if tool is not None:
+            known = known.holding(prefix, tool)
+        stated = known.named(known.parameters.nominal)
+        found = known.named(known.parameters.values(known.x))
+        moved = np.eye(4)
+        if base:
+            moved = np.linalg.inv(_base(stated)) @ _base(found)
+        free = known.x[known.parameters.identified]
+        problem = CalibrationProblem(robot, known.parameters, result.problem.data)
+        return cls(
+            robot,
+            kind,
+            nominal=Arm.of(robot, stated, prefix, np.eye(4), kind, torques),
+            real=Arm.of(robot, found, prefix, moved, kind, torques),
+            spread=Spread(problem, free, known.covariance, reflector),
+        )
+
+    def compensated(
+        self, q: Array | None, poses: Array | None, torque: Array | None, largest: float
+    ) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
+        N = len(np.asarray(q if poses is None else poses))
+        tau = np.empty((N, 0))
+        if torque is not None:
+            tau = torque @ np.linalg.inv(self.robot.joint_map)  # of the model's joints
+        nominal, target, missed = self._believed(q, poses, tau)
+        _, before, J = self.real.at(nominal, tau, target)
+        W = attainable(J)
+        unit = ranges(self.robot, J.shape[1])
+        reached = self._reached(missed, W)
+        due = np.where(reached[:, None], before - missed, 0.0)
+        P = pinned(W @ J * unit, times(W, due), largest)
+        low, high = self._around(nominal, largest)
+        found, left, held = nearest(self.real, tau, target, nominal, low, high, unit, W, P)
+        lowest, highest = self.robot.limits.T
+        at_limit = (held & ((found <= lowest) | (found >= highest))).any(axis=1)
+        cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
+        place_before, turn_before = self._norms(before)
+        place, turn = self._norms(left)
+        return {
+            "nominal": nominal,
+            "q": found,
+            "position_before": place_before,
+            "orientation_before": turn_before,
+            "position_error": place,
+            "orientation_error": turn,
+            "std": self.spread.at(found, torque),
+            "status": np.select(list(cases.values()), list(cases), "near singular"),
+        }
+
+    def _believed(self, q: Array | None, poses: Array | None, tau: Array) -> tuple[Array, Array, Array]:
+        """Return the controller's commands (N, dof), the targets (N, c), and by how much it misses them (N, k)."""
+        if poses is not None:
+            commands = self._commands(poses, q, tau)
+            return commands, poses, self.nominal.at(commands, tau, poses)[1]
+        commands = np.asarray(q)
+        believed, error, _ = self.nominal.at(commands, tau, np.zeros((len(commands), len(self.kind.columns))))
+        return commands, believed, np.zeros_like(error)
+
+    def _around(self, commands: Array, largest: float) -> tuple[Array, Array]:
+        """Return the bounds (N, dof) of corrected commands."""
+        lowest, highest = self.robot.limits.T
+        inside = np.clip(commands, lowest, highest)
+        return np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
+
+    def _commands(self, poses: Array, q: Array | None, tau: Array) -> Array:
+        """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
+        starts = self._starts(poses, tau.shape[1]) if q is None else q[:, None]
+        found, left, _ = self._nearest(poses, tau, starts[:, 0])
+        for k in range(1, starts.shape[1]):
+            again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
+            if not len(again):
+                break
+            other, error, _ = self._nearest(poses[again], tau[again], starts[again, k])
+            better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
+            found[again[better]] = other[better]
+            left[again[better]] = error[better]
+        if poses.shape[1] == 3 or self.robot.dof >= 6:
+            return found
+        return self._nearest(poses, tau, found, attainable(self.nominal.at(found, tau, poses)[2]))[0]
+
+    def _nearest(
+        self, poses: Array, tau: Array, start: Array, W: Array | None = None
+    ) -> tuple[Array, Array, np.ndarray]:
+        low, high = self.robot.limits.T
+        return nearest(self.nominal, tau, poses, start, low, high, np.ones(self.robot.dof), W)
+
+    def _starts(self, poses: Array, torques: int) -> Array:
+        """Return the nearest of many configurations within limits, or a turn, for every pose, (N, TRIALS, dof)."""
+        low, high = self.robot.limits.T
+        low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
+        high = np.where(np.isfinite(high), high, low + 2 * np.pi)
+        bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
+        seen = self.nominal.at(bank, np.zeros((BANK, torques)), np.zeros((BANK, poses.shape[1])))[0]
+        distance = cdist(poses[:, :3], seen[:, :3], "sqeuclidean")
+        if poses.shape[1] == 7:
+            distance += 8 * (1 - np.abs(poses[:, 3:] @ seen[:, 3:].T))  # the angle's square, nearly
+        closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
+        order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
+        return bank[np.take_along_axis(closest, order, axis=1)]
+
+    @property
+    def _lengths(self) -> np.ndarray:
+        return np.array([dimension == "length" for dimension in self.kind.components.values()])
+
+    def _norms(self, error: Array) -> tuple[Array, Array]:
+        """Return the norms of position and orientation errors; NaN where there is no orientation."""
+        turn = error[:, ~self._lengths]
+        angle = np.linalg.norm(turn, axis=1) if turn.shape[1] else np.full(len(error), np.nan)
+        return np.linalg.norm(error[:, self._lengths], axis=1), angle
+
+    def _reached(self, error: Array, W: Array) -> np.ndarray:
+        place, turn = self._norms(times(W, error))
+        return (place <= REACHED) & ~(turn > REACHED)

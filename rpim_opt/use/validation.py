@@ -1,0 +1,233 @@
+"""A saved calibration on measurements that it has never seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.tables import csv_text, read_columns
+from rpim_opt.basics.text import table
+from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement
+from rpim_opt.data.naming import parse_units, rename
+from rpim_opt.data.reading import read_data
+
+RARE = 0.01
+"""Probability that data like those of the calibration have any row that is named."""
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Errors of a calibration on new measurements.
+
+    Parameters
+    ----------
+    label
+        N row labels.
+    nominal, error
+        (N,) position errors before and after calibration [m].
+    vectors
+        (N, 3) measured minus predicted position [m]; NaN where no position was measured.
+    angle
+        (N,) orientation errors [rad]; NaN for rows that are no poses.
+    sigmas, allowed
+        (N,) |S^-1/2 r| of a row's residual r, with S = J C J' + its measurement's covariance and C the calibration's,
+        and what of it chi^2 allows so that one of all N rows exceeds it with probability `RARE`. NaN where the
+        calibration has no covariance, or none in a direction that the row depends on.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> found = ro.use.validate(ro.calibrate(instance.problem, ro.tikhonov, ro.reml), instance.validation)
+    >>> f"{1e3 * found.largest:.2f} mm", found.beyond  # no row that the uncertainty does not explain
+    ('0.04 mm', ())
+    >>> found.csv().splitlines()[0].split(",")[0], sorted(found.content())[:3]
+    ('label', ['axes', 'beyond', 'identified'])
+    """
+
+    label: tuple[str, ...]
+    nominal: Array
+    error: Array
+    vectors: Array
+    angle: Array
+    sigmas: Array
+    allowed: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest error [m]."""
+        return float(np.nanmax(self.error))
+
+    @property
+    def beyond(self) -> tuple[int, ...]:
+        """Rows beyond what the prediction's uncertainty allows, the worst first."""
+        order = np.argsort(-np.nan_to_num(self.sigmas / self.allowed))
+        return tuple(int(i) for i in order if self.sigmas[i] > self.allowed[i])
+
+    def content(self) -> dict[str, Any]:
+        """Return the figures [mm, mrad], and the rows."""
+        axes = {a: v[np.isfinite(v)] for a, v in zip("xyz", self.vectors.T, strict=True)}
+        rows = self._rows()
+        return {
+            "nominal": statistics(self.nominal),
+            "identified": statistics(self.error),
+            "axes": {a: {**statistics(np.abs(v)), "bias_mm": 1e3 * v.mean()} for a, v in axes.items() if len(v)},
+            "orientation": statistics(self.angle, "mrad"),
+            "beyond": [self.label[i] for i in self.beyond],
+            "judged": bool(np.isfinite(self.sigmas).any()),
+            "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
+        }  # fmt: skip
+
+    def csv(self) -> str:
+        """Return the rows as CSV."""
+        cells = {k: [c if isinstance(c, str) else f"{c:.6f}" if np.isfinite(c) else "" for c in column]
+                 for k, column in self._rows().items()}  # fmt: skip
+        return csv_text(cells, zip(*cells.values(), strict=True))
+
+    def __str__(self) -> str:
+        """Return the errors as a table, and the rows beyond their uncertainty by name."""
+        found = self.content()
+        sets = {"nominal": found["nominal"], "identified": found["identified"]}
+        for axis, figures in found["axes"].items():
+            sets[f"  {axis}, mean signed"] = {**figures, "mean_mm": figures["bias_mm"]}
+        rows = [[name, str(s["count"]), *(f"{s[k]:.4f}" for k in ("mean_mm", "rms_mm", "max_mm"))]
+                for name, s in sets.items()]  # fmt: skip
+        turn = found["orientation"]
+        if turn["count"]:
+            figures = [f"{turn[k]:.4f}" for k in ("mean_mrad", "rms_mrad", "max_mrad")]
+            rows.append(["orientation, identified [mrad]", str(turn["count"]), *figures])
+        return "\n".join([table(["error [mm]", "rows", "mean", "RMS", "max"], rows), self._judgement()])
+
+    def _judgement(self) -> str:
+        if not np.isfinite(self.sigmas).any():
+            return "The calibration has no covariance for these rows: how large errors may be is not known."
+        if not self.beyond:
+            return "No row is beyond what the prediction's uncertainty allows."
+        named = ", ".join(
+            f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond[:8]
+        )
+        more = f" and {len(self.beyond) - 8} more" if len(self.beyond) > 8 else ""
+        return f"Beyond what the prediction's uncertainty allows: {named}{more}."
+
+    def _rows(self) -> dict[str, Sequence[Any]]:
+        mm = {f"{axis}_mm": (1e3 * v).tolist() for axis, v in zip("xyz", self.vectors.T, strict=True)}
+        return {
+            "label": self.label, "nominal_mm": (1e3 * self.nominal).tolist(), "error_mm": (1e3 * self.error).tolist(),
+            **mm, "orientation_mrad": (1e3 * self.angle).tolist(), "sigmas": self.sigmas.tolist(),
+            "allowed_sigmas": self.allowed.tolist(),
+        }  # fmt: skip
+
+
+def validate(result: Calibration, data: Dataset) -> Validation:
+    """Return the errors of a calibration on measurements, and whether its uncertainty explains them.
+
+    Parameters
+    ----------
+    result
+        The calibration, perhaps of `load_result`.
+    data
+        Measurements in the same instrument's frame, by reflectors of the calibration.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> found = ro.use.validate(ro.calibrate(instance.problem, ro.tikhonov, ro.l_curve), instance.validation)
+    >>> f"{1e3 * found.error.mean():.3f} mm"
+    '0.032 mm'
+    """
+    return Validation(
+        data.label, result.nominal_errors(data), result.errors(data), result.error_vectors(data),
+        result.errors(data, "angle"), *_sigmas(result, data),
+    )  # fmt: skip
+
+
+def read_measurements(
+    result: Calibration, source: Any, measurement: str | None = None, units: str = ""
+) -> tuple[Dataset, tuple[str, ...]]:
+    """Return the measurements of a table, whose columns `naming.rename` recognises, and columns that were left out.
+
+    Rows that state no uncertainty have that of the calibration's data, at the noise level that it observed.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    source
+        A path (``.csv``, ``.parquet``, ``.xlsx``), or a data frame.
+    measurement
+        Which of the calibration's kinds, where it has several.
+    units
+        Units of columns whose name carries none, ``"deg,mm"``.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
+    >>> table = {f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}
+    >>> table |= {"x": [826.6, 810.0], "y": [98.0, 240.0], "z": [107.0, 254.0], "note": ["", "warm"]}
+    >>> data, left_out = ro.read_measurements(result, table, units="deg,mm")
+    >>> len(data), left_out
+    (2, ('note',))
+    """
+    kinds = {block.measurement.name: block.measurement for block in result.problem.data.blocks}
+    name = measurement or (next(iter(kinds)) if len(kinds) == 1 else "")
+    if name not in kinds:
+        raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
+    given = parse_units(units)
+    try:
+        found = rename(read_columns(source), result.problem.robot, kinds[name], given)
+        data = read_data(found.columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
+    except InputError as error:
+        raise error.within(source if isinstance(source, str | Path) else None) from None
+    return data, found.left_out
+
+
+def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:
+    """Return the typical standard deviation of every component, as a table ``[noise]`` has it."""
+    blocks = [block for block in result.problem.data.blocks if block.measurement is kind]
+    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
+    level = 1.0 if known_covariance(result) is None else result.noise_variance
+    si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in kind.components.values()}
+    sigma = zip(kind.components.items(), np.sqrt(level * variance), strict=True)
+    return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma}
+
+
+def _sigmas(result: Calibration, data: Dataset) -> tuple[Array, Array]:
+    """Return the rows' residuals in standard deviations of their prediction and measurement, and the bound of them."""
+    N = len(data)
+    C = known_covariance(result)
+    start = 0
+    sigmas = np.full(N, np.nan)
+    allowed = np.full(N, np.nan)
+    if C is None:
+        return sigmas, allowed
+    problem = result.problem.on(data)
+    residual = problem.residual(result.x)
+    J = problem.jacobian(result.x)
+    known = np.isfinite(np.diag(C))
+    C = np.where(np.outer(known, known), C, 0.0)
+    for block in data.blocks:
+        k = len(block.measurement.components)
+        end = start + k * len(block.row)
+        r = residual[start:end].reshape(-1, k)
+        A = J[start:end].reshape(-1, k, len(C))
+        start = end
+        S = A @ C @ A.transpose(0, 2, 1) + block.covariance
+        squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
+        seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
+        sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
+        allowed[block.row] = np.where(seen, np.sqrt(chi2.ppf(1 - RARE / N, k)), np.nan)
+    return sigmas, allowed
