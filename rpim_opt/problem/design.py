@@ -1,0 +1,321 @@
+"""Which configurations to measure: optimal design by convex relaxation, rounded, with its gap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.tables import numbers, read_columns
+from rpim_opt.basics.units import UNITS, joint_columns, with_unit
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.linear import RANK_TOLERANCE
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.mdh import Robot
+
+CRITERIA = ("D", "A", "E", "V")
+SMOOTH = 12
+"""Power of the smooth least eigenvalue, (tr M^-p)^(-1/p)."""
+ROUNDINGS = 5
+"""How often the relaxation is rounded: once to the largest weights, then at random by them; the best set stays."""
+ENOUGH = 2e-3
+"""Relative gap at which the relaxation is solved well enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A chosen set of configurations.
+
+    Parameters
+    ----------
+    chosen
+        (count,) indices of the candidates.
+    weights
+        (M,) what the relaxation gives every candidate, from 0 to 1.
+    criterion
+        ``D``, ``A``, ``E`` or ``V``.
+    value, bound
+        The criterion of the chosen set (ln det M for D, [m^2] for V), and what no set of that size can exceed (fall
+        below, for A and V).
+    gap
+        bound over value as efficiencies, minus 1: 0.01 means that no set is more than 1 % better. D counts per
+        parameter, det^(1/n).
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> design = ro.problem.choose(problem, ro.problem.random_candidates(problem.robot, 60), count=30, criterion="D")
+    >>> len(design.chosen), design.gap < 0.02, design.value < design.bound
+    (30, True, True)
+    """
+
+    chosen: np.ndarray
+    weights: Array
+    criterion: str
+    value: float
+    bound: float
+    gap: float
+
+    def __str__(self) -> str:
+        """Return the choice in a sentence."""
+        names = {"D": "det^(1/n)", "A": "mean variance", "E": "least information", "V": "predicted variance"}
+        count = f"{len(self.chosen)} of {len(self.weights)} configurations"
+        what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
+        if self.gap > 1:
+            return f"{what}: too few for a useful bound on how near the best set is; choose more."
+        return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
+
+
+def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
+    """Return joint values (count, dof) [rad or m], uniform in the middle of every joint's range.
+
+    Parameters
+    ----------
+    robot
+        Its limits have to be finite: InputError otherwise.
+    count
+        How many configurations.
+    seed
+        Of the draws, or a generator to draw from.
+    share
+        Which part of every joint's range is used, from 0 to 1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> q = ro.problem.random_candidates(ro.load("position").problem.robot, 1000, share=0.5)
+    >>> np.degrees(q.max(axis=0)).round()
+    array([ 82.,  55.,  25.,  80.,  60., 200.])
+    """
+    if not np.isfinite(robot.limits).all():
+        raise InputError("limits", "a joint without limits", "limits for every joint, or candidates of your own")
+    middle, half = robot.limits.mean(axis=1), share * np.ptp(robot.limits, axis=1) / 2
+    return np.random.default_rng(seed).uniform(middle - half, middle + half, (count, robot.dof))
+
+
+def read_candidates(source: Any, robot: Robot) -> Array:
+    """Return the joint values (M, dof) of a table with columns ``q1_deg``, ...; other columns are left alone."""
+    columns, q = read_columns(source), []
+    rows = [str(i + 1) for i in range(len(next(iter(columns.values()))))]
+    for i, dimension in enumerate(robot.joint_dimensions, start=1):
+        name = next((n for n in with_unit(f"q{i}", dimension) if n in columns), None)
+        if name is None:
+            raise InputError("the header", f"no column for 'q{i}'", " or ".join(with_unit(f"q{i}", dimension)), source)
+        q.append(UNITS[name.split("_")[1]].si * numbers(columns[name], rows, name))
+    return np.column_stack(q)
+
+
+def joint_cells(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str]]:
+    """Return joint values as the columns of a table, labelled by the number of the candidate."""
+    units = joint_columns(robot.joint_dimensions)
+    cells = {name: [f"{v / si:.4f}" for v in column] for (name, si), column in zip(units.items(), q.T, strict=True)}
+    return {"label": [f"n{k}" for k in index], **cells}
+
+
+def choose(
+    problem: CalibrationProblem,
+    candidates: Array,
+    count: int,
+    criterion: str = "V",
+    predicted: Array | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Design:
+    """Choose the configurations that tell most about the identified parameters.
+
+    With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is
+    M = 1 + sum A_i' A_i. Relaxed to weights 0 <= w_i <= 1 with sum w_i = count, each criterion is convex::
+
+        D   maximize ln det M
+        A   minimize tr M^-1
+        E   maximize the least eigenvalue of M
+        V   minimize the mean variance of predicted positions, the axes' sum [m^2]
+
+    The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
+    any set can reach; E counts directions that some candidate sees. The largest weights are rounded and improved by
+    exchanges (Fedorov 1972).
+
+    Parameters
+    ----------
+    problem
+        Gives robot, parameters, scales and noise; the first block of its data says what is measured.
+    candidates
+        (M, dof) joint values of the controller that could be measured.
+    count
+        How many to choose.
+    criterion
+        One of ``D``, ``A``, ``E``, ``V``.
+    predicted
+        (K, dof) where positions are to be predicted (V); the candidates by default.
+    progress
+        Told what goes on.
+
+    Raises
+    ------
+    InputError
+        For another criterion, a count that the candidates do not allow, or measurements between two points.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> design = ro.problem.choose(problem, ro.problem.random_candidates(problem.robot, 60), count=30)
+    >>> print(str(design).partition(":")[0])
+    30 of 60 configurations, V-optimal (predicted variance)
+    """
+    if criterion not in CRITERIA:
+        raise InputError("criterion", f"'{criterion}'", choices(criterion, CRITERIA))
+    candidates = np.atleast_2d(np.asarray(candidates, dtype=float))
+    if not 0 < count < len(candidates):
+        raise InputError("count", f"{count}", f"1 to {len(candidates) - 1}, fewer than the candidates")
+    A = _rows(problem, candidates)
+    n = A.shape[2]
+    C = np.eye(n)
+    if criterion == "V":
+        P = _rows(problem, candidates if predicted is None else np.atleast_2d(predicted), whitened=False)
+        C = np.einsum("kin,kim->nm", P, P) / len(P)
+    progress(f"relaxing over {len(A)} candidates")
+    if criterion == "E":  # directions that no candidate sees would be the least informed whatever is chosen
+        _, s, Vt = np.linalg.svd(A.reshape(-1, n), full_matrices=False)
+        A = A @ Vt[s > RANK_TOLERANCE * s[0]].T
+        n = A.shape[2]
+        C = np.eye(n)
+    weights, bound = _relaxed(A, count, criterion, C, progress)
+    progress("rounding")
+    rng, best, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
+    for trial in range(ROUNDINGS):
+        start = np.argsort(-weights)[:count]
+        if trial:
+            share = np.maximum(weights, 1e-6)
+            start = rng.choice(len(A), count, replace=False, p=share / share.sum())
+        picked = np.sort(_exchanged(A, start, criterion, C, weights))
+        value = _value(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
+        score = value if criterion in "DE" else -value
+        if score > best:
+            best, chosen = score, picked
+    value = best if criterion in "DE" else -best
+    gap = {"D": np.exp((bound - value) / n), "E": bound / value}.get(criterion, value / bound) - 1
+    return Design(chosen, weights, criterion, float(value), float(bound), float(max(gap, 0.0)))
+
+
+def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array:
+    """Jacobians (M, k, n) of the candidates at nominal, in units of the scales; of positions [m] if not whitened."""
+    block = problem.data.blocks[0]
+    kind = block.measurement
+    if kind.points != 1:
+        raise InputError("design", f"measurement '{kind.name}' between two points", "measurements of one point")
+    y = np.zeros((len(q), len(kind.columns)))
+    if "qw" in kind.columns:
+        y[:, list(kind.columns).index("qw")] = 1.0
+    covariance = np.broadcast_to(np.median(block.covariance, axis=0), block.covariance.shape[1:])
+    data = Dataset.of(q, y, covariance, measurement=kind)
+    torque = None if block.torque is None else np.zeros((len(q), 1, q.shape[1]))
+    data = replace(
+        data, blocks=tuple(replace(b, markers=block.markers, fixture=block.fixture, torque=torque) for b in data.blocks)
+    )
+    there, scale = problem.on(data), problem.parameters.free.scale
+    x = np.zeros(len(scale))
+    rows = there.linearize(x).A if whitened else there.jacobian(x) * scale
+    rows = rows.reshape(len(q), -1, len(scale))
+    return rows if whitened else rows[:, [i for i, d in enumerate(kind.components.values()) if d == "length"]]
+
+
+def _value(M: Array, criterion: str, C: Array) -> float:
+    if criterion == "D":
+        return float(np.linalg.slogdet(M)[1])
+    if criterion == "E":
+        return float(np.linalg.eigvalsh(M)[0])
+    return float(np.trace(np.linalg.solve(M, C)))
+
+
+def _slope(M: Array, criterion: str, C: Array) -> Array:
+    """Z such that tr(A_i Z A_i') is by how much the relaxed criterion gains from candidate i."""
+    if criterion == "D":
+        return np.asarray(np.linalg.inv(M), dtype=float)
+    if criterion == "E":
+        values, vectors = np.linalg.eigh(M)
+        power = (values[0] / values) ** (SMOOTH + 1)
+        return np.asarray((vectors * (power / power.sum())) @ vectors.T, dtype=float)
+    inverse = np.linalg.inv(M)
+    return inverse @ C @ inverse
+
+
+def _relaxed(
+    A: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None], most: int = 4000
+) -> tuple[Array, float]:
+    """Maximize over {0 <= w <= 1, sum w = count} by multiplicative steps; weights and a bound on the optimum.
+
+    The criteria are concave, so that the slope at any weights bounds them all: for E because the least eigenvalue is at
+    most tr(Z M) for every Z of trace one, here that of a smooth least eigenvalue.
+    """
+    n, w = A.shape[2], np.full(len(A), count / len(A))
+    upper = criterion in "DE"
+    bound = np.inf if upper else -np.inf
+    flat = A.reshape(-1, n)
+    power = {"D": 1.0, "E": 1.0 / (SMOOTH + 1)}.get(criterion, 0.5)
+    for k in range(most):
+        M = np.eye(n) + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
+        Z = _slope(M, criterion, C)
+        gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
+        value, most_gain = _value(M, criterion, C), float(np.sort(gain)[-count:].sum())
+        if criterion == "E":
+            bound = min(bound, 1.0 + most_gain)
+        elif criterion == "D":
+            bound = min(bound, value + most_gain - float(gain @ w))
+        else:
+            bound = max(bound, value - most_gain + float(gain @ w))
+        off = bound - value if criterion == "D" else abs(bound - value) / abs(value)
+        if off <= ENOUGH * (n if criterion == "D" else 1):
+            break
+        if k % 200 == 0:
+            progress(f"relaxing over {len(A)} candidates: within {100 * off / (n if criterion == 'D' else 1):.2f} %")
+        w = _filled(w * np.maximum(gain, 1e-300) ** power, count)
+    return w, bound
+
+
+def _filled(v: Array, count: int) -> Array:
+    """min(1, mu v) with mu such that the sum is count."""
+    order = np.argsort(-v)
+    tail = np.cumsum(v[order][::-1])[::-1]
+    for k in range(count):  # k weights at 1
+        mu = (count - k) / tail[k]
+        if mu * v[order[k]] <= 1:
+            return np.minimum(1.0, mu * v)
+    return np.minimum(1.0, v / v[order[count - 1]])
+
+
+def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array, weights: Array, passes: int = 20) -> np.ndarray:
+    """Exchange single configurations while that improves the criterion."""
+    picked, n = [int(k) for k in chosen], A.shape[2]
+    eye = np.eye(A.shape[1])
+    for _ in range(passes):
+        changed = False
+        for place in range(len(picked)):
+            others = [c for c in picked if c != picked[place]]
+            M = np.eye(n) + np.einsum("kin,kim->nm", A[others], A[others])
+            inverse = np.linalg.inv(M)
+            small = np.einsum("kin,nm,kjm->kij", A, inverse, A, optimize=True) + eye
+            if criterion == "D":
+                score = np.linalg.slogdet(small)[1]
+            elif criterion == "E":
+                score = np.full(len(A), -np.inf)
+                likely = np.argsort(-weights)[: 3 * len(picked)]
+                vector = np.linalg.eigh(M)[1][:, 0]
+                likely = np.union1d(likely, np.argsort(-np.sum((A @ vector) ** 2, axis=1))[:20])
+                for k in np.append(likely, picked[place]):
+                    score[k] = np.linalg.eigvalsh(M + A[k].T @ A[k])[0]
+            else:
+                middle = np.einsum("kin,nm,kjm->kij", A, inverse @ C @ inverse, A, optimize=True)
+                score = np.trace(np.linalg.solve(small, middle), axis1=1, axis2=2)
+            score[others] = -np.inf
+            best = int(np.argmax(score))
+            if score[best] > score[picked[place]] * (1 + 1e-9 * np.sign(score[picked[place]])):
+                picked[place], changed = best, True
+        if not changed:
+            break
+    return np.array(picked)

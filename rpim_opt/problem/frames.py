@@ -1,0 +1,201 @@
+"""Where base, reflectors and fixtures start, and where the data put them on the nominal robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import of_fixture
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.placing import NOMINAL_ERROR, Place, locate
+from rpim_opt.problem.source import Source
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, roll_pitch_yaw
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.model import model_parameters
+from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import Parameters
+
+MISPLACED = 3.0
+"""How many scales a frame may be from where it is stated before the statement counts as a mistake."""
+MOST_STEPS = 200
+"""Steps, taken or refused, after which frames are as good as they get."""
+SHORT, ROUNDING = 1e-11, 1e-12
+"""Frames are found when a full step is shorter than the first, relative to 1 + |z|; a step is refused when it raises
+the objective by more than the second."""
+
+
+def starting_parameters(
+    robot: Robot,
+    data: Dataset,
+    base: Place | None = (0.0,) * 6,
+    tools: Mapping[str, Place] | None = None,
+    own: Mapping[str, float] | None = None,
+) -> Parameters:
+    """Return the model's parameters with closed-form values for what is not stated; none identified yet.
+
+    Parameters
+    ----------
+    robot, data
+        The nominal robot and what was measured.
+    base
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
+    tools
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
+    own
+        Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
+        parameters is stated is located from the nominal robot.
+
+    Raises
+    ------
+    InputError
+        For a marker of the data without a reflector, and data that do not determine what they have to.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> tools = {"": [0.02, 0, 0.06, 0, 0, 0]}
+    >>> parameters = ro.problem.starting_parameters(problem.robot, problem.data, base=None, tools=tools)
+    >>> parameters.identify(["base_[xyz]"]).free.nominal.round(2)  # [m]; it stands at 1.8, -0.7, 0.35
+    array([ 1.8 , -0.7 ,  0.35])
+    """
+    tools = tools or {"": (0.0,) * 6}
+    place: Place = (0.0,) * 6 if base is None else base
+    for block in data.blocks:
+        for marker in set(block.markers) - set(tools):
+            where = f"row {data.label[block.row[0]]}, column marker"
+            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
+    places: dict[str, Place] = dict(tools)
+    if base is None:
+        place, located = locate(robot, data, tools)
+        places |= {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
+    entries: dict[str, tuple[str, float]] = {}
+    own_frames: dict[str, None] = {}
+    for block in data.blocks:
+        kind = block.measurement
+        own_frames |= dict.fromkeys(of_fixture(name + "_", block.fixture) for name in kind.frames)
+        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+        given = {name: (own or {})[names[name]] for name in names if names[name] in (own or {})}
+        if names and not given and kind.start is not None:
+            T = (
+                numeric_frame(place)
+                @ forward_kinematics(robot, block.q[:, 0])
+                @ numeric_frame(places[block.markers[0]])
+            )
+            given = kind.start(T[:, :3, 3], block.y)
+        entries |= {names[name]: (d, float(given.get(name, 0.0))) for name, d in kind.parameters.items()}
+    return model_parameters(robot, place, tools, entries, tuple(own_frames))
+
+
+def relocated(problem: Source) -> Source | None:
+    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that.
+
+    Compared is what `locate` finds on the nominal robot with identified frames. A frame that is more than three
+    scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
+    it was found. None when every frame is near enough, or the data do not tell.
+    """
+    p = problem.parameters
+    index = {name: i for i, name in enumerate(p.names)}
+    at = {"base_": [index[f"base_{c}"] for c in FRAME]}
+    if not p.identified[at["base_"]].all():
+        return None
+    data = problem.sample().data
+    for block in data.blocks:
+        at[tool_prefix(block.markers[0])] = [index[tool_prefix(block.markers[0]) + c] for c in FRAME]
+    tools = {b.markers[0]: p.nominal[at[tool_prefix(b.markers[0])]] for b in data.blocks}
+    try:
+        base, places = locate(problem.robot, data, tools)
+    except InputError:
+        return None
+    found = {"base_": base} | {tool_prefix(b.markers[0]): places[b.markers[0]] for b in data.blocks}
+    nominal, moved = p.nominal.copy(), False
+    for prefix, place in found.items():
+        k = np.array(at[prefix])
+        free = p.identified[k]
+        if not (free[:3].all() and (free[3:].all() or not free[3:].any())):
+            continue
+        far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
+        if (far & free).any():
+            nominal[k[free]], moved = place[free], True
+    return problem.with_parameters(replace(p, nominal=nominal)) if moved else None
+
+
+def fitted_frames(problem: Source) -> tuple[Source, Array]:
+    """Return the problem that identifies frames alone, and its solution: what the data say before calibration.
+
+    ::
+
+        minimize    |Sigma^-1/2 r(S z)|^2 + |z|^2
+
+    over the identified parameters of base, reflectors, anchors and the like, in units of their scales; the robot is as
+    its drawing says. By Marquardt's damped Gauss-Newton steps.
+
+    Parameters
+    ----------
+    problem
+        In memory or in parts. One that identifies no frame comes back as it is, at nominal.
+
+    Returns
+    -------
+    The problem of the frames (all other parameters nominal; where frames were stated far off, counted from where the
+    data put them, `relocated`), and the deviations (f,) [SI].
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> fitted, x = ro.problem.fitted_frames(instance.problem)
+    >>> len(x), f"{1e3 * fitted.on(instance.validation).errors(x).mean():.2f} mm"
+    (9, '1.13 mm')
+    """
+    p = problem.parameters
+    frames = p.of_frames & p.identified
+    if not frames.any():
+        return problem, np.zeros(len(p.free))
+    alone = problem.identifying(frames)
+    alone = relocated(alone) or alone
+    source = in_parts(alone.frozen())
+    scale = alone.parameters.free.scale
+    z = np.zeros(len(scale))
+    model = source.linearize(scale * z)
+    damping = 0.0
+    for _ in range(MOST_STEPS):
+        step = _damped_step(model, z, damping)
+        candidate = source.linearize(scale * (z + step))
+        if _objective(candidate, z + step) > _objective(model, z) * (1 + ROUNDING):
+            damping = max(4 * damping, 1e-3)
+            continue
+        z = z + step
+        model = candidate
+        if damping == 0 and np.linalg.norm(step) <= SHORT * (1 + np.linalg.norm(z)):
+            break
+        damping = damping / 8 if damping > 1e-6 else 0.0
+    return alone, scale * z
+
+
+def _damped_step(model: LinearModel, z: Array, damping: float) -> Array:
+    """Return s that minimizes |A (z + s) - b|^2 + |z + s|^2 + damping |D s|^2, D the sizes of the columns."""
+    R = model.triangle
+    n = len(z)
+    A = np.vstack([R[:, :n], np.eye(n)])
+    b = np.concatenate([R[:, n] - R[:, :n] @ z, -z])
+    size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
+    step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), np.concatenate([b, np.zeros(n)]), rcond=None)[0]
+    return np.asarray(step, dtype=float)
+
+
+def _objective(model: LinearModel, z: Array) -> float:
+    return float(np.sum((model.A @ z - model.b) ** 2) + np.sum(z**2))
+
+
+def _deviation(place: Place, nominal: Array) -> Array:
+    """Return the deviation (6,) that takes a nominal frame to a place (`kinematics.frame`)."""
+    T, T0 = numeric_frame(place), numeric_frame(nominal)
+    return np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])

@@ -1,0 +1,149 @@
+"""The CasADi functions of a row: residual, Jacobian and modelled values of a measurement, asked anew or kept."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.models import MEASUREMENTS, Measurement, of_fixture
+from rpim_opt.robot.kinematics import FRAME, chain, frame
+from rpim_opt.robot.parameter_names import tool_prefix
+
+Functions = Mapping[str, ca.Function]
+"""``residual``, ``jacobian`` and ``modelled`` of one row; inputs are deviations, nominal values and the row."""
+
+transform = Measurement(
+    "transform", lambda T: ca.vec(T.T), {f"t{i}{j}": "" for i in range(4) for j in range(4)}, noise={"entry": ""}
+)
+"""The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
+
+_READY = frozenset({*MEASUREMENTS.values(), transform})
+_lock = threading.RLock()  # symbols of CasADi are counted without one; a model may itself evaluate a problem
+
+
+class Structure(NamedTuple):
+    """What decides the functions of a block's rows besides the measurement.
+
+    ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
+    """
+
+    joint_types: tuple[str, ...]
+    names: tuple[str, ...]
+    identified: bytes
+    absent: bytes
+    markers: tuple[str, ...]
+    fixture: str
+    torques: bool
+
+
+class Row(NamedTuple):
+    """The symbols and expressions of one row."""
+
+    x: ca.SX
+    nominal: ca.SX
+    row: ca.SX
+    residual: ca.SX
+    modelled: ca.SX
+
+
+class Kept:
+    """Functions that are asked for once: what a calibration works with from its first pass to its last."""
+
+    def __init__(self) -> None:
+        self._functions: dict[tuple[Structure, Measurement], Functions] = {}
+
+    def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
+        """Return the functions as they were when they were first asked for."""
+        with _lock:
+            if (structure, measurement) not in self._functions:
+                self._functions[structure, measurement] = asked(structure, measurement)
+            return self._functions[structure, measurement]
+
+
+def asked(structure: Structure, measurement: Measurement) -> Functions:
+    """Return the functions of a row.
+
+    Ready measurements are pure, and built once. A user's model may read a variable that has changed: it is asked
+    anew, and what was built before is taken only when it answers the same expression.
+
+    Raises
+    ------
+    InputError
+        For a residual with more or fewer components than the measurement declares.
+    """
+    if measurement in _READY:
+        return _ready(structure, measurement)
+    with _lock:
+        expressions = _expressions(structure, measurement)
+        answer = ca.Function("row", list(expressions[:3]), list(expressions[3:]))
+        return _built(answer.serialize())
+
+
+@lru_cache(maxsize=256)
+def _ready(structure: Structure, measurement: Measurement) -> Functions:
+    with _lock:
+        return _derived(_expressions(structure, measurement))
+
+
+@lru_cache(maxsize=256)
+def _built(answer: str) -> Functions:
+    function = ca.Function.deserialize(answer)
+    symbols = function.sx_in()
+    return _derived(Row(*symbols, *function.call(symbols)))
+
+
+def _derived(of: Row) -> Functions:
+    inputs = [of.x, of.nominal, of.row]
+    # call_rows returns the transposes: the derivative by x stands in rows
+    transposed = ca.densify(-ca.jacobian(of.residual, of.x).T)
+    return {
+        "residual": ca.Function("residual", inputs, [of.residual]),
+        "jacobian": ca.Function("jacobian", inputs, [of.residual, transposed]),
+        "modelled": ca.Function("modelled", inputs, [of.modelled]),
+    }
+
+
+def _expressions(of: Structure, measurement: Measurement) -> Row:
+    dof = len(of.joint_types)
+    points = len(of.markers)
+    free = np.flatnonzero(np.frombuffer(of.identified, dtype=bool))
+    zero = np.frombuffer(of.absent, dtype=bool)
+    x = ca.SX.sym("x", len(free))
+    nominal = ca.SX.sym("nominal", len(of.names))
+    q = ca.SX.sym("q", dof * points)
+    tau = ca.SX.sym("tau", dof * points if of.torques else 0)
+    y = ca.SX.sym("y", len(measurement.columns))
+    start = {name: ca.SX(0) if zero[i] else nominal[i] for i, name in enumerate(of.names)}
+    deviation = dict.fromkeys(of.names, ca.SX(0))
+    deviation.update({of.names[i]: x[k] for k, i in enumerate(free)})
+
+    def place(prefix: str) -> ca.SX:
+        return frame([start[prefix + c] for c in FRAME], [deviation[prefix + c] for c in FRAME])
+
+    def value(name: str) -> ca.SX:
+        return start[name] + deviation[name] if name in start else ca.SX(0)
+
+    def reflector(point: int, marker: str) -> ca.SX:
+        at = slice(point * dof, (point + 1) * dof)
+        torque = ca.vertsplit(tau[at]) if of.torques else (0,) * dof
+        flange = chain(of.joint_types, ca.vertsplit(q[at]), torque, value)
+        return place("base_") @ flange @ place(tool_prefix(marker))
+
+    own = {name: place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
+    in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
+    for name in measurement.parameters:
+        if not name.startswith(in_frames):
+            own[name] = value(of_fixture(name, of.fixture))
+    transforms = [reflector(point, marker) for point, marker in enumerate(of.markers)]
+    modelled = ca.densify(measurement.model(*transforms, **own))
+    residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
+    if residual.numel() != len(measurement.components):
+        found = f"{residual.numel()} components of the residual"
+        raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
+    return Row(x, nominal, ca.vertcat(q, tau, y), residual, modelled)

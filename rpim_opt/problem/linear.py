@@ -1,0 +1,146 @@
+"""A calibration problem linearized: whitened, scaled equations, their triangle and their singular values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.phases import phase
+from rpim_opt.robot.parameters import Parameters
+
+RANK_TOLERANCE = 1e-10
+"""Singular values below this part of the largest count as zero: the data do not see those directions."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """A calibration linearized around some deviation: A z ~ b, everything dimensionless.
+
+    Parameters
+    ----------
+    A
+        (m, n) = Sigma^-1/2 J S, the whitened identification Jacobian in units of the scales.
+    b
+        (m,) = Sigma^-1/2 r + A z_k, so that z is the *total* deviation in units of the scales.
+    group
+        (m,) number of the configuration that an equation belongs to.
+    parameters
+        The n identified parameters.
+    constrained
+        Whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would meet them, so
+        that how well they are met does not tell the noise.
+    stands_for
+        How many equations A and b were reduced from by a rotation, None where they are the equations themselves.
+    offset
+        What a loss that these equations majorize has besides |A z - b|^2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    >>> model.A.shape, model.equations, model.rank, model.triangle.shape
+    ((27, 26), 27, 20, (27, 27))
+    >>> (model.svd[1][:3] / model.svd[1][0]).round(2)  # largest singular values, relative
+    array([1.  , 0.96, 0.8 ])
+    >>> float(np.abs(model.with_values(0 * model.b).svd[0]).max())  # no data, no deviations
+    0.0
+    >>> model.scaled(np.repeat([1.0, 0.0], [15, 12])).rank  # without the last four configurations
+    15
+    """
+
+    A: Array
+    b: Array
+    group: np.ndarray
+    parameters: Parameters
+    constrained: bool = False
+    stands_for: int | None = None
+    offset: float = 0.0
+
+    @property
+    def equations(self) -> int:
+        """Number of equations m, those of the data where A and b were reduced from them."""
+        return len(self.b) if self.stands_for is None else self.stands_for
+
+    @cached_property
+    def svd(self) -> tuple[Array, Array, Array]:
+        """U'b (n,), s (n,), V' (n, n) of A = U diag(s) V'; s below `RANK_TOLERANCE` times the largest are zero."""
+        n, R = self.A.shape[1], self.triangle
+        with phase("reduction"):
+            U, s, Vt = np.linalg.svd(R[:n, :n])
+        s = np.where(s > RANK_TOLERANCE * s[0], s, 0.0)
+        return U.T @ R[:n, n], s, Vt
+
+    @cached_property
+    def triangle(self) -> Array:
+        """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
+        with phase("reduction"):
+            return reduced_rows(np.column_stack([self.A, self.b]))
+
+    @property
+    def rank(self) -> int:
+        """Number of directions in the parameters that the data see."""
+        return int(np.count_nonzero(self.svd[1]))
+
+    def with_values(self, b: Array) -> LinearModel:
+        """Return the model with other right-hand sides (m,)."""
+        return replace(self, b=b)
+
+    def scaled(self, rows: Array) -> LinearModel:
+        """Return the model with its equations multiplied by numbers (m,)."""
+        return replace(self, A=self.A * rows[:, None], b=self.b * rows)
+
+
+_geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
+
+
+def reduced_rows(rows: Array, R: Array | None = None) -> Array:
+    """Return the upper triangle (n+1, n+1) of R over ``rows`` (m, n+1), by Householder's QR."""
+    n = rows.shape[1]
+    above = 0 if R is None else len(R)
+    stacked = np.empty((max(above + len(rows), n), n), order="F")
+    stacked[:above] = 0 if R is None else R
+    stacked[above : above + len(rows)] = rows
+    stacked[above + len(rows) :] = 0.0
+    factors = _geqrf(stacked, lwork=64 * n, overwrite_a=1)[0]
+    return np.triu(factors[:n])
+
+
+def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0.0) -> LinearModel:
+    """Return the linear model of a triangle: n + 1 equations with the same |A z - b| as those it was reduced from.
+
+    Parameters
+    ----------
+    like
+        Gives the parameters, and whether measured values are constraints.
+    R
+        (n+1, n+1) of [A b] = QR.
+    equations
+        How many equations A and b had.
+    offset
+        As `LinearModel` has it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.linear import from_triangle
+    >>> problem = ro.load("position").problem
+    >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    >>> small = from_triangle(model, model.triangle, model.equations)
+    >>> bool(np.allclose(small.svd[1], model.svd[1])), len(small.b), small.equations
+    (True, 35, 120)
+    """
+    group = np.zeros(len(R), dtype=int)
+    return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)
+
+
+Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]
+"""``reweigh(model, z)``: some equations whose squares, and a constant, stand at z (n,) for a loss of the model's."""

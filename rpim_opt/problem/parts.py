@@ -1,0 +1,319 @@
+"""Measurements that are read part by part and never stand in memory together: a source of linear models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.reading import read_data
+from rpim_opt.problem.linear import LinearModel, Reweigh
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
+from rpim_opt.problem.triangles import joined, reduced, whole_configurations
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import Parameters
+
+KEPT = 200_000
+"""Equations up to which a problem keeps its rows; beyond, only their triangle."""
+Part = Callable[[], Dataset]
+"""Reads some of the measurements; whole configurations."""
+
+
+class PartitionedProblem:
+    """A calibration problem whose measurements come in parts, read anew at every pass.
+
+    Every part is rotated into a triangle (n+1, n+1), and the triangles into one, by twos; so that memory depends on
+    the largest part and not on their number, and the parts may be read by threads or by the workers of a cluster.
+    What speaks of rows goes through `rows`, one part after the other; a row's label is preceded by the number of its
+    part, ``2:T8-6``.
+
+    Parameters
+    ----------
+    robot, parameters
+        As `CalibrationProblem` has them.
+    data
+        The first part, or what resembles it: it finds the frames' start, and is checked as a problem's data are.
+    parts
+        Functions that read the parts, at least one; `partitions` makes them from files.
+    compute
+        Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or `on_cluster` (client).
+
+    Raises
+    ------
+    InputError
+        For no parts, as `CalibrationProblem`, and for `data` of all the parts, which do not stand anywhere.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> whole = ro.load("position").problem
+    >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
+    >>> problem = ro.problem.PartitionedProblem(whole.robot, whole.parameters, halves[0](), tuple(halves))
+    >>> problem.linearize(0 * whole.parameters.free.nominal).equations
+    120
+    >>> [part.labels[0] for part in problem.rows()], problem.keeps_rows
+    (['1:c0', '2:c20'], False)
+    >>> f"{ro.calibrate(problem, ro.tikhonov, weight=ro.reml).weight:.2f}"
+    '1.55'
+    >>> x = 0 * whole.parameters.free.nominal
+    >>> problem.errors(x).shape, problem.whitened_errors(x)[0].shape, problem.configuration_errors(x)[0].shape
+    ((40,), (40,), (40,))
+    >>> frames = problem.identifying(whole.parameters.of_frames & whole.parameters.identified)
+    >>> len(frames.frozen().parameters.free), len(frames.with_parameters(whole.parameters).parameters.free)
+    (9, 34)
+    >>> len(problem.sample().labels), problem.on(whole.data).labels[0]
+    (20, 'c0')
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        parameters: Parameters,
+        data: Dataset,
+        parts: Sequence[Part] = (),
+        compute: Callable[..., Iterable[Any]] = map,
+    ):
+        if not parts:
+            raise InputError("parts", "none", "at least one function that reads measurements")
+        self._first = CalibrationProblem(robot, parameters, data)
+        self._dropped: frozenset[str] = frozenset()
+        self.parts = tuple(parts)
+        self.compute = compute
+
+    @property
+    def robot(self) -> Robot:
+        """The nominal robot."""
+        return self._first.robot
+
+    @property
+    def parameters(self) -> Parameters:
+        """All parameters of the model, some of them identified."""
+        return self._first.parameters
+
+    @property
+    def data(self) -> NoReturn:
+        """Raises InputError: the measurements do not stand together anywhere."""
+        raise InputError("problem.data", "measurements in parts", "problem.rows(), one problem a part")
+
+    @property
+    def keeps_rows(self) -> bool:
+        """False: linear models are triangles."""
+        return False
+
+    def _with(self, first: CalibrationProblem) -> PartitionedProblem:
+        copy = PartitionedProblem(first.robot, first.parameters, first.data, self.parts, self.compute)
+        copy._first = first
+        copy._dropped = self._dropped
+        return copy
+
+    def on(self, data: Dataset) -> CalibrationProblem:
+        """Return the same problem with other measurements, in memory."""
+        return self._first.on(data)
+
+    def with_parameters(self, parameters: Parameters) -> PartitionedProblem:
+        """Return the same problem with another table of parameters."""
+        return self._with(self._first.with_parameters(parameters))
+
+    def identifying(self, identified: np.ndarray) -> PartitionedProblem:
+        """Return the same problem with other parameters identified, (P,) true or false."""
+        return self._with(self._first.identifying(identified))
+
+    def frozen(self) -> PartitionedProblem:
+        """Return a copy that asks every measurement once and keeps the answer; workers elsewhere ask once a part."""
+        return self._with(self._first.frozen())
+
+    def sample(self) -> CalibrationProblem:
+        """Return the first part: rows enough to place frames by."""
+        return self._first
+
+    def rows(self) -> Iterator[CalibrationProblem]:
+        """Yield one problem a part, read in this process; no two parts share the number of a configuration."""
+        configurations = 0
+        for number, part in enumerate(self.parts, start=1):
+            data = _read(self._dropped, (number, part))
+            if len(data):
+                label = tuple(f"{number}:{name}" for name in data.label)
+                yield self.on(replace(data, label=label, configuration=data.configuration + configurations))
+                configurations += int(data.configuration.max()) + 1
+
+    def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
+        """Return the linear model of all parts around the deviations x (n,) [SI], as a triangle.
+
+        Parameters
+        ----------
+        x
+            (n,) deviations [SI].
+        reweigh
+            What weighs the equations of some thousand rows, whole configurations, by their residuals at x; it is
+            called where a part is read.
+        """
+        models = self._everywhere(partial(_reduced, x, reweigh))
+        return joined(models)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """N labels of the rows, ``part:label``, parts counted from 1."""
+        return tuple(label for part in self.rows() for label in part.labels)
+
+    def without(self, labels: Collection[str]) -> PartitionedProblem:
+        """Return the same problem without the rows of these labels, wherever they stand.
+
+        >>> import rpim_opt as ro
+        >>> whole = ro.load("position").problem
+        >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
+        >>> problem = ro.problem.PartitionedProblem(whole.robot, whole.parameters, halves[0](), halves)
+        >>> len(problem.without({"1:c3", "2:c33", "2:c34"}).labels)
+        37
+        """
+        copy = self._with(self._first)
+        copy._dropped = self._dropped | frozenset(labels)
+        return copy
+
+    def errors(self, x: Array, dimension: str = "length") -> Array:
+        """Return the norm of every row's residual, (N,) [m]; arguments as for `CalibrationProblem.errors`."""
+        return np.concatenate(self._everywhere(partial(_errors, x, dimension)))
+
+    def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,)."""
+        norms, equations = zip(*self._everywhere(partial(_whitened_errors, x)), strict=True)
+        return np.concatenate(norms), np.concatenate(equations)
+
+    def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every configuration's residual at x (n,), (C,), and its number of equations (C,).
+
+        A configuration's rows stand in one part.
+        """
+        norms, equations = zip(*self._everywhere(partial(_configuration_errors, x)), strict=True)
+        return np.concatenate(norms), np.concatenate(equations)
+
+    def _everywhere(self, what: Callable[[CalibrationProblem], Any]) -> list[Any]:
+        """Return what a function makes of every part, read and evaluated where ``compute`` does so."""
+        task = partial(_on_part, what, sketch(self._first), self._dropped)
+        results = self.compute(task, list(enumerate(self.parts, start=1)))
+        found = [result for result in results if result is not None]
+        if not found:
+            raise InputError("data", "no row", "at least one")
+        return found
+
+
+def in_parts(problem: Source) -> Source:
+    """Return the problem as it is solved: in parts of whole configurations where it keeps more than `KEPT` equations.
+
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> from rpim_opt.problem.parts import in_parts
+    >>> in_parts(problem) is problem  # 27 equations
+    True
+    """
+    if not isinstance(problem, CalibrationProblem):
+        return problem
+    if sum(len(block.row) * len(block.measurement.components) for block in problem.data.blocks) <= KEPT:
+        return problem
+    parts = [partial(problem.data.take, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
+    return PartitionedProblem(problem.robot, problem.parameters, problem.data, parts)._with(problem)
+
+
+def sketch(problem: CalibrationProblem) -> CalibrationProblem:
+    """Return the problem with one row of its data: what a worker must know of it besides its own part."""
+    return problem.on(problem.data.take([0]))
+
+
+# What a worker does with a part: functions of the module, so that they travel by name.
+
+
+def _on_part(
+    what: Callable[[CalibrationProblem], Any],
+    known: CalibrationProblem,
+    dropped: frozenset[str],
+    part: tuple[int, Part],
+) -> Any:
+    data = _read(dropped, part)
+    return what(known.on(data)) if len(data) else None
+
+
+def _read(dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
+    """Return the measurements of a part, without what was dropped of it."""
+    number, read = part
+    mine = f"{number}:"
+    out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}
+    data = read()
+    return data.without(out) if out else data
+
+
+def _reduced(x: Array, reweigh: Reweigh | None, problem: CalibrationProblem) -> LinearModel:
+    return reduced(problem, x, reweigh)
+
+
+def _errors(x: Array, dimension: str, problem: CalibrationProblem) -> Array:
+    return problem.errors(x, dimension)
+
+
+def _whitened_errors(x: Array, problem: CalibrationProblem) -> tuple[Array, np.ndarray]:
+    return problem.whitened_errors(x)
+
+
+def _configuration_errors(x: Array, problem: CalibrationProblem) -> tuple[Array, np.ndarray]:
+    return problem.configuration_errors(x)
+
+
+def partitions(
+    paths: Sequence[str | Path], robot: Robot, noise: Mapping[str, Any], measurement: Measurement = position
+) -> tuple[Part, ...]:
+    """Return functions that read the files, each a table as `read_data` takes it, of a few hundred thousand rows.
+
+    A configuration's rows stand in one file. Parquet is read fastest.
+
+    Parameters
+    ----------
+    paths
+        Tables; at least one.
+    robot, noise, measurement
+        As for `read_data`.
+
+    Raises
+    ------
+    InputError
+        For no paths; when a part is read, as `read_data`.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parts = ro.problem.partitions(["targets.csv"], robot, {"position_mm": 0.03})
+    >>> len(parts), len(parts[0]())
+    (1, 18)
+    """
+    if not paths:
+        raise InputError("paths", "no file", "at least one")
+    return tuple(partial(read_data, Path(path), robot, noise, measurement) for path in paths)
+
+
+def on_cluster(client: Any) -> Callable[..., Iterable[Any]]:
+    """Return a ``compute`` for `PartitionedProblem` that lets the workers of a Dask cluster read and reduce the parts.
+
+    Parameters
+    ----------
+    client
+        A ``distributed.Client``.
+
+    Examples
+    --------
+    With ``from distributed import Client`` and the address of the cluster's scheduler::
+
+        compute = ro.problem.on_cluster(Client("tcp://10.0.0.7:8786"))
+        problem = ro.problem.PartitionedProblem(robot, parameters, parts[0](), parts, compute)
+    """
+
+    def compute(task: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+        return client.gather(client.map(task, list(parts), pure=False))
+
+    return compute

@@ -1,0 +1,225 @@
+"""Closed forms that place frames: registration, tool offsets from distances, hand and eye (AX = ZB)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers
+from rpim_opt.robot.mdh import Robot
+
+Place = Sequence[float] | Array
+"""A frame's six numbers, or a point's three."""
+ENOUGH = 2000
+"""Rows of a measurement from which frames are placed, where there are more."""
+NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
+"""What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
+
+
+def register(source: Array, target: Array, weights: Array | None = None) -> Array:
+    """Return the rigid motion T (4, 4) that minimizes sum q_i |R source_i + t - target_i|^2 (paper, Eq. 17).
+
+    The rotation is proper (det R = 1), by singular value decomposition (Umeyama 1991, IEEE PAMI 13:376).
+
+    Parameters
+    ----------
+    source, target
+        (N, 3) points [m].
+    weights
+        (N,) q_i; 1 by default.
+
+    Raises
+    ------
+    InputError
+        For fewer than three points, points that coincide, or points on a line: their rotation is arbitrary.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> seen = np.array([[2, 0, 0], [2, 1, 0], [1, 0, 0]])  # turned by 90 degrees about z, moved by 2 along x
+    >>> ro.problem.register(corners, seen).round(9)[:3] + 0.0
+    array([[ 0., -1.,  0.,  2.],
+           [ 1.,  0.,  0.,  0.],
+           [ 0.,  0.,  1.,  0.]])
+    """
+    source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
+    q = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=float)
+    if source.shape != target.shape or source.shape[1:] != (3,) or q.shape != (len(source),) or not (q >= 0).all():
+        raise InputError(
+            "points", f"shapes {source.shape}, {target.shape}, {q.shape}", "N points, N points, N weights >= 0"
+        )
+    if np.count_nonzero(q) < 3:
+        raise InputError("points", f"{np.count_nonzero(q)} with a weight", "three or more, not on a line")
+    p, r = q @ source / q.sum(), q @ target / q.sum()
+    for points, what in ((source - p, "source"), (target - r, "target")):
+        s = np.linalg.svd(np.sqrt(q)[:, None] * points, compute_uv=False)
+        if s[1] <= 1e-6 * s[0]:
+            raise InputError(f"{what} points", "points on a line, or all in one place", "points that span a plane")
+    U, _, Vt = np.linalg.svd((source - p).T @ (q[:, None] * (target - r)))
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    T = np.eye(4)
+    T[:3, :3] = Vt.T @ D @ U.T
+    T[:3, 3] = r - T[:3, :3] @ p
+    return T
+
+
+def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), spread: float = np.inf) -> Array:
+    """Return the reflector's offset in the flange frame, (3,) [m], without knowing the base (paper, Eqs. 18 to 23).
+
+    Minimizes the differences of measured and modelled distances, | |y_j - y_i| - |p_j - p_i + (R_j - R_i) o| |^2,
+    over pairs of configurations, by Levenberg-Marquardt from ``start``.
+
+    Parameters
+    ----------
+    flange
+        (N, 4, 4) transforms of the flange [m].
+    points
+        (N, 3) measured positions [m], in any frame.
+    start, spread
+        (3,) where the offset is expected [m], and its standard deviation [m] against errors of the distances of 5 mm:
+        a direction that the configurations do not show stays there.
+
+    Raises
+    ------
+    InputError
+        For fewer than two configurations.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
+    >>> points = flange[:, :3, :3] @ [0.02, 0.0, 0.06] + flange[:, :3, 3]
+    >>> ro.problem.tool_from_distances(flange, points + [5.0, 0.0, 1.0]).round(9) + 0.0  # wherever it stands
+    array([0.02, 0.  , 0.06])
+    """
+    N = len(points)
+    if N < 2:
+        raise InputError("configurations", f"{N}", "two or more for a distance")
+    steps = np.unique(np.geomspace(1, N - 1, 10).astype(int))
+    i = np.concatenate([np.arange(N - step) for step in steps])
+    j = i + np.concatenate([np.full(N - step, step) for step in steps])
+    measured = np.linalg.norm(points[j] - points[i], axis=1)
+    first = np.asarray(start, dtype=float)
+    ridge = NOMINAL_ERROR / spread * np.sqrt(len(i) / N)  # a configuration counts once, in however many pairs
+
+    def residual(o: Array) -> Array:
+        p = flange[:, :3, :3] @ o + flange[:, :3, 3]
+        return np.append(np.linalg.norm(p[j] - p[i], axis=1) - measured, ridge * (o - first))
+
+    return least_squares(residual, first, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+
+
+def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[Array, Array]:
+    """Return base Z and tool X, (4, 4) each, with measured_i = Z flange_i X: the problem A X = Z B, A = flange^-1.
+
+    Rotations by the Kronecker product and one singular value decomposition (Shah 2013, J. Mechanisms and
+    Robotics 5:031007), translations by linear least squares, the tool's as near to ``start`` as the data allow.
+
+    Parameters
+    ----------
+    flange, measured
+        (N, 4, 4) transforms of the flange in the base, and of the tool in the instrument's frame.
+    start
+        (3,) expected offset of the tool [m].
+
+    Raises
+    ------
+    InputError
+        For fewer than three poses, or rotations about one axis only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
+    >>> base, tool = np.eye(4), np.eye(4)
+    >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
+    >>> Z, X = ro.problem.hand_eye(flange, base @ flange @ tool)
+    >>> bool(np.abs(Z - base).max() < 1e-9), bool(np.abs(X - tool).max() < 1e-9)
+    (True, True)
+    """
+    N = len(flange)
+    if N < 3:
+        raise InputError("poses", f"{N}", "three or more")
+    RA, RB = flange[:, :3, :3], measured[:, :3, :3]
+    # R_B = R_Z R_A R_X, so that sum_i R_B kron R_A maps vec(R_X') to N vec(R_Z)
+    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
+    U, s, Vt = np.linalg.svd(K)
+    if s[1] > (1 - 1e-6) * s[0]:
+        raise InputError("poses", "rotations about one axis only", "poses turned about two axes")
+    V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
+    sign = 1.0 if np.linalg.det(V) > 0 else -1.0
+    Z, X = np.eye(4), np.eye(4)
+    Z[:3, :3], X[:3, :3] = _proper(sign * V), _proper(sign * W).T
+    A = np.concatenate([np.hstack([Z[:3, :3] @ R, np.eye(3)]) for R in RA])
+    o = np.asarray(start, dtype=float)
+    b = measured[:, :3, 3] - (flange[:, :3, 3] + RA @ o) @ Z[:3, :3].T
+    t = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
+    X[:3, 3], Z[:3, 3] = o + t[:3], t[3:]
+    return Z, X
+
+
+def _proper(M: Array) -> Array:
+    """Return the rotation nearest to M."""
+    U, _, Vt = np.linalg.svd(M)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+
+
+def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array]]:
+    """Return the base (6,) and the reflectors (6,) by marker, from positions and poses on the nominal robot.
+
+    Poses give both by `hand_eye`. Otherwise distances correct the reflectors and registration places the base.
+
+    Raises
+    ------
+    InputError
+        When there are no positions and no poses, or they do not determine the base.
+    """
+    seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
+    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
+    if not seen:
+        raise InputError("key base", '"auto" without positions or poses', "a table [base]")
+    places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
+    source, target, weight = [], [], []
+    for block in seen:
+        flange, marker = forward_kinematics(robot, block.q[:, 0]), block.markers[0]
+        if block.measurement.name == "pose":
+            try:
+                base, tool = hand_eye(flange, _transforms(block.y), places[marker][:3])
+            except InputError:
+                pass  # too few turns: positions and the stated tool have to do
+            else:
+                places[marker] = frame_numbers(tool)
+                return frame_numbers(base), places
+        if len(flange) > 3:
+            places[marker][:3] = tool_from_distances(flange, block.y[:, :3], places[marker][:3], TOOL_ERROR)
+        source.append(flange[:, :3, :3] @ places[marker][:3] + flange[:, :3, 3])
+        target.append(block.y[:, :3])
+        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
+        weight.append(1 / np.broadcast_to(variance, len(flange)))
+    q = np.concatenate(weight)
+    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
+
+
+def _transforms(y: Array) -> Array:
+    """Return the transforms (N, 4, 4) of measured poses (N, 7): x, y, z [m] and unit quaternion, w first."""
+    T = np.tile(np.eye(4), (len(y), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
+    T[:, :3, 3] = y[:, :3]
+    return T

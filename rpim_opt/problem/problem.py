@@ -1,0 +1,388 @@
+"""The calibration problem: residuals, Jacobians and linearization of measurements in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.phases import phase
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import of_fixture
+from rpim_opt.problem.functions import Functions, Kept, Structure, asked
+from rpim_opt.problem.linear import LinearModel, Reweigh
+from rpim_opt.robot.compiled import compiled
+from rpim_opt.robot.kinematics import call_rows
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import Parameters
+
+SOME, LARGE = 1000, 20_000
+"""Rows from which on a compiled function is worth loading, and worth compiling."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem:
+    """What was measured on which robot, and which parameters are to explain it.
+
+    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
+    in the order of the data's blocks.
+
+    Parameters
+    ----------
+    robot
+        The nominal robot.
+    parameters
+        All parameters of the model, some of them identified.
+    data
+        The measurements, of one kind or several.
+    asked
+        What `frozen` keeps; None where every call asks the measurements anew.
+
+    Raises
+    ------
+    InputError
+        When nothing is identified, or the data do not fit the robot or the parameters.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> problem = instance.problem
+    >>> nominal = np.zeros(len(problem.parameters.free))
+    >>> problem.residual(nominal).shape, problem.modelled(nominal)[0].shape, problem.jacobian(nominal).shape
+    ((27,), (9, 3), (27, 26))
+    >>> len(problem.linearize(nominal).b)
+    27
+    >>> [round(float(1e3 * p.errors(nominal).mean()), 3) for p in (problem, problem.on(instance.validation))]  # [mm]
+    [2.096, 2.649]
+    """
+
+    robot: Robot
+    parameters: Parameters
+    data: Dataset
+    asked: Kept | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        p = self.parameters
+        if not p.identified.any():
+            raise InputError("key identify", "no parameter", "at least one")
+        for block in self.data.blocks:
+            if block.q.shape[2] != self.robot.dof:
+                raise InputError("q", f"{block.q.shape[2]} columns", f"{self.robot.dof}, one a joint")
+            for marker in block.markers:
+                if tool_prefix(marker) + "x" not in p.names:
+                    known = sorted({n.split("_")[1] for n in p.names if n.startswith("tool_") and n.count("_") == 2})
+                    raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
+            for name in block.measurement.parameters:
+                if of_fixture(name, block.fixture) not in p.names:
+                    where = f"measurement {block.measurement.name}"
+                    raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
+        compliant = [n for n, used in zip(p.names, p.identified, strict=True) if used and n.startswith("compliance")]
+        if compliant and not any(block.torque is not None for block in self.data.blocks):
+            raise InputError(
+                "key identify", f"'{compliant[0]}' without joint torques", "columns tau1_Nm, ... in the data"
+            )
+
+    def on(self, data: Dataset) -> CalibrationProblem:
+        """Return the same problem with other measurements."""
+        return replace(self, data=data)
+
+    def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
+        """Return the same problem with another table of parameters.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> len(problem.with_parameters(problem.parameters.identify(["a?"])).parameters.free)
+        6
+        """
+        return replace(self, parameters=parameters)
+
+    def identifying(self, identified: np.ndarray) -> CalibrationProblem:
+        """Return the same problem with other parameters identified, (P,) true or false.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> problem.identifying(problem.parameters.of_frames).parameters.free.names[:4]
+        ('base_x', 'base_y', 'base_z', 'base_rx')
+        """
+        return self.with_parameters(replace(self.parameters, identified=identified))
+
+    def sample(self) -> CalibrationProblem:
+        """Return rows enough to place frames by: here all of them, of measurements in parts the first part.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> problem.sample() is problem
+        True
+        """
+        return self
+
+    def rows(self) -> Iterator[CalibrationProblem]:
+        """Yield problems that together have all the rows: here this one, of measurements in parts one a part.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> [len(part.data) for part in problem.rows()]
+        [9]
+        """
+        yield self
+
+    @property
+    def keeps_rows(self) -> bool:
+        """Whether `linearize` returns the equations themselves, and not their triangle.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.keeps_rows
+        True
+        """
+        return True
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """N labels of the rows.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.labels[:2]
+        ('T2-1', 'T2-2')
+        """
+        return self.data.label
+
+    def without(self, labels: Collection[str]) -> CalibrationProblem:
+        """Return the same problem without the rows of these labels.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.without({"T2-1"}).labels[:2]
+        ('T2-2', 'T2-3')
+        """
+        return self.on(self.data.without(labels))
+
+    def frozen(self) -> CalibrationProblem:
+        """Return a copy that asks every measurement once, now, and keeps the answer.
+
+        A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
+        every call. Within a calibration one answer has to serve from the first pass to the last.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> reading = {"zero": 0.0}
+        >>> height = ro.data.Measurement("height", lambda T: T[2, 3] + reading["zero"], {"z": "length"})
+        >>> arm = ro.load("paper_arm").problem
+        >>> problem = arm.on(ro.Dataset.of(arm.data.q, np.zeros((9, 1)), sigma=1e-5, measurement=height))
+        >>> kept, x = problem.frozen(), np.zeros(len(arm.parameters.free))
+        >>> before = problem.residual(x)
+        >>> reading["zero"] = 1.0
+        >>> bool(np.allclose(kept.residual(x), before)), bool(np.allclose(problem.residual(x), before - 1))
+        (True, True)
+        """
+        if self.asked is not None:
+            return self
+        copy = replace(self, asked=Kept())
+        for block in copy.data.blocks:
+            copy._functions(block)
+        return copy
+
+    def residual(self, x: Array) -> Array:
+        """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
+        return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+
+    def modelled(self, x: Array) -> list[Array]:
+        """Return what the instrument would read at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
+        return [self._evaluate(block, "modelled", x)[0][:, 0] for block in self.data.blocks]
+
+    def errors(self, x: Array, dimension: str = "length") -> Array:
+        """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
+
+        Parameters
+        ----------
+        x
+            (n,) deviations [SI].
+        dimension
+            ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error. Rows without
+            such components get NaN.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("pose").problem
+        >>> nominal = np.zeros(len(problem.parameters.free))
+        >>> [f"{1e3 * problem.errors(nominal, dimension).mean():.2f}" for dimension in ("length", "angle")]  # mm, mrad
+        ['15.01', '7.09']
+        """
+        errors = np.full(len(self.data), np.nan)
+        for block in self.data.blocks:
+            of = [i for i, d in enumerate(block.measurement.components.values()) if d == dimension]
+            if of:
+                residual = self._evaluate(block, "residual", x)[0][:, 0, of]
+                errors[block.row] = np.sqrt(np.sum(residual**2, axis=1))
+        return errors
+
+    def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem  # 2 mm off at nominal, and 0.03 mm of noise declared
+        >>> norms, count = problem.whitened_errors(np.zeros(len(problem.parameters.free)))
+        >>> norms[:3].round(1), count[:3]
+        (array([72.9, 68.5, 54.5]), array([3, 3, 3]))
+        """
+        norms, count = np.zeros(len(self.data)), np.zeros(len(self.data), dtype=int)
+        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
+            r = (whitening @ self._evaluate(block, "residual", x)[0].transpose(0, 2, 1))[:, :, 0]
+            norms[block.row], count[block.row] = np.sqrt(np.sum(r**2, axis=1)), r.shape[1]
+        return norms, count
+
+    def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every configuration's residual at x (n,), (C,), and its number of equations (C,).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("markers").problem  # three reflectors
+        >>> norms, count = problem.configuration_errors(np.zeros(len(problem.parameters.free)))
+        >>> norms.shape, count[:2]
+        ((25,), array([9, 9]))
+        """
+        norms, count = self.whitened_errors(x)
+        which = np.unique(self.data.configuration, return_inverse=True)[1]
+        return np.sqrt(np.bincount(which, norms**2)), np.bincount(which, count).astype(int)
+
+    def whitened_residual(self, x: Array) -> Array:
+        """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> nominal = np.zeros(len(problem.parameters.free))
+        >>> bool(np.allclose(problem.whitened_residual(nominal), problem.linearize(nominal).b))
+        True
+        """
+        parts = []
+        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
+            residual = self._evaluate(block, "residual", x)[0]
+            parts.append((whitening @ residual.transpose(0, 2, 1)).ravel())
+        return np.concatenate(parts)
+
+    def jacobian(self, x: Array) -> Array:
+        """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
+        parts = [self._evaluate(block, "jacobian", x)[1] for block in self.data.blocks]
+        return np.concatenate([part.reshape(-1, len(x)) for part in parts])
+
+    def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
+        """Return the whitened, scaled linear model around the deviations x (n,) [SI].
+
+        Parameters
+        ----------
+        x
+            (n,) deviations [SI].
+        reweigh
+            What weighs the equations by their residuals there, or None.
+        """
+        pieces = list(self.pieces(x, len(self.data)))
+        model = replace(
+            pieces[0],
+            A=np.concatenate([piece.A for piece in pieces]),
+            b=np.concatenate([piece.b for piece in pieces]),
+            group=np.concatenate([piece.group for piece in pieces]),
+        )
+        if reweigh is None:
+            return model
+        weighed, offset = reweigh(model, x / self.parameters.free.scale)
+        return replace(weighed, offset=offset)
+
+    def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
+        """Yield the linear model of `linearize` some rows at a time, block by block.
+
+        Parameters
+        ----------
+        x
+            (n,) deviations [SI].
+        most
+            Rows of a piece.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> [len(piece.b) for piece in problem.pieces(np.zeros(len(problem.parameters.free)), 5)]
+        [15, 12]
+        """
+        constrained = any(not block.measurement.columns for block in self.data.blocks)
+        for i, block in enumerate(self.data.blocks):
+            each = len(block.measurement.components)
+            for start in range(0, len(block.row), most):
+                part = slice(start, start + most)
+                A, b = self._equations(i, x, part)
+                group = np.repeat(self.data.configuration[block.row[part]], each)
+                yield LinearModel(A, b, group, self.parameters.free, constrained)
+
+    def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
+        """Return whitened, scaled A and b of some rows of a block."""
+        whitening = self._whitening[i]
+        L = whitening if len(whitening) == 1 else whitening[part]
+        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part)
+        each = np.diagonal(L[0])
+        if len(L) == 1 and np.count_nonzero(L[0] - np.diag(each)) == 0:
+            # independent and the same for all rows: a product of numbers is several times faster than one of matrices
+            r = (residual[:, 0] * each).ravel()
+            A = (jacobian * each[:, None]).reshape(-1, len(x))
+        else:
+            r = (L @ residual.transpose(0, 2, 1)).ravel()
+            A = (L @ jacobian).reshape(-1, len(x))
+        scale = self.parameters.free.scale
+        A *= scale
+        return A, r + A @ (x / scale)
+
+    @cached_property
+    def _whitening(self) -> list[Array]:
+        """L^-1 with covariance = L L', for every block."""
+        if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
+            raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
+        try:
+            factors = [np.linalg.cholesky(block.covariance) for block in self.data.blocks]
+            return [np.asarray(np.linalg.inv(L), dtype=float) for L in factors]
+        except np.linalg.LinAlgError:
+            raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
+
+    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+        function = self._functions(block)[what]
+        if len(block.row) >= SOME:
+            function = compiled(function, make=len(block.row) >= LARGE) or function
+        with phase("evaluation"):
+            return call_rows(function, [x, self.parameters.nominal], self._rows(block, part))
+
+    def _functions(self, block: Block) -> Functions:
+        p = self.parameters
+        absent = (p.nominal == 0) & ~p.identified
+        structure = Structure(
+            self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
+            block.markers, block.fixture, block.torque is not None,
+        )  # fmt: skip
+        return (self.asked or asked)(structure, block.measurement)
+
+    def _rows(self, block: Block, part: slice) -> Array:
+        """Return joint values of the model, torques, and measured values, side by side."""
+        start, stop, _ = part.indices(len(block.row))
+        if stop - start == len(block.row):
+            if id(block) not in self._kept:
+                self._kept[id(block)] = self._stacked(block, part)
+            return self._kept[id(block)]
+        return self._stacked(block, part)
+
+    @cached_property
+    def _kept(self) -> dict[int, Array]:
+        return {}
+
+    def _stacked(self, block: Block, part: slice) -> Array:
+        M, y = self.robot.joint_map, block.y[part]
+        parts = [(block.q[part] @ M.T).reshape(len(y), -1)]
+        if block.torque is not None:  # virtual work: tau_model = M^-T tau
+            parts.append((block.torque[part] @ np.linalg.inv(M)).reshape(len(y), -1))
+        return np.hstack([*parts, y])

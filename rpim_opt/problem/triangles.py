@@ -1,0 +1,85 @@
+"""Triangles of linear models: rows rotated into n + 1 equations that say all that a squared loss sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.linear import LinearModel, Reweigh, from_triangle, reduced_rows
+from rpim_opt.problem.problem import CalibrationProblem
+
+ROWS = 4096
+"""Rows that are evaluated and reduced together: as many as a processor's cache holds."""
+
+
+@one_blas_thread
+def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
+    """Return the model of ``problem.linearize(x)`` as its triangle: n + 1 equations, the same |A z - b| for every z.
+
+    Rows are evaluated, whitened and rotated into the triangle `ROWS` at a time, so that memory does not grow with
+    their number.
+
+    Parameters
+    ----------
+    problem
+        Measurements in memory.
+    x
+        (n,) deviations [SI].
+    reweigh
+        What weighs the equations of `ROWS` rows, whole configurations, by their residuals at x; or None.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> from rpim_opt.problem.triangles import reduced
+    >>> model = reduced(problem, np.zeros(len(problem.parameters.free)))
+    >>> model.A.shape, model.equations
+    ((35, 34), 120)
+    """
+    if reweigh is None:
+        return _rotated(problem.pieces(x, ROWS))
+    groups = whole_configurations(problem.data, ROWS)
+    return _rotated(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
+
+
+def joined(models: Sequence[LinearModel]) -> LinearModel:
+    """Return the triangle of several triangles, joined by twos."""
+    R = [np.column_stack([model.A, model.b]) for model in models]
+    while len(R) > 1:
+        pairs = [R[i : i + 2] for i in range(0, len(R), 2)]
+        R = [reduced_rows(pair[-1], pair[0]) if len(pair) == 2 else pair[0] for pair in pairs]
+    equations = sum(model.equations for model in models)
+    return from_triangle(models[0], R[0], equations, sum(model.offset for model in models))
+
+
+def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:
+    """Return the rows in groups of whole configurations, at least one each, and ``most`` rows unless one has more."""
+    order = np.argsort(data.configuration, kind="stable")
+    ends = np.concatenate([[0], np.flatnonzero(np.diff(data.configuration[order])) + 1, [len(order)]])
+    cuts = [0]
+    while cuts[-1] < len(order):
+        last_fitting = ends[np.searchsorted(ends, cuts[-1] + most, side="right") - 1]
+        next_one = ends[np.searchsorted(ends, cuts[-1], side="right")]
+        cuts.append(max(last_fitting, next_one))
+    return np.split(order, cuts[1:-1])
+
+
+def _rotated(models: Iterable[LinearModel]) -> LinearModel:
+    """Rotate the equations of models into one triangle, which stands for them all."""
+    R, equations, offset, last = None, 0, 0.0, None
+    for last in models:
+        equations += last.equations
+        offset += last.offset
+        with phase("reduction"):
+            R = reduced_rows(np.column_stack([last.A, last.b]), R)
+    if last is None or R is None:
+        raise InputError("data", "no row", "at least one")
+    return from_triangle(last, R, equations, offset)
