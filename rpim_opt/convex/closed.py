@@ -1,0 +1,96 @@
+"""Minima of quadratic programs: by formula without constraints, by an active set in a box."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.active_set import minimum_in_box
+from rpim_opt.convex.constraints import Box
+from rpim_opt.convex.objective import Damping, Objective
+from rpim_opt.problem.linear import RANK_TOLERANCE
+
+Bounds = tuple[Array, Array]
+"""Lower and upper (n,)."""
+
+
+def minimum(objective: Objective, weight: float, damping: Damping | None) -> Array:
+    """Return the unconstrained minimum (n,)."""
+    if damping is not None:
+        A, b = objective.stacked(weight, damping)
+        return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=float)
+    z = objective.ridge.minima(np.array([weight]))[0]
+    if _plain(objective):
+        return z
+    A, b = objective.stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
+    return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
+
+
+def _plain(objective: Objective) -> bool:
+    """Whether the penalty is |z|^2, or there is none: its singular values are those of A."""
+    form = objective.penalty_form
+    return form is None or (form.diagonal and bool((form.L == 1).all()))
+
+
+def values(objective: Objective, Z: Array) -> tuple[Array, Array]:
+    """Return the loss and the penalty of many points Z (K, n), (K,) each, all at once."""
+    R, n = objective.squared.triangle, Z.shape[1]
+    loss = np.sum((Z @ R[:, :n].T - R[:, n]) ** 2, axis=1) + objective.squared.offset
+    form = objective.penalty_form
+    if form is None:
+        return loss, np.zeros(len(Z))
+    return loss, np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
+
+
+def minimum_between(
+    objective: Objective, bounds: Bounds, weight: float, damping: Damping | None, free: Array, start: Array | None
+) -> tuple[Array, Array]:
+    """Return the minimum (n,) in a box, and the multipliers (n,) of its bounds.
+
+    Parameters
+    ----------
+    objective, weight, damping
+        What is minimized.
+    bounds
+        The box.
+    free
+        The minimum (n,) without box and damping.
+    start
+        A point near the minimum, (n,): that of a neighbouring weight.
+    """
+    lower, upper = bounds
+    inside = bool(np.all((lower <= free) & (free <= upper)))
+    if inside and damping is None and weight > 0:
+        return free, np.zeros_like(free)
+    A, b = objective.stacked(weight, damping)
+    near = free if start is None else start
+    return minimum_in_box(A, b, lower, upper, np.clip(near, lower, upper))
+
+
+def path_between(objective: Objective, bounds: Bounds, weights: Array) -> tuple[Array, Array]:
+    """Return the minima (K, n) in a box at weights (K,), each from its neighbour, and their multipliers (K, n)."""
+    if _plain(objective):
+        free = objective.ridge.minima(weights)
+    else:
+        free = np.array([minimum(objective, float(weight), None) for weight in weights])
+    Z, multipliers = np.zeros_like(free), np.zeros_like(free)
+    start = None
+    for k, weight in enumerate(weights):
+        Z[k], multipliers[k] = minimum_between(objective, bounds, float(weight), None, free[k], start)
+        start = Z[k]
+    return Z, multipliers
+
+
+def shares(objective: Objective, bounds: Bounds, z: Array, multipliers: Array) -> tuple[Array, ...]:
+    """Return the multipliers (n,) of a box by constraint: where z lies on a bound, to a box stating it."""
+    lower, upper = bounds
+    left = multipliers.copy()
+    found: list[Array] = []
+    for constraint in objective.formulation.constraints:
+        if not isinstance(constraint, Box):
+            continue
+        low, high = constraint.bounds(objective.model.parameters)
+        stated = (z <= lower) & (low == lower) | (z >= upper) & (high == upper)
+        found.append(np.where(stated, left, 0.0))
+        left = np.where(stated, 0.0, left)
+    return tuple(found)

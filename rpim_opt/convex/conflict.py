@@ -1,0 +1,165 @@
+"""Why a program has no solution: which constraints contradict each other, and by how much."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+from cvxpy.error import SolverError
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import Conflict
+from rpim_opt.convex.constraints import Box, spoken
+from rpim_opt.convex.posed import Posed, norms
+from rpim_opt.problem.linear import LinearModel
+
+FAR = 1e6
+"""Bounds beyond so many scales are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """One thing that is demanded, by a name that its user knows, as CVXPY constraints of z."""
+
+    name: str
+    demands: tuple[Any, ...]
+
+
+def conflict(posed: Posed, model: LinearModel) -> Conflict | None:
+    """Return what contradicts what; None where the constraints can be met after all.
+
+    ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
+    Dravnieks 1991, ORSA Journal on Computing 3:157).
+    """
+    z = cp.Variable(posed.n)
+    units = _units(posed, model, z)
+    everything = [stated for unit in units for stated in unit]
+    if _possible(everything):
+        return None
+    kept = _irreducible(units)
+    single = _irreducible([[stated] for unit in kept for stated in unit])
+    names = tuple(stated.name for unit in single for stated in unit)
+    return Conflict(*_loosening(posed, model), names)
+
+
+def _possible(demands: Sequence[Stated]) -> bool:
+    """Whether all can be met at once."""
+    every = [constraint for stated in demands for constraint in stated.demands]
+    problem = cp.Problem(cp.Minimize(0), every)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except SolverError:
+            return True
+    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+
+
+def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
+    """Leave out, one after the other, what is not needed for the contradiction."""
+    kept = list(units)
+    for unit in units:
+        others = [other for other in kept if other is not unit]
+        if not _possible([stated for other in others for stated in other]):
+            kept = others
+    return kept
+
+
+def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated]]:
+    """Return what every constraint function demands, bound by bound, and ``largest`` by configuration."""
+    units: list[list[Stated]] = []
+    for k, function in enumerate(posed.formulation.constraints):
+        if isinstance(function, Box):
+            units.append(_bounds(function, posed, z))
+            continue
+        demands = [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+        name = name_of(function, k)
+        several = len(demands) > 1
+        units.append([Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)])
+    if posed.limited:
+        size = norms(model.A @ z - model.b, model.group)
+        largest = posed.formulation.largest
+        numbers = np.unique(model.group)
+        name = "configuration {} within {:g} sigmas"
+        units.append([Stated(name.format(g, largest), (size[i] <= largest,)) for i, g in enumerate(numbers)])
+    return units
+
+
+def name_of(function: Any, k: int) -> str:
+    """Return what a user calls a constraint function."""
+    stated = getattr(function, "stated", None)
+    if stated:
+        maker, *arguments = stated
+        return f"{maker}({', '.join(repr(a) for a in arguments)})"
+    name = getattr(function, "__name__", "<lambda>")
+    if name == "<lambda>":
+        return f"constraint {k + 1}"
+    return name
+
+
+def _bounds(box: Box, posed: Posed, z: cp.Variable) -> list[Stated]:
+    """Return every finite bound of a box, in the parameter's unit."""
+    parameters = posed.parameters
+    found: list[Stated] = []
+    for sign, side in zip("><", box.bounds(parameters), strict=True):
+        for i in np.flatnonzero(np.isfinite(side)):
+            bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
+            name = f"{parameters.names[i]} {sign}= {bound} ({box.name})"
+            demand = z[i] >= side[i] if sign == ">" else z[i] <= side[i]
+            found.append(Stated(name, (demand,)))
+    return found
+
+
+def _loosening(posed: Posed, model: LinearModel) -> tuple[dict[str, float], dict[int, float]]:
+    """Return the least loosening of the boxes [SI], and apart from it of the configurations' bound [sigma]."""
+    parameters, groups = model.parameters, np.unique(model.group)
+    by_bound = _least(posed, model, True) * parameters.scale
+    by_row = _least(posed, model, False)
+    bounds = {parameters.names[i]: float(by_bound[i]) for i in np.flatnonzero(by_bound > 1e-6 * parameters.scale)}
+    rows = {int(groups[i]): float(by_row[i]) for i in np.flatnonzero(by_row > 1e-6)}
+    return bounds, rows
+
+
+def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
+    """Return the slacks of least sum that make the constraints possible; zeros where none do."""
+    n, count = posed.n, len(np.unique(model.group))
+    z = cp.Variable(n)
+    slack = cp.Variable(n if loosen_boxes else count, nonneg=True)
+    hard: list[Any] = []
+    for k, function in enumerate(posed.formulation.constraints):
+        if not isinstance(function, Box):
+            hard += [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+            continue
+        lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(posed.parameters))
+        room = slack if loosen_boxes else 0.0
+        hard += [z <= upper + room, z >= lower - room]
+    if posed.limited:
+        extra = 0.0 if loosen_boxes else slack
+        hard.append(norms(model.A @ z - model.b, model.group) <= posed.formulation.largest + extra)
+    problem = cp.Problem(cp.Minimize(cp.sum(slack)), hard)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except SolverError:
+            return np.zeros(slack.size)
+    if slack.value is None:
+        return np.zeros(slack.size)
+    return np.asarray(slack.value)
+
+
+def advice(posed: Posed, status: str, found: Conflict | None) -> str:
+    """Return the sentence that says why a program was not solved, and what may help."""
+    if found is not None:
+        return ""
+    if status.startswith("unbounded"):
+        return "loss and penalty seem to fall without end: give it a larger weight, or a start nearer to the data"
+    if posed.constrained and status.startswith(("infeasible", "optimal")):
+        return (
+            "its constraints can be met, but not to the solver's accuracy: check their units, or loosen them a little"
+        )
+    return "the solver did not reach its accuracy: give a larger weight, or another solver (solver=..., settings=...)"

@@ -1,0 +1,259 @@
+"""Formulations: what a user states in CVXPY's own algebra, and the ready ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import cvxpy as cp
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
+from rpim_opt.robot.parameters import Parameters
+
+Function = Callable[[Any], Any]
+HUBER = 2.0
+"""Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
+NAMED = (cp.sum_squares, cp.sum, cp.max, cp.norm1, cp.norm2, by_link, by_kind)
+"""Functions that mean the same whenever they are asked, besides those that are `Ready`."""
+
+
+@dataclass(frozen=True)
+class Formulation:
+    """A convex way to identify the scaled total deviation z from whitened equations A z ~ b.
+
+    ::
+
+        minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
+
+    The functions may hold variables and parameters of their own, and read whatever they like: they are asked anew at
+    every calibration, and once in it.
+
+    Parameters
+    ----------
+    name
+        What reports call it.
+    loss
+        Convex function of the whitened residual (m,); the sum of squares by default.
+    penalty
+        Convex function of z (n,), or None.
+    constraints
+        Functions of z and of the identified `Parameters`, each returning a CVXPY constraint or several.
+    loss_over
+        ``"equation"``, or ``"configuration"``: the loss then gets the whitened norm of each configuration (N,), and
+        has to be nondecreasing.
+    penalty_over
+        A function of the identified `Parameters` that returns matrices D_k: the penalty then gets the norms
+        |D_k z| (K,), and has to be nondecreasing. `by_link`, `by_kind`, `differences`.
+    largest
+        Largest whitened norm that a configuration may keep; infinite by default.
+    solvable
+        False for one that was read from a file, which cannot hold a script's functions.
+
+    Raises
+    ------
+    InputError
+        For another ``loss_over`` or ``largest``; when it is posed, for a program that is not convex.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> mine = ro.Formulation("L1 in a ball", loss=cp.norm1, constraints=(ro.in_ball(3.0, "*"),))
+    >>> problem = ro.load("position").problem
+    >>> program = ro.convex.pose(mine, problem.linearize(np.zeros(len(problem.parameters.free))))
+    >>> round(float(np.linalg.norm(program.solve().z)), 6)  # in units of the scales
+    3.0
+    >>> ro.tikhonov.ready, ro.Formulation("mine", loss=lambda r: cp.sum(r**2)).ready
+    (True, False)
+    """
+
+    name: str
+    loss: Function = cp.sum_squares
+    penalty: Function | None = None
+    constraints: tuple[Constraint, ...] = ()
+    loss_over: str = "equation"
+    penalty_over: Callable[[Parameters], Sequence[Array]] | None = None
+    largest: float = float("inf")
+    solvable: bool = True
+
+    def __post_init__(self) -> None:
+        if self.loss_over not in ("equation", "configuration"):
+            raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
+        if not isinstance(self.constraints, tuple):
+            object.__setattr__(self, "constraints", _functions(self.constraints))
+        if not self.largest > 0:
+            raise InputError("largest", f"{self.largest}", "a number of sigmas above zero, or infinity")
+
+    def __reduce__(self) -> Any:
+        stated = {field.name: getattr(self, field.name) for field in fields(self)}
+        for key in ("loss", "penalty", "penalty_over"):
+            if stated[key] in NAMED:  # functions of CVXPY do not all travel by themselves
+                stated[key] = _Name(NAMED.index(stated[key]))
+        return _arrived, (stated,)
+
+    @property
+    def ready(self) -> bool:
+        """Whether all its functions are the package's own, which mean the same whenever they are asked."""
+        return all(_is_ready(f) for f in (self.loss, self.penalty, self.penalty_over, *self.constraints))
+
+
+def _functions(constraints: Any) -> tuple[Constraint, ...]:
+    """Return constraint functions that stand alone or in a list as a tuple of them."""
+    if callable(constraints):
+        return (constraints,)
+    try:
+        return tuple(constraints)
+    except TypeError:
+        found = f"a {type(constraints).__name__}"
+        raise InputError("constraints", found, "functions of z and the parameters, in a tuple") from None
+
+
+class _Name(NamedTuple):
+    """Which of the `NAMED` functions."""
+
+    place: int
+
+
+def _arrived(stated: dict[str, Any]) -> Formulation:
+    """Return the formulation that was pickled."""
+    for key, value in stated.items():
+        if isinstance(value, _Name):
+            stated[key] = NAMED[value.place]
+    return Formulation(**stated)
+
+
+def _is_ready(function: Any) -> bool:
+    if isinstance(function, Box):
+        return function == within_tolerance or isinstance(function.limits, Ready)
+    return function is None or isinstance(function, Ready) or function in NAMED
+
+
+@dataclass(frozen=True)
+class _Huber(Ready):
+    threshold: float
+    maker = "huber"
+
+    def __call__(self, v: Any) -> Any:
+        bound: Any = self.threshold  # CVXPY's annotation says int
+        return cp.sum(cp.huber(v, bound))
+
+
+def lost(name: str) -> Callable[..., Any]:
+    """Return what stands for the functions of a formulation that a file could not hold: it raises InputError."""
+
+    def function(*_: Any) -> Any:
+        accepted = "the script that holds them, to calibrate again"
+        raise InputError(f"formulation '{name}'", "functions that the file of a result cannot hold", accepted)
+
+    return function
+
+
+def huber(threshold: float = HUBER) -> Function:
+    """Return Huber's loss (1964): v^2 up to the threshold, 2 threshold |v| - threshold^2 beyond, summed.
+
+    ``threshold`` is in sigmas: of an equation, or with ``loss_over="configuration"`` of a configuration's norm.
+    InputError for one that is not above zero.
+
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> by_axis = ro.Formulation("Huber of equations", loss=ro.huber(1.5), penalty=cp.sum_squares)
+    >>> result = ro.calibrate(ro.load("blunders").problem, by_axis, weight=1.0)
+    >>> len(result.flagged)
+    5
+    """
+    if not (np.isfinite(threshold) and threshold > 0):
+        raise InputError("huber", f"threshold {threshold}", "a number of sigmas above zero")
+    return _Huber(threshold)
+
+
+least_squares = Formulation("least squares")
+"""|A z - b|^2, the linear least squares of every textbook. It needs no weight, and independent parameters.
+
+>>> import rpim_opt as ro
+>>> instance = ro.load("position")
+>>> result = ro.calibrate(instance.problem, ro.least_squares)
+>>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm")
+0.023 mm
+"""
+tikhonov = Formulation("Tikhonov", penalty=cp.sum_squares)
+"""|A z - b|^2 + weight |z|^2 (Tikhonov 1963): deviations are expected about as large as their scales.
+
+>>> import rpim_opt as ro
+>>> instance = ro.load("position")
+>>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
+>>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm")
+0.024 mm
+"""
+bounded = Formulation("bounded Tikhonov", penalty=cp.sum_squares, constraints=(within_tolerance,))
+"""`tikhonov` with |x_i| <= tolerance_i, where a tolerance is stated.
+
+>>> import rpim_opt as ro
+>>> problem = ro.load("paper_arm").problem
+>>> result = ro.calibrate(problem, ro.bounded, weight=ro.l_curve)
+>>> bool((abs(result.x) <= problem.parameters.free.tolerance).all())
+True
+"""
+robust = Formulation("Huber", loss=huber(), penalty=cp.sum_squares, loss_over="configuration")
+"""`huber` of the norms of the configurations, + weight |z|^2: blunders hardly pull the fit, and are flagged.
+
+>>> import rpim_opt as ro
+>>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=ro.reml)
+>>> [flag.label for flag in result.flagged]
+['c43', 'c39', 'c7', 'c14', 'c1']
+"""
+sum_of_norms = Formulation("sum of norms", loss=cp.sum, penalty=cp.sum_squares, loss_over="configuration")
+"""sum_k |r_k| over the configurations, + weight |z|^2: an L1 loss that does not depend on the axes.
+
+>>> import rpim_opt as ro
+>>> instance = ro.load("paper_arm", variant="misprints")  # 27 points, two of them misprinted
+>>> result = ro.calibrate(instance.problem, ro.sum_of_norms, weight=ro.reml)
+>>> [f"{flag.label}: {flag.error_mm:.0f} mm" for flag in result.flagged[:2]]
+['T8-6: 38 mm', 'T8-7: 15 mm']
+"""
+minimax = Formulation("minimax", loss=cp.max, penalty=cp.sum_squares, loss_over="configuration")
+"""max_k |r_k| over the configurations, + weight |z|^2: the worst configuration counts, and nothing else does.
+
+>>> import rpim_opt as ro
+>>> problem = ro.load("position").problem
+>>> for formulation in (ro.least_squares, ro.minimax):
+...     print(f"{1e3 * ro.calibrate(problem, formulation, weight=1e-3).errors().max():.3f} mm")
+0.079 mm
+0.060 mm
+"""
+lasso = Formulation("lasso", penalty=cp.norm1)
+"""|A z - b|^2 + weight |z|_1 (Tibshirani 1996): parameters that the data do not ask for stay nominal.
+
+>>> import numpy as np
+>>> import rpim_opt as ro
+>>> result = ro.calibrate(ro.load("position").problem, ro.lasso, weight=5.0)
+>>> moved = np.abs(result.x / result.problem.parameters.free.scale) > 1e-6
+>>> print(f"{moved.sum()} of {len(moved)} parameters moved")
+27 of 34 parameters moved
+"""
+group_lasso = Formulation("group lasso by link", penalty=cp.sum, penalty_over=by_link)
+"""|A z - b|^2 + weight sum_k |z_k| over links and frames (Yuan and Lin 2006): links stay nominal as a whole.
+
+>>> import numpy as np
+>>> import rpim_opt as ro
+>>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=20.0)
+>>> free = result.problem.parameters.free
+>>> sizes = [np.linalg.norm(D @ (result.x / free.scale)) for D in ro.constraints.by_link(free)]
+>>> [round(float(size), 1) for size in sizes]  # links, base, tool
+[0.0, 1.1, 2.5, 1.1, 1.2, 0.6, 0.0, 0.8]
+"""
+
+FORMULATIONS = {
+    "least_squares": least_squares,
+    "tikhonov": tikhonov,
+    "bounded": bounded,
+    "robust": robust,
+    "sum_of_norms": sum_of_norms,
+    "minimax": minimax,
+    "lasso": lasso,
+    "group_lasso": group_lasso,
+}

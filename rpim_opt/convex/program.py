@@ -1,0 +1,253 @@
+"""The convex program of one linearization: what it is as a CVXPY problem, and its solutions at any weight."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.convex.closed import minimum, minimum_between, path_between, shares, values
+from rpim_opt.convex.conflict import advice, conflict
+from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.interior import Found, interior
+from rpim_opt.convex.objective import Damping, Objective
+from rpim_opt.convex.posed import Unposed, posed
+from rpim_opt.convex.written import by_solver, parametrized
+from rpim_opt.problem.linear import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One solution: z (n,) at a weight, with the two values that the L-curve plots.
+
+    Parameters
+    ----------
+    z
+        (n,) in units of the scales.
+    weight, loss, penalty
+        The weight, loss(A z - b) and penalty(z).
+    duals
+        Multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the objective would
+        fall if the constraint were loosened by one unit of the scales.
+    status
+        CVXPY's word.
+    iterations, seconds
+        What the solver needed; zero iterations: a formula, or an active set.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+    >>> estimate = program.solve(1e-3)
+    >>> estimate.status, estimate.objective == estimate.loss + 1e-3 * estimate.penalty, len(estimate.duals)
+    ('optimal', True, 1)
+    >>> program.solve(1e-3, solver="CLARABEL", settings={"max_iter": 100}).iterations > estimate.iterations == 0
+    True
+    """
+
+    z: Array
+    weight: float
+    loss: float
+    penalty: float
+    duals: tuple[Array, ...] = ()
+    status: str = cp.OPTIMAL
+    iterations: int = 0
+    seconds: float = 0.0
+
+    @property
+    def objective(self) -> float:
+        """Loss and weighted penalty together."""
+        if self.weight == 0:
+            return self.loss
+        return self.loss + self.weight * self.penalty
+
+
+@dataclass(frozen=True, eq=False)
+class Program(Objective):
+    """A formulation applied to a linear model, ready to be solved at any weight.
+
+    Parameters
+    ----------
+    formulation, model
+        What is stated, and the equations A z ~ b.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))
+    >>> estimate = program.solve(5.0)
+    >>> written = program.problem(5.0)  # the same program, to print, change, or give to another solver
+    >>> bool(abs(written.solve(solver="CLARABEL") / estimate.objective - 1) < 1e-6), written.is_dcp(dpp=True)
+    (True, True)
+    >>> [int(np.sum(abs(e.z) > 1e-6)) for e in program.path([0.5, 5.0, 50.0])]  # parameters that move
+    [28, 28, 24]
+    >>> loss, penalty = program.value(estimate.z)
+    >>> loss + 5.0 * penalty == program.objective(estimate.z, 5.0) == estimate.objective
+    True
+    >>> there = program.on(problem.linearize(estimate.z * problem.parameters.free.scale))
+    >>> round(loss), round(there.value(estimate.z)[0])  # promised, and what the nonlinear model keeps
+    (97, 100)
+    """
+
+    def __reduce__(self) -> Any:
+        return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
+
+    def on(self, model: LinearModel) -> Program:
+        """Return the program for another model of the same shape, without asking the functions anew."""
+        return replace(self, model=model)
+
+    def problem(self, weight: float) -> cp.Problem:
+        """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
+
+        ``A``, ``b`` and ``weight`` are parameters of those names (`cp.Problem.param_dict`), and so are the parameters
+        of the formulation's own functions. It obeys CVXPY's rules for parametrized programs (DPP): solved again with
+        other values, it is not canonicalized again.
+
+        Raises
+        ------
+        InputError
+            For a weight that is negative or not finite.
+        """
+        return parametrized(self, self._weight(weight)).problem
+
+    @one_blas_thread
+    def solve(
+        self,
+        weight: float = 0.0,
+        *,
+        damping: Damping | None = None,
+        solver: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        verbose: bool = False,
+    ) -> Estimate:
+        """Return the solution at a weight.
+
+        Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
+        than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
+        have a formula, in a box an active set; everything else is Clarabel's, on data that are dimensionless.
+
+        Parameters
+        ----------
+        weight
+            Of the penalty, zero or more.
+        damping
+            A term that keeps the solution near a point.
+        solver, settings, verbose
+            Any installed solver of CVXPY with its options: then `problem` is solved by it, whatever the structure.
+
+        Raises
+        ------
+        InputError
+            For a weight that is negative or not finite, and a solver that is not installed.
+        NoSolutionFound
+            When the solver does not end with "optimal", or its point misses the constraints; ``conflict`` names
+            what contradicts what when the program is infeasible.
+        """
+        begin = time.perf_counter()
+        weight = self._weight(weight)
+        box = self.box
+        if solver or settings or verbose:
+            asked = solver or cp.CLARABEL
+            estimate = self._judged(by_solver(self, weight, damping, asked, settings or {}, verbose), weight)
+        elif self.closed_form:
+            estimate = self._at(minimum(self, weight, damping), weight)
+        elif self.quadratic and box is not None:
+            z, multipliers = minimum_between(self, box, weight, damping, minimum(self, weight, None), None)
+            estimate = self._at(z, weight, shares(self, box, z, multipliers))
+        else:
+            estimate = self._by_interior_point(weight, damping)
+        return replace(estimate, seconds=time.perf_counter() - begin)
+
+    @one_blas_thread
+    def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
+        """Return the solutions at many weights (K,): all at once by formula, in a box each from its neighbour."""
+        checked = np.array([self._weight(weight) for weight in weights])
+        box = self.box
+        if self.closed_form:
+            Z = self.ridge.minima(checked)
+            rows = zip(Z, checked, *values(self, Z), strict=True)
+            return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
+        if not self.quadratic or box is None:
+            return [self.solve(weight) for weight in checked]
+        Z, multipliers = path_between(self, box, checked)
+        rows = zip(Z, checked, *values(self, Z), multipliers, strict=True)
+        return [
+            Estimate(z, float(w), float(loss), float(penalty), shares(self, box, z, held))
+            for z, w, loss, penalty, held in rows
+        ]
+
+    def _weight(self, weight: float) -> float:
+        """Return the weight, checked; zero where there is no penalty for it to multiply."""
+        number = isinstance(weight, int | float | np.integer | np.floating) and not isinstance(weight, bool)
+        if not (number and np.isfinite(weight) and weight >= 0):
+            raise InputError("weight", f"{weight!r}", "a finite number, zero or more")
+        if self.formulation.penalty is None:
+            return 0.0
+        return float(weight)
+
+    def _at(self, z: Array, weight: float, duals: tuple[Array, ...] = (), iterations: int = 0) -> Estimate:
+        if not self.quadratic:  # a quadratic is finite everywhere
+            z = self.inside(z, np.zeros_like(z), weight)
+        return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
+
+    def _by_interior_point(self, weight: float, damping: Damping | None) -> Estimate:
+        """Return what Clarabel finds in our terms, and where it finds nothing, in CVXPY's."""
+        found = interior(self, weight, damping)
+        if found.z is None:
+            first = found.status
+            found = by_solver(self, weight, damping, cp.CLARABEL, {}, False)
+            if found.z is None and "outside" not in found.status:
+                found = Found(first)
+        return self._judged(found, weight)
+
+    def _judged(self, found: Found, weight: float) -> Estimate:
+        """Return a solver's point as an estimate, or say why there is none."""
+        if found.z is not None:
+            return replace(self._at(found.z, weight, found.duals, found.iterations), status=found.status)
+        status, contradiction = found.status, None
+        if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
+            contradiction = conflict(self._posed, self.model)
+        elif status.startswith("infeasible"):
+            status = "stalled"  # a program without constraints always has a point
+        text = advice(self._posed, status, contradiction)
+        raise NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
+
+
+def pose(formulation: Formulation, model: LinearModel) -> Program:
+    """Return the program of a formulation on a linear model; the formulation's functions are asked now, once.
+
+    Parameters
+    ----------
+    formulation
+        What is stated.
+    model
+        Equations A z ~ b.
+
+    Raises
+    ------
+    InputError
+        For functions that do not answer convex expressions and constraints of CVXPY.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+    >>> program.closed_form, len(program.path([1e-3, 1.0]))
+    (True, 2)
+    """
+    if not formulation.solvable:
+        return Program(formulation, model, Unposed(formulation, model))
+    return Program(formulation, model, posed(formulation, model))

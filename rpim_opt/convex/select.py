@@ -1,0 +1,84 @@
+"""Choosing the weight from the identification data alone, with the evidence for the choice: ``ro.select``."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.select_curve import corner, l_curve
+from rpim_opt.convex.select_held_out import k_fold, leave_one_out, two_step
+from rpim_opt.convex.select_scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
+from rpim_opt.convex.selection import Selection, Selector
+
+__all__ = [
+    "Selection",
+    "compare",
+    "corner",
+    "discrepancy",
+    "gcv",
+    "k_fold",
+    "l_curve",
+    "leave_one_out",
+    "ncp",
+    "quasi_optimality",
+    "reml",
+    "robust_gcv",
+    "two_step",
+]
+
+
+def compare(program: Program) -> dict[str, Selection]:
+    """Return what every selector chooses that serves a program, by name.
+
+    Those that hold configurations out are left out where that would take long: without a closed form, or with more
+    than 200 configurations.
+
+    >>> import rpim_opt as ro
+    >>> program = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).program
+    >>> chosen = ro.select.compare(program)
+    >>> for name in ("reml", "l_curve", "gcv"):
+    ...     print(f"{name:8} {chosen[name].weight:.2g}")
+    reml     1.5
+    l_curve  7.3
+    gcv      1
+    """
+    quick = program.closed_form and len(np.unique(program.model.group)) <= 200
+    asked = dict(SELECTORS)
+    if not quick:
+        for slow in ("leave_one_out", "k_fold", "two_step"):
+            del asked[slow]
+    chosen = {}
+    for name, rule in asked.items():
+        with contextlib.suppress(InputError, NoSolutionFound):  # it does not serve this formulation or these data
+            chosen[name] = rule(program)
+    return chosen
+
+
+def disagreement(program: Program) -> str:
+    """Return a warning where L-curve, GCV and REML lie more than a decade apart, else nothing."""
+    if not program.closed_form or program.model.constrained:
+        return ""
+    found = {rule.__name__: rule(program).weight for rule in (l_curve, gcv, reml)}
+    decades = np.ptp(np.log10(list(found.values())))
+    if decades <= 1:
+        return ""
+    weights = ", ".join(f"{name} {weight:.2g}" for name, weight in found.items())
+    return f"The selectors disagree by {decades:.1f} decades: {weights}."
+
+
+SELECTORS: dict[str, Selector] = {
+    "reml": reml,
+    "l_curve": l_curve,
+    "corner": corner,
+    "two_step": two_step,
+    "gcv": gcv,
+    "robust_gcv": robust_gcv,
+    "leave_one_out": leave_one_out,
+    "k_fold": k_fold,
+    "discrepancy": discrepancy,
+    "quasi_optimality": quasi_optimality,
+    "ncp": ncp,
+}

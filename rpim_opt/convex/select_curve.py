@@ -1,0 +1,187 @@
+"""Rules that look for the corner of the L-curve, where the misfit begins to pay for a smaller penalty."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.program import Estimate, Program
+from rpim_opt.convex.selection import Selection, least_between, weight_grid
+
+TINY = np.finfo(float).tiny
+"""Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
+GOLDEN = (1 + 5**0.5) / 2
+
+
+def l_curve(program: Program) -> Selection:
+    """Choose the corner of the L-curve: the largest curvature of (ln |A z - b|, ln |z|).
+
+    With a closed form the derivatives are analytic (Hansen 1998, Rank-Deficient and Discrete Ill-Posed
+    Problems, sec. 4.6; sign such that the corner of an L is positive) and the maximum is refined between
+    the neighbours on the grid. Otherwise the curvature is that of the circle through three neighbouring
+    points (Cultrera and Callegaro 2020). A maximum at the edge is no corner, and
+    neither is a curve bent the other way everywhere; the weight is then that edge, or the lower one.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1.8e-05', True)
+    """
+    if program.closed_form:
+        weights = weight_grid(program)
+        score = _curvature(program, weights)
+    else:
+        weights = weight_grid(program, 60)
+        score = menger(_points(program.path(weights)))
+    best = int(np.argmax(score))
+    if not score[best] > 0:
+        best = 0
+    if not 0 < best < len(weights) - 1:
+        return _no_corner(weights, score, best)
+    weight = float(weights[best])
+    if program.closed_form:
+        weight = _refined(program, weights, score, best)
+    return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
+
+
+def _no_corner(weights: Array, score: Array, best: int) -> Selection:
+    side = "lower" if best == 0 else "upper"
+    note = (
+        f"the L-curve has no corner: the weight is the {side} edge of {weights[0]:.1e} to {weights[-1]:.1e}; "
+        "another selector, or a weight of your own, may serve better"
+    )
+    return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
+
+
+def _refined(program: Program, weights: Array, score: Array, best: int) -> float:
+    """Return the weight of the largest curvature between the neighbours of the best on the grid."""
+    weight, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
+    # the search sees one maximum of several: the grid's own stays unless it is beaten
+    if -opposite > score[best]:
+        return weight
+    return float(weights[best])
+
+
+def _points(estimates: list[Estimate]) -> Array:
+    """Return ln |A z - b| and ln |z| of estimates, (K, 2)."""
+    squares = [[max(each.loss, TINY), max(each.penalty, TINY)] for each in estimates]
+    return 0.5 * np.log(squares)
+
+
+def _curvature(program: Program, weights: Array) -> Array:
+    """Curvature of t = ln weight -> (u, v) = (ln rho, ln eta) / 2 with rho = |Az - b|^2, eta = |z|^2.
+
+    With z_i = s_i beta_i / (s_i^2 + w): eta' = d eta / dt = -2 w sum z_i^2 / (s_i^2 + w), and rho' = -w eta'.
+    """
+    beta2, s2, perp = program.ridge.filters
+    w = weights[:, None]
+    z2 = s2 * beta2 / (s2 + w) ** 2
+    eta = z2.sum(1)
+    rho = (w**2 * beta2 / (s2 + w) ** 2).sum(1) + perp
+    # derivatives by t, once and twice
+    first = (z2 / (s2 + w)).sum(1)
+    second = (z2 / (s2 + w) ** 2).sum(1)
+    eta1 = -2 * weights * first
+    eta2 = eta1 + 6 * weights**2 * second
+    rho1 = -weights * eta1
+    rho2 = -weights * (eta1 + eta2)
+    eta = np.maximum(eta, TINY)
+    rho = np.maximum(rho, TINY)
+    u1 = rho1 / rho / 2
+    v1 = eta1 / eta / 2
+    u2 = rho2 / rho / 2 - 2 * u1**2
+    v2 = eta2 / eta / 2 - 2 * v1**2
+    speed = np.maximum(u1**2 + v1**2, TINY)
+    return (u1 * v2 - v1 * u2) / speed**1.5
+
+
+def menger(points: Array) -> Array:
+    """Signed curvature of the circle through each point (K, 2) and its neighbours; zero at the ends."""
+    chords = np.diff(points, axis=0)
+    before = chords[:-1]
+    after = chords[1:]
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    sides = [np.linalg.norm(side, axis=1) for side in (before, after, points[2:] - points[:-2])]
+    product = np.prod(sides, axis=0)
+    # points that coincide have no circle; neither have those that differ by rounding
+    inner = np.divide(2 * cross, product, out=np.zeros(len(cross)), where=product > 1e-18)
+    return np.concatenate([[0.0], inner, [0.0]])
+
+
+def corner(program: Program, tolerance: float = 0.01) -> Selection:
+    """Search the corner of the L-curve without a grid: golden sections by Menger curvature, any formulation.
+
+    Cultrera and Callegaro 2020 (IOP SciNotes 1:025004): of four points on the curve the inner one with the larger
+    curvature stays, and the interval shrinks to its neighbours; one new solution a step.
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    tolerance
+        Length of the interval of ln weight at which the search ends.
+
+    Raises
+    ------
+    InputError
+        For a formulation without penalty.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
+    >>> f"{result.weight:.1g}", result.selection.note
+    ('0.7', 'corner of the L-curve by golden sections')
+    """
+    low, high = np.log(weight_grid(program, 2))
+    curve = _Curve(program)
+    best = _by_golden_sections(curve, low, high, tolerance)
+    order = sorted(curve.seen)
+    points = np.array([curve.seen[t] for t in order])
+    interior = bool(low + 0.1 < best < high - 0.1)
+    note = "corner of the L-curve by golden sections"
+    if not interior:
+        note = "the search ended at an edge: the L-curve has no corner"
+    return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
+
+
+class _Curve:
+    """The L-curve over t = ln weight, solved where it is asked for and kept."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.seen: dict[float, Array] = {}
+
+    def point(self, t: float) -> Array:
+        if t not in self.seen:
+            self.seen[t] = _points(self.program.path([np.exp(t)]))[0]
+        return self.seen[t]
+
+    def curvature(self, a: float, b: float, c: float) -> float:
+        return float(menger(np.array([self.point(a), self.point(b), self.point(c)]))[1])
+
+
+def _by_golden_sections(curve: _Curve, low: float, high: float, tolerance: float) -> float:
+    """Return ln weight of the corner: of the two inner points the one with the larger curvature, until they meet."""
+    left = (high + GOLDEN * low) / (1 + GOLDEN)
+    right = low + high - left
+    best = left
+    while high - low > tolerance:
+        on_the_right = curve.curvature(left, right, high)
+        while on_the_right < 0 and high - low > tolerance:
+            # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
+            high = right
+            right = left
+            left = (high + GOLDEN * low) / (1 + GOLDEN)
+            on_the_right = curve.curvature(left, right, high)
+        if curve.curvature(low, left, right) > on_the_right:
+            best = left
+            high = right
+            right = left
+            left = (high + GOLDEN * low) / (1 + GOLDEN)
+        else:
+            best = right
+            low = left
+            left = right
+            right = low + high - left
+    return best

@@ -1,0 +1,226 @@
+"""Selectors by a score of the linear estimator: likelihood, cross-validation, misfit, change, white residual."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.quadratic import ridge, robot_alone
+from rpim_opt.convex.select_linear import Rule, Squared, influence, linear_rule
+from rpim_opt.convex.selection import Score, Selection, weight_grid, with_rows
+
+
+def reml(program: Program) -> Selection:
+    """Choose the most likely weight: restricted maximum likelihood, with the noise level profiled out.
+
+    The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters and sigma^2 as
+    unknown, so that declared noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
+    anchors) are fixed effects: the m equations are projected off their columns, because how far a tripod stands
+    says nothing about a gear. Minimizes, with g_i = w / (s_i^2 + w) (Patterson and Thompson 1971, Biometrika
+    58:545; Wahba 1985, Annals of Statistics 13:1378)::
+
+        m ln(sum beta_i^2 g_i + |r_perp|^2) - sum ln g_i
+
+    Points on a plane or sphere are met by a robot shrunk to nothing, so that their fit tells no noise level: the
+    weight is 1, declared noise and scales at their word. With few data a second maximum may lie at infinite
+    weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
+    at the lower edge means that the data want no penalty. Constraints are left out of the likelihood.
+
+    Raises
+    ------
+    InputError
+        For another penalty than a quadratic.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+    >>> print(result.weight_sentence())
+    Weight 1.549 (reml: largest restricted likelihood), formulation 'Tikhonov'.
+    """
+    if program.model.constrained and program.penalty_form is not None:
+        weights = weight_grid(program)
+        note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
+        return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
+    rule = Rule("reml", _restricted_likelihood, "largest restricted likelihood", local=True)
+    chosen = linear_rule(program, rule)
+    if chosen.interior or chosen.weight < 1.0:
+        return chosen
+    note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
+    return replace(chosen, weight=1.0, note=note)
+
+
+def _restricted_likelihood(squared: Squared) -> Score:
+    """Return the function from weights (K,) to -2 ln(restricted likelihood), up to a constant."""
+    tiny = np.finfo(float).tiny
+    frames = squared.model.parameters.of_frames
+    form = squared.form
+    if frames.any() and not frames.all():
+        form = ridge(squared.model, robot_alone(squared.penalty, frames))
+    beta2, s2, perp = form.filters
+    m = squared.model.equations - form.fixed
+
+    def score(weights: Array) -> Array:
+        g = weights[:, None] / (s2 + weights[:, None])
+        return m * np.log(np.maximum(g @ beta2 + perp, tiny)) - np.sum(np.log(g), axis=1)
+
+    return score
+
+
+def gcv(program: Program) -> Selection:
+    """Choose by generalized cross-validation: minimize rho(w) / (m - dof(w))^2 (Golub, Heath and Wahba 1979).
+
+    rho = |A z - b|^2, dof = sum s_i^2 / (s_i^2 + w). InputError for another penalty than a quadratic.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.gcv)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1', True)
+    """
+    return linear_rule(program, _gcv_rule("gcv", 1.0, "smallest generalized cross-validation error"))
+
+
+def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
+    """Choose by cross-validation that charges more for degrees of freedom: rho(w) / (m - gamma dof(w))^2.
+
+    Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233).
+
+    Parameters
+    ----------
+    program
+        The formulation on a linear model.
+    gamma
+        The price of a degree of freedom, 1 in `gcv`.
+
+    Raises
+    ------
+    InputError
+        For another penalty than a quadratic; with less than three equations for each direction, where it guards
+        too much.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.robust_gcv)
+    >>> f"{result.weight:.2g}", result.selection.interior
+    ('1.9', True)
+    """
+    m = program.model.equations
+    rank = program.model.rank
+    if m < 3 * rank:
+        found = f"{m} equations for {rank} directions"
+        raise InputError("selector robust_gcv", found, "three equations a direction; gcv or reml with fewer")
+    note = f"smallest cross-validation error with gamma {gamma:g}"
+    return linear_rule(program, _gcv_rule("robust_gcv", gamma, note))
+
+
+def _gcv_rule(name: str, gamma: float, note: str) -> Rule:
+    """Return the rule that minimizes rho(w) / (m - gamma dof(w))^2; no weight serves that leaves no equation."""
+
+    def of(squared: Squared) -> Score:
+        beta2, s2, perp = squared.form.filters
+        free = squared.form.fixed
+
+        def score(weights: Array) -> Array:
+            g = weights[:, None] / (s2 + weights[:, None])
+            left = squared.model.equations - gamma * (free + np.sum(1 - g, axis=1))
+            return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
+
+        return score
+
+    return Rule(name, of, note)
+
+
+def discrepancy(program: Program) -> Selection:
+    """Choose the largest weight that fits as well as the declared noise allows (Morozov 1966).
+
+    rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
+    InputError for another penalty than a quadratic.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.discrepancy)
+    >>> f"{result.weight:.2g}", result.selection.note
+    ('28', 'misfit equal to the declared noise')
+    """
+    chosen = linear_rule(program, Rule("discrepancy", _misfit, "misfit equal to the declared noise"))
+    fits = np.flatnonzero(chosen.score <= 0)
+    weights = chosen.weights
+    if not len(fits):
+        note = "no weight fits as well as the declared noise promises: it is too small, or the model lacks something"
+        return replace(chosen, weight=float(weights[0]), interior=False, note=note)
+    k = int(fits[-1])
+    if k == len(weights) - 1:
+        note = "every weight fits better than the declared noise: it is stated too large"
+        return replace(chosen, weight=float(weights[k]), interior=False, note=note)
+    # between the last weight that fits and the next, where the score crosses zero
+    share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])
+    weight = float(np.exp(np.log(weights[k]) + share * np.log(weights[k + 1] / weights[k])))
+    return replace(chosen, weight=weight, interior=True, note="misfit equal to the declared noise")
+
+
+ROOM = 1.1
+"""Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
+
+
+def _misfit(squared: Squared) -> Score:
+    """Return the function from weights (K,) to ln(rho / (tau^2 (m - dof)))."""
+    beta2, s2, perp = squared.form.filters
+
+    def score(weights: Array) -> Array:
+        g = weights[:, None] / (s2 + weights[:, None])
+        left = ROOM**2 * np.maximum(squared.spare - np.sum(1 - g, axis=1), 1e-9)
+        return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
+
+    return score
+
+
+def quasi_optimality(program: Program) -> Selection:
+    """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
+
+    The lowest minimum inside the grid, if there is one. InputError for another penalty than a quadratic.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.quasi_optimality)
+    >>> f"{result.weight:.1g}", result.selection.interior
+    ('5e-06', True)
+    """
+
+    def of(squared: Squared) -> Score:
+        beta2, s2, _ = squared.form.filters
+        return lambda weights: np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
+
+    return linear_rule(program, Rule("quasi_optimality", of, "least change of the solution", local=True))
+
+
+def ncp(program: Program) -> Selection:
+    """Choose where the residual looks most like white noise: normalized cumulative periodogram (Hansen et al. 2006).
+
+    Minimizes the largest distance of the cumulative periodogram of the residual, in the order of the rows, from
+    a straight line. Needs rows in an order that means something, such as time or place. InputError for another penalty
+    than a quadratic.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.ncp)
+    >>> f"{result.weight:.2g}", result.selection.note
+    ('67', 'whitest residual')
+    """
+    with_rows(program, "ncp")
+
+    def of(squared: Squared) -> Score:
+        Q, s2, target = influence(squared)
+
+        def score(weights: Array) -> Array:
+            fit = (s2 / (s2 + weights[:, None])) * (Q.T @ target)
+            residual = target - fit @ Q.T
+            power = np.abs(np.fft.rfft(residual, axis=1)[:, 1:]) ** 2
+            cumulative = np.cumsum(power, axis=1) / np.sum(power, axis=1, keepdims=True)
+            line = np.arange(1, power.shape[1] + 1) / power.shape[1]
+            return np.max(np.abs(cumulative - line), axis=1)
+
+        return score
+
+    return linear_rule(program, Rule("ncp", of, "whitest residual"))

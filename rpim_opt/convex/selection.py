@@ -1,0 +1,116 @@
+"""A chosen weight with its evidence, and the weights that rules try."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.quadratic import Ridge, ridge
+from rpim_opt.problem.linear import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """A chosen weight with its evidence.
+
+    Parameters
+    ----------
+    weight
+        The choice.
+    name
+        The rule's name.
+    weights, score
+        (K,) the weights that were tried and what the rule compared.
+    interior
+        Whether the choice lies inside the weights that were tried. If not, ``note`` says what that means.
+    note
+        One sentence for the report.
+
+    Examples
+    --------
+    A selector of one's own is a function of the program that returns one.
+
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> def within_a_scale(program):
+    ...     weights = np.geomspace(1e-3, 1e3, 60)
+    ...     largest = np.array([np.abs(e.z).max() for e in program.path(weights)])
+    ...     k = int(np.argmax(largest <= 1))
+    ...     return ro.select.Selection(weights[k], "within a scale", weights, largest, interior=0 < k < 59)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, within_a_scale)
+    >>> result.selection.name, result.selection.interior
+    ('within a scale', True)
+    """
+
+    weight: float
+    name: str
+    weights: Array
+    score: Array
+    interior: bool
+    note: str = ""
+
+
+Selector = Callable[[Program], Selection]
+
+Score = Callable[[Array], Array]
+"""From weights (K,) to what a rule compares, (K,)."""
+
+
+EDGES = {
+    "lower": "the smallest weight of the grid is best: the data want no penalty",
+    "upper": "the largest weight of the grid is best: the data want no deviation",
+}
+"""What it means that a rule chooses an edge of its grid."""
+
+
+def edge(best: int) -> str:
+    """Return the note on a choice at the first or the last weight."""
+    if best == 0:
+        return EDGES["lower"]
+    return EDGES["upper"]
+
+
+def with_rows(program: Program, name: str) -> LinearModel:
+    """Return the model for a rule that leaves rows out, if it has its rows."""
+    if program.model.stands_for is not None:
+        found = f"{program.model.equations} equations of which only the triangle is kept"
+        raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
+    return program.model
+
+
+def weight_grid(program: Program, count: int = 200) -> Array:
+    """Return weights from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside).
+
+    Below, the penalty changes nothing that the data see; above, it leaves nothing to identify.
+    """
+    if program.formulation.penalty is None:
+        raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
+    if program.quadratic:
+        return grid_of(program.ridge, count)
+    return grid_of(ridge(program.model, program.penalty_form), count)
+
+
+def grid_of(form: Ridge, count: int = 200) -> Array:
+    """Return the weights between which an estimator in closed form changes, by its singular values."""
+    s = form.s[form.seen]
+    if not len(s):
+        raise InputError("data", "no sensitivity to any identified parameter", "data that see at least one")
+    return np.geomspace(1e-4 * s[-1] ** 2, 10 * s[0] ** 2, count)
+
+
+def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
+    """Return the weight of the least score between the neighbours of the best on a grid, and that score."""
+    fine: Any = minimize_scalar(
+        lambda t: score(np.exp([t]))[0],
+        bounds=(np.log(weights[best - 1]), np.log(weights[best + 1])),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    return float(np.exp(fine.x)), float(fine.fun)

@@ -1,0 +1,126 @@
+"""Which configurations a robust loss trusts, and the squares that its fit amounts to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.terms import term
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.source import Source
+
+RARE = 0.01
+"""What part of good sets of data have any configuration that counts as an outlier."""
+SMALL = 1e-6
+"""Residuals are taken as no smaller, in sigmas: below, a norm has no slope of its own."""
+
+
+def noise_level(norms: Array, count: np.ndarray) -> float:
+    """Return the noise that whitened norms (N,) with ``count`` equations show: median(norm / median of chi_k).
+
+    At least 1, which is the declared noise.
+    """
+    return max(1.0, float(np.median(norms / np.sqrt(chi2.ppf(0.5, count)))))
+
+
+def limits(noise: float, configurations: int, count: np.ndarray) -> Array:
+    """Return above which norm one of so many configurations with ``count`` equations is an outlier."""
+    return noise * np.sqrt(chi2.ppf(1 - RARE / configurations, count))
+
+
+def outlying(norms: Array, count: np.ndarray) -> Array:
+    """Return above which whitened norm (N,) a row or configuration with ``count`` equations is an outlier.
+
+    What one good set of data in a hundred would exceed, s sqrt(chi2_k^-1(1 - 0.01 / N)), with the declared noise s = 1
+    or, where that is larger, median(norm / median of chi_k).
+    """
+    return limits(noise_level(norms, count), len(norms), count)
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """Keeps the equations that a robust loss trusts, weighed as it does: squares that its fit amounts to.
+
+    Configurations above ``noise sqrt(chi2_k^-1(1 - 0.01 / configurations))`` are left out, with k their equations
+    (`outlying`); the others are multiplied by the root of ``factor``. A `Reweigh` for measurements in parts too.
+    """
+
+    noise: float
+    configurations: int
+    factor: float
+
+    def keeps(self, model: LinearModel, z: Array) -> np.ndarray:
+        """Return which equations (m,) are trusted at z (n,)."""
+        _, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
+        norms = np.sqrt(np.bincount(which, (model.A @ z - model.b) ** 2))
+        return (norms <= limits(self.noise, self.configurations, count))[which]
+
+    def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:
+        """Return the trusted equations; nothing is constant. z is (n,)."""
+        return kept_equations(model, self.keeps(model, z), self.factor), 0.0
+
+
+def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> LinearModel:
+    """Return some of a model's equations (m,), multiplied by the root of a factor."""
+    root = np.sqrt(factor)
+    return replace(model, A=root * model.A[keep], b=root * model.b[keep], group=model.group[keep])
+
+
+def trusted(
+    name: str, slope_at: Callable[[Array], Array | None], norms: Array, count: np.ndarray, residuals: Array | None
+) -> Trusted:
+    """Return what a robust formulation trusts: its factor is the median of loss'(v) / (2 v) over what it keeps.
+
+    Parameters
+    ----------
+    name
+        The formulation's.
+    slope_at
+        The loss's slopes at numbers v, one each.
+    norms, count
+        (N,) whitened norms of the configurations, and how many equations each has.
+    residuals
+        Of the trusted equations, where the loss gets equations, and not norms.
+
+    Raises
+    ------
+    InputError
+        For a loss without a slope, or one that rests on few equations (minimax).
+    """
+    noise = noise_level(norms, count)
+    v = norms[norms <= limits(noise, len(norms), count)]
+    if residuals is not None:
+        v = np.abs(residuals)
+    v = np.maximum(v, SMALL)
+    found, accepted = f"formulation '{name}'", "another selector: l_curve, corner, k_fold, or a number"
+    slope = slope_at(v)
+    if slope is None or len(slope) != len(v):
+        raise InputError(found, "a loss without slope", accepted)
+    factor = 0.0
+    if len(v):
+        factor = float(np.median(np.abs(slope) / (2 * v)))
+    if not factor > 0:
+        raise InputError(found, "a loss that rests on a few equations", accepted)
+    return Trusted(noise, len(norms), factor)
+
+
+def trusted_parts(source: Source, x: Array, formulation: Formulation) -> Trusted:
+    """Return what a robust formulation trusts of measurements in parts at the deviations x (n,) [SI].
+
+    Where the loss gets equations, those of a configuration count as alike.
+    """
+    norms, count = source.configuration_errors(x)
+    residuals = None
+    if formulation.loss_over == "equation":
+        residuals = norms / np.sqrt(count)
+
+    def slope_at(v: Array) -> Array | None:
+        return term(formulation.loss, len(v), f"formulation '{formulation.name}', loss").slope(v)
+
+    return trusted(formulation.name, slope_at, norms, count, residuals)
