@@ -1,0 +1,196 @@
+"""The usual methods without convex programming, so that agreement with them is evidence."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.problem.problem import CalibrationProblem
+
+__all__ = [
+    "extended_kalman_filter",
+    "gauss_newton",
+    "gradient_descent",
+    "levenberg_marquardt",
+    "linear_least_squares",
+]
+
+
+class Baseline(NamedTuple):
+    """Identified deviations (n,) [SI], the passes or evaluations that it took, and the method."""
+
+    x: Array
+    iterations: int
+    method: str
+
+
+def linear_least_squares(problem: CalibrationProblem) -> Baseline:
+    """LSM of the paper: one step of least squares from nominal, of smallest norm in units of the scales.
+
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> found = ro.baselines.linear_least_squares(problem)
+    >>> found.x.shape, found.iterations
+    ((34,), 1)
+    """
+    scale = problem.parameters.free.scale
+    model = problem.linearize(np.zeros_like(scale))
+    return Baseline(scale * np.linalg.lstsq(model.A, model.b, rcond=1e-12)[0], 1, "linear least squares")
+
+
+def gauss_newton(problem: CalibrationProblem, iterations: int = 20, tolerance: float = 1e-10) -> Baseline:
+    """Gauss-Newton: least-squares steps of smallest norm, repeated until they are shorter than ``tolerance`` scales.
+
+    Nothing holds back directions that the data do not see well: they wander where noise sends them.
+
+    Parameters
+    ----------
+    problem
+        What was measured, and what is to be identified.
+    iterations, tolerance
+        When to stop.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> ro.baselines.gauss_newton(problem).iterations < 20
+    True
+    """
+    scale = problem.parameters.free.scale
+    z, k = np.zeros_like(scale), 0
+    while k < iterations:
+        k += 1
+        model = problem.linearize(scale * z)
+        step = np.linalg.lstsq(model.A, model.b - model.A @ z, rcond=1e-12)[0]
+        z = z + step
+        if np.linalg.norm(step) <= tolerance * (1 + np.linalg.norm(z)):
+            break
+    return Baseline(scale * z, k, "Gauss-Newton")
+
+
+def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
+    """Levenberg-Marquardt as in SciPy (MINPACK), on whitened residuals, analytic Jacobian, 200 evaluations.
+
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> found = ro.baselines.levenberg_marquardt(problem)
+    >>> other = ro.baselines.gauss_newton(problem)
+    >>> bool(abs(problem.errors(found.x) - problem.errors(other.x)).max() < 1e-4)  # [m]
+    True
+    """
+    scale = problem.parameters.free.scale
+
+    def residual(z: Array) -> Array:
+        model = problem.linearize(scale * z)
+        return model.A @ z - model.b
+
+    if len(residual(np.zeros_like(scale))) < len(scale):
+        raise InputError("data", "fewer equations than parameters", "gauss_newton, or a calibration with a penalty")
+
+    def slope(z: Array) -> Array:
+        return problem.linearize(scale * z).A
+
+    jac: Any = slope
+    found = least_squares(residual, np.zeros_like(scale), jac=jac, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200)
+    return Baseline(scale * found.x, int(found.nfev), "Levenberg-Marquardt")
+
+
+def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, preconditioned: bool = False) -> Baseline:
+    """Descend along the gradient of the sum of squares, by the linear model's exact steps.
+
+    As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by
+    the column norms of the Jacobian, which is what makes it move at all along the weak directions.
+
+    Parameters
+    ----------
+    problem
+        What was measured, and what is to be identified.
+    iterations
+        When to stop.
+    preconditioned
+        Whether deviations are divided by the column norms.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> ro.baselines.gradient_descent(problem, iterations=100).iterations  # not at rest
+    100
+    """
+    scale = problem.parameters.free.scale
+    model = problem.linearize(np.zeros_like(scale))
+    unit = np.ones_like(scale)
+    if preconditioned:
+        norms = np.linalg.norm(model.A, axis=0) / scale
+        unit = 1 / np.where(norms > 0, norms, norms.max())
+    x, k = np.zeros_like(scale), 0
+    r = model.A @ (x / scale) - model.b
+    while k < iterations:
+        k += 1
+        J = model.A / scale * unit
+        g = J.T @ r
+        if np.linalg.norm(g) <= 1e-12 * max(1.0, float(np.linalg.norm(r))):
+            break
+        step = -(g @ g) / float(np.sum((J @ g) ** 2)) * g * unit
+        for _ in range(30):
+            model = problem.linearize(x + step)
+            after = model.A @ ((x + step) / scale) - model.b
+            if after @ after <= r @ r:
+                break
+            step = step / 2
+        else:
+            break
+        x, r = x + step, after
+    return Baseline(x, k, "gradient descent, preconditioned" if preconditioned else "gradient descent")
+
+
+def extended_kalman_filter(problem: CalibrationProblem, passes: int = 1) -> Baseline:
+    """Filter one configuration after the other (extended Kalman filter), scales as prior, declared noise as noise.
+
+    Linearizes each configuration at the estimate so far; with more passes the prior is taken again, at the last
+    estimate (iterated filter), which ends at the Tikhonov solution of weight 1.
+
+    Parameters
+    ----------
+    problem
+        What was measured, and what is to be identified.
+    passes
+        How often all configurations are gone through.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> found = ro.baselines.extended_kalman_filter(problem, passes=8)
+    >>> tikhonov = ro.calibrate(problem, ro.tikhonov, weight=1.0)
+    >>> bool(abs((found.x - tikhonov.x) / problem.parameters.free.scale).max() < 1e-6)
+    True
+    """
+    scale = problem.parameters.free.scale
+    groups = np.unique(problem.data.configuration)
+    start = np.zeros_like(scale)
+    z = start
+    for _ in range(passes):
+        at, z, P = (start if passes == 1 else z), np.zeros_like(scale), np.eye(len(scale))
+        for group in groups:
+            rows = problem.on(problem.data.take(np.flatnonzero(problem.data.configuration == group)))
+            model = rows.linearize(scale * (z if passes == 1 else at))
+            gain = P @ model.A.T @ np.linalg.inv(model.A @ P @ model.A.T + np.eye(len(model.b)))
+            z = z + gain @ (model.b - model.A @ z)
+            left = np.eye(len(z)) - gain @ model.A
+            P = left @ P @ left.T + gain @ gain.T  # Joseph's form stays symmetric and positive
+    return Baseline(scale * z, passes, "extended Kalman filter")
+
+
+METHODS = {
+    "LSM": linear_least_squares,
+    "GN": gauss_newton,
+    "LM": levenberg_marquardt,
+    "GD": gradient_descent,
+    "EKF": extended_kalman_filter,
+}

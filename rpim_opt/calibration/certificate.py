@@ -1,0 +1,94 @@
+"""Evidence that a solution is one: the user's functions and the model asked anew, and nothing taken from the loop."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import NoSolutionFound
+from rpim_opt.convex.feasible import room
+from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.program import Program, pose
+from rpim_opt.problem.linear import LinearModel
+
+DECREASE = 1e-6
+"""What the convex program at a solution may still promise, relative to the objective: an interior point's accuracy."""
+TINY = 1e-300
+"""Where numbers end that something may be divided by."""
+
+
+class Certificate(NamedTuple):
+    """How well the conditions of a solution are met.
+
+    ``gradient`` is that of the nonlinear problem (data, penalty, and multipliers of the bounds) relative to the data's
+    at nominal; None where the objective has none or other constraints hold. ``step`` is how far the convex program at
+    the solution would still go, relative to 1 + |z|; ``violation`` by how much the constraints are missed, in units of
+    the scales; ``decrease`` what that step promises, relative to the objective, or None where it is not known.
+
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> result = ro.calibrate(problem, ro.bounded, weight=1e-3)
+    >>> evidence = result.certificate
+    >>> evidence.holds(result.z), evidence.decrease < 1e-9, evidence.violation, evidence.gradient < 1e-6
+    (True, True, 0.0, True)
+    >>> early = ro.calibrate(problem, ro.bounded, weight=1e-3, max_iterations=1)
+    >>> early.certificate.holds(early.z)
+    False
+    """
+
+    gradient: float | None
+    step: float
+    violation: float
+    decrease: float | None = None
+
+    def holds(self, z: Array) -> bool:
+        """Whether this is a solution z (n,), to the accuracy of an interior point."""
+        return self.decrease is not None and self.decrease <= DECREASE and self.violation <= room(z)
+
+
+def certified(
+    formulation: Formulation, model: LinearModel, slope: float, z: Array, weight: float, floor: float = 0.0
+) -> Certificate:
+    """Return the evidence that z (n,) minimizes the nonlinear problem.
+
+    Parameters
+    ----------
+    formulation
+        Whose functions are asked anew.
+    model, slope
+        The problem linearized at z, anew, and the norm of the data's gradient where the loop began.
+    z, weight
+        What is certified.
+    floor
+        Below what an objective is as good as zero.
+    """
+    program = pose(formulation, model)
+    objective = program.objective(z, weight)
+    violation = program.violation(z)
+    gradient = _gradient(program, slope, z, weight)
+    try:
+        best = program.inside(program.solve(weight).z, z, weight)
+    except NoSolutionFound:
+        return Certificate(gradient, float("inf"), violation, None)
+    step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))
+    promised = objective - program.objective(best, weight)
+    if not np.isfinite(promised):
+        return Certificate(gradient, step, violation, None)
+    return Certificate(gradient, step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
+
+
+def _gradient(program: Program, slope: float, z: Array, weight: float) -> float | None:
+    """Return the norm of the gradient off the bounds, relative to that of the data at nominal."""
+    if not program.quadratic or program.box is None:
+        return None
+    gradient = program.gradient(z, weight)
+    if gradient is None:
+        return None
+    lower, upper = program.box
+    at_low = np.isfinite(lower) & (z <= lower + 1e-9)
+    at_high = np.isfinite(upper) & (z >= upper - 1e-9)
+    held = (at_low & (gradient > 0)) | (at_high & (gradient < 0))
+    left = np.where(held, 0.0, gradient)
+    return float(np.linalg.norm(left) / max(slope, TINY))

@@ -1,0 +1,127 @@
+"""The weight while the loop goes on: a number, or what a selector answers until it answers the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.phases import phase
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.select import SELECTORS, Selection, Selector
+
+SETTLED = 1e-3
+"""The weight is chosen anew while a step is longer than this part of the solution, then stays."""
+SAME = 0.01
+"""Two weights are the same when their logarithms differ by no more."""
+PATIENCE = 10
+"""How many different answers a selector may give in turn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Choosing:
+    """The weight of a pass, and what is known of its choice.
+
+    Parameters
+    ----------
+    rule
+        The selector; None for a number.
+    weight
+        Now.
+    selection
+        The selector's last answer.
+    answers
+        All its answers, in turn.
+    settled
+        Whether the weight stays while the loop comes to rest.
+    final
+        Whether it stays for good: a number, an answer that was confirmed, or one that ended a quarrel.
+    note
+        What a reader must know of it.
+    """
+
+    rule: Selector | None
+    weight: float = 0.0
+    selection: Selection | None = None
+    answers: tuple[float, ...] = ()
+    settled: bool = False
+    final: bool = False
+    note: str = ""
+
+    def asked(self, program: Program) -> Choosing:
+        """Return what the selector makes of a program, unless the weight is settled."""
+        if self.settled or self.rule is None:
+            return self
+        with phase("selection"):
+            selection = self.rule(program)
+        if not isinstance(selection, Selection):
+            name = getattr(self.rule, "__name__", "selector")
+            raise InputError(f"selector {name}", f"a {type(selection).__name__}", "a Selection with a weight")
+        if not (np.isfinite(selection.weight) and selection.weight >= 0):
+            raise InputError(f"selector {selection.name}", f"weight {selection.weight}", "a number, zero or more")
+        answers = (*self.answers, float(selection.weight))
+        chosen = replace(self, weight=float(selection.weight), selection=selection, answers=answers)
+        return chosen._checked()
+
+    def after(self, step: float) -> Choosing:
+        """Return the choice after a step of that length, relative to the solution."""
+        if self.settled or step > SETTLED:
+            return self
+        return replace(self, settled=True)
+
+    def confirmed(self, program: Program) -> Choosing:
+        """Return the choice after the selector was asked about the program at the end: final, or another weight."""
+        if self.final:
+            return self
+        again = replace(self, settled=False).asked(program)
+        if _same(again.weight, self.weight):
+            return replace(self, settled=True, final=True)
+        return again
+
+    def _checked(self) -> Choosing:
+        """Settle a rule that goes round in circles, or never comes to rest, on the safer of its answers."""
+        turns = [self.answers[0]]
+        turns += [b for a, b in zip(self.answers, self.answers[1:], strict=False) if not _same(a, b)]
+        last = turns[-4:]
+        if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
+            return self._settled_between(last[2], last[3])
+        if len(turns) >= PATIENCE:
+            return self._settled_between(last[-2], last[-1])
+        return self
+
+    def _settled_between(self, one: float, other: float) -> Choosing:
+        low, high = sorted((one, other))
+        name = self.selection.name if self.selection else "selector"
+        weight, which = high, "the larger one, which holds back more, is used"
+        if low > 0 and high <= 10 * low:
+            weight, which = float(np.sqrt(low * high)), f"their geometric mean, {np.sqrt(low * high):.2g}, is used"
+        note = f"The rule {name} alternates between {one:.2g} and {other:.2g}: {which}."
+        return replace(self, weight=weight, settled=True, final=True, note=note)
+
+
+def _same(one: float, other: float) -> bool:
+    if one <= 0 or other <= 0:
+        return one == other
+    return abs(np.log(one / other)) <= SAME
+
+
+def choosing(weight: float | str | Selector, penalized: bool) -> Choosing:
+    """Return how a weight is to be found: a number, a selector, or a ready selector's name.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    if isinstance(weight, str):
+        if weight not in SELECTORS:
+            raise InputError("weight", f"'{weight}'", f"a number, a selector, or one of {choices(weight, SELECTORS)}")
+        weight = SELECTORS[weight]
+    if callable(weight):
+        return Choosing(weight, settled=not penalized, final=not penalized)
+    if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):
+        raise InputError("weight", f"{weight!r}", "a number, zero or more, or a selector")
+    if not (np.isfinite(weight) and weight >= 0):
+        raise InputError("weight", f"{weight}", "a finite number, zero or more")
+    return Choosing(None, float(weight), settled=True, final=True)

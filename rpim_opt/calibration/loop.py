@@ -1,0 +1,495 @@
+"""The outer loop: linearize, choose the weight, solve, step or damp, until the convex program promises nothing more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
+from rpim_opt.calibration.choosing import Choosing, choosing
+from rpim_opt.calibration.result import Calibration, Iteration
+from rpim_opt.convex.formulation import Formulation, tikhonov
+from rpim_opt.convex.majorize import Squares, on_triangles
+from rpim_opt.convex.objective import Damping
+from rpim_opt.convex.program import Program, pose
+from rpim_opt.convex.select import Selector
+from rpim_opt.convex.trust import trusted_parts
+from rpim_opt.problem.frames import relocated
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
+
+GOOD, POOR = 0.75, 0.25
+"""Of the decrease that the convex program promises: above the first, damping gets less; below the second, more."""
+HARDER, SOFTER, FIRST, LAST = 4.0, 0.5, 1.0, 1e-4
+"""By how much; what damping first weighs against the promised decrease, and below what part of it there is none."""
+BENT, BEND_STEP, MOST_BEND = 0.1, 0.1, 0.75
+"""A step follows the curve of the residual where that bends by this part of the step's effect; measured so far along
+the step; unless it would turn the step by more than the last."""
+STRAIGHT = 1e-3
+"""Steps shorter than this part of the solution are straight: what bends them is rounding."""
+EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
+"""Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
+VANISHING = 1e-12
+"""Part of the first objective below which one has vanished."""
+ROUNDING = 1e-9
+"""By how much of itself an objective may rise at a step: what rounding makes of it, not where it leads."""
+MANY = 6
+"""Refused steps in a row after which a small promise is taken for the solver's noise; the certificate judges that."""
+LONG = 10
+"""Passes after which an objective that did not fall is taken to be the least; the certificate judges that."""
+QUIET = 3
+"""Passes in a row in which a program promises nothing beyond its accuracy: then it will not."""
+PENALTY = 10.0
+"""What missing ``largest`` by its own size costs, relative to the objective."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where the loop is.
+
+    Parameters
+    ----------
+    z
+        (n,) deviations in units of the scales.
+    program
+        Linearized at z.
+    choice
+        The weight.
+    merit
+        The nonlinear objective at z, and what missing ``largest`` costs.
+    damping
+        Weight of |size (step)|^2.
+    size
+        (n,) largest norm that each column of A has had.
+    history
+        The passes so far.
+    evaluations
+        Linearizations so far.
+    quiet
+        Passes in a row that promised nothing.
+    refused
+        Steps in a row that did not lower the objective.
+    outcome
+        Why the loop ended; empty while it goes on.
+    slope
+        Norm of the data's gradient where the loop began.
+    floor
+        What objectives are compared with where they vanish: a small part of the first one.
+    """
+
+    z: Array
+    program: Program
+    choice: Choosing
+    merit: float
+    size: Array
+    damping: float = 0.0
+    history: tuple[Iteration, ...] = ()
+    evaluations: int = 1
+    quiet: int = 0
+    refused: int = 0
+    outcome: str = ""
+    slope: float = 0.0
+    floor: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What stays the same from pass to pass: the measurements, how a program is solved, when to stop."""
+
+    source: Source
+    asked: Formulation
+    reweigh: Squares | None
+    solver: Mapping[str, Any]
+    tolerance: float
+    most: int
+
+    def linearized(self, z: Array, before: Array | None = None) -> LinearModel:
+        """Return the linear model at z (n,)."""
+        reweigh = self.reweigh
+        if reweigh is not None and before is not None:
+            reweigh = reweigh.after(before)
+        return self.source.linearize(self.source.parameters.free.scale * z, reweigh)
+
+    def chosen(self, state: State) -> State:
+        """Ask for the weight; the objective follows it."""
+        choice = state.choice
+        if not choice.settled:
+            choice = choice.asked(self._judged(state))
+        if choice.weight == state.choice.weight and state.history:
+            return replace(state, choice=choice)
+        return replace(state, choice=choice, merit=_merit(state.program, state.z, choice.weight))
+
+    def confirmed(self, state: State) -> State:
+        """Ask the selector once more where the loop came to rest: a weight is chosen when it is its own answer."""
+        if state.outcome != "rest" or state.choice.final:
+            return state
+        choice = state.choice.confirmed(self._judged(state))
+        if choice.weight == state.choice.weight:
+            return replace(state, choice=choice)
+        merit = _merit(state.program, state.z, choice.weight)
+        return replace(state, choice=choice, merit=merit, quiet=0, outcome="")
+
+    def _judged(self, state: State) -> Program:
+        """Return the program that a selector sees: of squares that stand for a robust loss, those that it trusts."""
+        if self.reweigh is None:
+            return state.program
+        x = self.source.parameters.free.scale * state.z
+        return state.program.on(self.source.linearize(x, trusted_parts(self.source, x, self.asked)))
+
+    def advanced(self, state: State) -> State:
+        """Return the state after one attempt at a step."""
+        straight = self._solved(state.program, state)
+        promised = state.merit - _merit(state.program, straight, state.choice.weight)
+        length = float(np.linalg.norm(straight - state.z))
+        short = length <= self.tolerance * (1 + float(np.linalg.norm(state.z)))
+        accuracy, best = self._accuracy(state)
+        nothing = promised <= accuracy
+        if state.damping > 0 and (short or nothing):
+            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
+        quiet = state.quiet + 1 if nothing else 0
+        if state.choice.settled and (promised <= best or quiet >= QUIET or self._stalled(state)):
+            return replace(state, outcome="rest")
+        z = self._bent(state, straight)
+        candidate = state.program.on(self.linearized(z, state.z))
+        merit = _merit(candidate, z, state.choice.weight)
+        state = replace(state, evaluations=state.evaluations + 1, quiet=quiet)
+        gain = (state.merit - merit) / promised if promised > 0 else 1.0
+        stepped = merit <= state.merit + ROUNDING * abs(state.merit) + state.floor
+        state = self._damped(state, gain, promised, z)
+        if not stepped:
+            state = replace(state, refused=state.refused + 1)
+            hopeless = state.refused > MANY and promised <= DECREASE * max(abs(state.merit), 1.0)
+            return self._refused(state, short or nothing or hopeless)
+        return self._accepted(state, candidate, z, merit, short)
+
+    def _solved(self, program: Program, state: State) -> Array:
+        """Return the minimum (n,) of a convex program, damped as the state says."""
+        damping = None
+        if state.damping > 0:
+            damping = Damping(state.z, np.sqrt(state.damping) * state.size)
+        weight = state.choice.weight
+        with phase("solve"):
+            estimate = program.solve(weight, damping=damping, **self.solver)
+        return program.inside(estimate.z, state.z, weight)
+
+    def _bent(self, state: State, straight: Array) -> Array:
+        """Let a step follow the curve of the residual: the convex program again, b moved by half the curvature.
+
+        (Geodesic acceleration; Transtrum and Sethna 2012, arXiv:1201.5885. The curvature is that along the step, by a
+        difference of residuals.)
+        """
+        step = straight - state.z
+        source, model = self.source, state.program.model
+        length = float(np.linalg.norm(step))
+        if not isinstance(source, CalibrationProblem) or length <= STRAIGHT * (1 + float(np.linalg.norm(state.z))):
+            return straight
+        along = model.A @ step
+        ahead = source.whitened_residual(source.parameters.free.scale * (state.z + BEND_STEP * step))
+        bend = (ahead - (model.b - model.A @ state.z) + BEND_STEP * along) / BEND_STEP**2
+        if not np.isfinite(bend).all() or np.linalg.norm(bend) <= BENT * np.linalg.norm(along):
+            return straight
+        try:
+            curved = self._solved(state.program.on(model.with_values(model.b + bend)), state)
+        except NoSolutionFound:
+            return straight
+        turn = np.linalg.norm(state.size * (curved - straight))
+        if 2 * turn > MOST_BEND * np.linalg.norm(state.size * step):
+            return straight
+        return curved
+
+    def _stalled(self, state: State) -> bool:
+        """Whether many passes together have changed the objective by no more than one may for nothing."""
+        if len(state.history) <= LONG:
+            return False
+        accuracy, best = self._accuracy(state)
+        fall = state.history[-LONG].objective - state.merit
+        if np.isfinite(best):
+            return fall <= accuracy
+        return fall <= LONG * accuracy
+
+    def _accuracy(self, state: State) -> tuple[float, float]:
+        """Return what a promised decrease may be for nothing, when it is so again and again, and when it is so once."""
+        exact = state.program.quadratic and state.program.box is not None
+        size = max(abs(state.merit), state.floor)
+        if exact and self.reweigh is None:
+            return EXACT * size, -np.inf
+        if not np.isfinite(state.merit):  # outside the functions' domain: any point inside is better
+            return 0.0, -np.inf
+        size = max(size, 1.0)  # an interior point's accuracy is absolute below one squared sigma
+        return INTERIOR * size, BEST * size
+
+    def _damped(self, state: State, gain: float, promised: float, z: Array) -> State:
+        """Return the state with the damping that a gain asks for."""
+        effect = float(np.sum((state.size * (z - state.z)) ** 2))
+        damping = state.damping
+        if gain < POOR and effect > 0 and promised > 0:
+            damping = max(HARDER * damping, FIRST * promised / effect if damping == 0 else 0.0)
+        elif gain > GOOD:
+            damping = SOFTER * damping
+            if damping * effect <= LAST * promised:
+                damping = 0.0
+        return replace(state, damping=damping)
+
+    def _refused(self, state: State, nothing: bool) -> State:
+        """Return the state after a step that does not lower the objective; where none was promised, it is at rest."""
+        if nothing and state.choice.settled:
+            return replace(state, outcome="rest")
+        if nothing:
+            return replace(state, choice=state.choice.after(0.0))
+        if state.damping > 1e30 or not np.isfinite(state.damping):
+            return replace(state, outcome="stuck")
+        return state
+
+    def _accepted(self, state: State, candidate: Program, z: Array, merit: float, short: bool) -> State:
+        """Return the state at a better point."""
+        scale = self.source.parameters.free.scale
+        length = float(np.linalg.norm(z - state.z))
+        x = scale * z
+        wrapped = self.source.parameters.free.wrapped(x)
+        if (wrapped != x).any():
+            turned = wrapped / scale
+            moved = candidate.model.with_values(candidate.model.b + candidate.model.A @ (turned - z))
+            candidate, z = candidate.on(moved), turned
+            merit = _merit(candidate, z, state.choice.weight)
+        settled = state.choice.settled
+        resting = settled and short
+        passed = Iteration(merit, length, state.choice.weight, state.damping)
+        return replace(
+            state,
+            z=z,
+            program=candidate,
+            merit=merit,
+            refused=0,
+            size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
+            history=(*state.history, passed),
+            choice=state.choice.after(length / (1 + float(np.linalg.norm(z)))),
+            outcome="rest" if resting else "",
+        )
+
+
+def _merit(program: Program, z: Array, weight: float) -> float:
+    objective = program.objective(z, weight)
+    excess = program.excess(z)
+    if excess == 0:
+        return objective
+    return objective + PENALTY * (1 + abs(objective)) * excess
+
+
+@one_blas_thread
+def calibrate(
+    problem: Source,
+    formulation: Formulation = tikhonov,
+    weight: float | str | Selector = 0.0,
+    *,
+    start: Array | None = None,
+    max_iterations: int = 500,
+    tolerance: float = 1e-8,
+    progress: Callable[[Iteration], None] | None = None,
+    solver: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    verbose: bool = False,
+) -> Calibration:
+    """Identify the parameters of a problem.
+
+    Every pass linearizes at the current deviations, solves for the *total* deviation and takes the step; a step that
+    bends follows the curve of the residual, and where the nonlinear objective falls by less than a quarter of what the
+    convex program promises, a term of Levenberg's and Marquardt's kind shortens the next one. The loop ends when the
+    undamped program promises no decrease beyond its solver's accuracy, or its step is shorter than
+    ``tolerance * (1 + ||z||)``. The result has converged if a `Certificate` computed anew agrees: then it is a
+    stationary point of the nonlinear problem.
+
+    Parameters
+    ----------
+    problem
+        What was measured, and what is to be identified.
+    formulation
+        The convex program of a pass; its functions are asked now.
+    weight
+        A number, or a selector (or its name), which sees identification data only. It is asked anew until the steps
+        become small; then the weight stays. One that takes turns between weights is answered, with a sentence.
+    start
+        (n,) deviations [SI] to begin with; nominal by default, and then frames that are stated metres or half a
+        turn from where the data put them count from there (`frames.relocated`). The answer does not depend on
+        a given start, as long as the loop converges: the deviations count from nominal all the same, angles within
+        half a turn.
+    max_iterations, tolerance
+        When to stop: linearizations, and length of a step. A calibration that did not converge says so in ``converged``
+        and ``message``.
+    progress
+        Called after every pass.
+    solver, settings, verbose
+        Any installed solver of CVXPY, with its options (`Program.solve`).
+
+    Raises
+    ------
+    InputError
+        For fewer equations than unknowns without a penalty, and a start that does not fit.
+    NoSolutionFound
+        When a convex program fails.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
+    >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm. {result.message}")
+    0.024 mm. Converged after 4 passes.
+    """
+    if isinstance(max_iterations, bool) or not isinstance(max_iterations, int) or max_iterations < 1:
+        raise InputError("max_iterations", f"{max_iterations!r}", "a whole number, 1 or more")
+    elsewhere = None
+    if start is None:
+        elsewhere = relocated(problem)
+    problem = elsewhere or problem
+    how = {"solver": solver, "settings": settings, "verbose": verbose}
+    source = in_parts(problem.frozen())
+    solved, reweigh = formulation, None
+    if not source.keeps_rows:
+        solved, reweigh = on_triangles(formulation, _equations(source))
+    loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations)
+    try:
+        state = _begun(loop, solved, choosing(weight, formulation.penalty is not None), start)
+        while not state.outcome and state.evaluations <= max_iterations:
+            passes = len(state.history)
+            state = loop.confirmed(loop.advanced(loop.chosen(state)))
+            if progress and len(state.history) > passes:
+                progress(state.history[-1])
+        evidence = _certified(loop, formulation, problem, state)
+    except NoSolutionFound as error:
+        raise error.naming(_names(source)) from None
+    converged = state.outcome == "rest" and evidence.holds(state.z)
+    message = _message(state, evidence, converged, max_iterations, elsewhere is not None)
+    asked = partial(
+        calibrate, formulation=formulation, weight=weight, max_iterations=max_iterations, tolerance=tolerance, **how
+    )
+    return Calibration(
+        problem=problem,
+        formulation=formulation,
+        x=source.parameters.free.scale * state.z,
+        weight=state.choice.weight,
+        selection=state.choice.selection,
+        converged=converged,
+        message=message,
+        history=state.history,
+        program=state.program,
+        certificate=evidence,
+        asked=asked,
+    )
+
+
+def _floor(merit: float) -> float:
+    """Return below what an objective is as good as zero: noise-free data end at rounding, which has no digits."""
+    if not np.isfinite(merit):
+        return 0.0
+    return VANISHING * abs(merit)
+
+
+def _equations(source: Source) -> int:
+    return sum(len(b.row) * len(b.measurement.components) for part in source.rows() for b in part.data.blocks)
+
+
+def _begun(loop: Loop, formulation: Formulation, choice: Choosing, start: Array | None) -> State:
+    """Return the state before the first pass, at a point that meets the constraints."""
+    parameters = loop.source.parameters
+    scale = parameters.free.scale
+    x = np.zeros(len(scale))
+    accepted = f"{len(scale)} deviations, finite, one a parameter"
+    if start is not None:
+        try:
+            x = np.asarray(start, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError("start", f"a {type(start).__name__}", accepted) from None
+    if x.shape != scale.shape:
+        raise InputError("start", f"shape {x.shape}", accepted)
+    if not np.isfinite(x).all():
+        raise InputError("start", "a value that is not finite", accepted)
+    z = parameters.free.wrapped(x) / scale
+    model = loop.linearized(z)
+    if not (np.isfinite(model.A).all() and np.isfinite(model.b).all()):
+        raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
+    unpenalized = formulation.penalty is None or (choice.settled and choice.weight == 0)
+    if model.equations < len(z) and unpenalized:
+        found = f"{model.equations} equations for {len(z)} parameters"
+        raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
+    with phase("canonicalization"):
+        program = pose(formulation, model)
+        nearest = program.nearest(z)
+    if (nearest != z).any():
+        z = nearest
+        program = program.on(loop.linearized(z))
+    size = np.linalg.norm(program.model.A, axis=0)
+    merit = _merit(program, z, choice.weight)
+    slope = float(np.linalg.norm(2 * model.A.T @ model.b))
+    return State(z, program, choice, merit, size, slope=slope, floor=_floor(merit))
+
+
+def _certified(loop: Loop, formulation: Formulation, problem: Source, state: State) -> Certificate:
+    """Ask everything anew: the formulation's functions, and the measurements' model."""
+    solved, model = formulation, state.program.model
+    if loop.reweigh is not None:
+        solved, _ = on_triangles(formulation, model.equations)
+    if loop.source.keeps_rows:  # of more than fits into memory the last pass has to do
+        model = problem.frozen().linearize(loop.source.parameters.free.scale * state.z)
+    return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor)
+
+
+def _names(source: Source) -> dict[int, str]:
+    """Return a label for every configuration's number."""
+    names: dict[int, str] = {}
+    for part in source.rows():
+        names |= dict(zip(part.data.configuration, part.data.label, strict=True))
+    return names
+
+
+def _message(state: State, evidence: Certificate, converged: bool, most: int, elsewhere: bool) -> str:
+    """Say how the loop ended, and why."""
+    count = len(state.history)
+    passes = f"{count} passes" if count != 1 else "1 pass"
+    if converged:
+        text = f"Converged after {passes}."
+    elif state.outcome == "rest":
+        text = _doubted(evidence)
+    elif state.outcome == "stuck":
+        text = (
+            "Not converged: no step lowers the nonlinear objective, however short; "
+            "the formulation may have no minimum here, or the start be far off."
+        )
+    else:
+        text = f"Not converged: {_unfinished(state, most)}"
+    if state.choice.note:
+        text += f" {state.choice.note}"
+    if elsewhere:
+        text += " Frames were stated far from where the data put them; their deviations count from there."
+    return text
+
+
+def _doubted(evidence: Certificate) -> str:
+    """Say why a loop at rest has not converged."""
+    if evidence.decrease is None:
+        return "Not converged: the convex program at the end could not be solved again, so that nothing certifies it."
+    if evidence.decrease > 1e-6:
+        return f"Not converged: the convex program at the end still promises {evidence.decrease:.1g} of the objective."
+    return f"Not converged: the constraints are missed by {evidence.violation:.1g} scales."
+
+
+def _unfinished(state: State, most: int) -> str:
+    """Say what the loop was doing when its passes ran out."""
+    passes = f"{most} passes were" if most != 1 else "1 pass was"
+    last = [iteration.objective for iteration in state.history[-5:]]
+    if len(last) == 5 and last[0] - last[-1] <= 1e-9 * abs(last[-1]):
+        return (
+            f"{passes} not enough, though the objective hardly changes: the data hardly decide, give a larger weight."
+        )
+    if state.choice.weight == 0 and most > 1:
+        return f"{passes} not enough: what the data hardly see runs away without a penalty; give one, with a weight."
+    return f"{passes} not enough; give more (max_iterations)."

@@ -1,0 +1,457 @@
+"""What a calibration found, in numbers: parameters, errors, what the fit trusts, and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.calibration import diagnosis
+from rpim_opt.calibration.certificate import Certificate
+from rpim_opt.calibration.diagnosis import Flag, Held
+from rpim_opt.calibration.spread import Spread
+from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.quadratic import ridge
+from rpim_opt.convex.select import Selection
+from rpim_opt.convex.trust import Trusted
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.record import Record
+from rpim_opt.problem.frames import fitted_frames
+from rpim_opt.problem.functions import transform
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
+from rpim_opt.robot.mdh import MDH, Robot
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One pass of the loop.
+
+    Parameters
+    ----------
+    objective
+        The nonlinear objective after it.
+    step
+        Length of the step, in units of the scales.
+    weight
+        Of the penalty.
+    damping
+        Weight of Levenberg and Marquardt's term; zero for a full step.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
+    >>> for passed in result.history[:2]:
+    ...     print(f"{passed.objective:.3f} {passed.step:.2f} {passed.weight:g} {passed.damping:g}")
+    111.445 3.57 1 0
+    109.557 0.32 1 0
+    """
+
+    objective: float
+    step: float
+    weight: float
+    damping: float
+
+
+class Prediction(NamedTuple):
+    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals.
+
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
+    >>> where = ro.calibration.Uncertainty(result).predict(instance.validation.q)
+    >>> where.covariance.shape, bool((where.expanded == where.coverage_factor * where.standard).all())
+    ((40, 3, 3), True)
+    """
+
+    position: Array
+    covariance: Array
+    coverage_factor: float = 1.0
+
+    @property
+    def standard(self) -> Array:
+        """Standard uncertainties (N, 3) [m] of the coordinates."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+    @property
+    def expanded(self) -> Array:
+        """Half widths (N, 3) [m] of the intervals of the coordinates."""
+        return self.coverage_factor * self.standard
+
+
+class Kept(NamedTuple):
+    """What the functions of a script said of a result, in whose file they are not.
+
+    Parameters at bounds; the equations (m, n) that the loss trusts (None where there were none), the loss's factor on
+    them, and the numbers of those that it left out.
+    """
+
+    held: tuple[Held, ...]
+    linear: LinearModel | None
+    factor: float = 1.0
+    left_out: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The numbers of a `Calibration`, which puts them into words; its fields are described there."""
+
+    problem: Source
+    formulation: Formulation
+    x: Array
+    weight: float
+    selection: Selection | None
+    converged: bool
+    message: str
+    history: tuple[Iteration, ...]
+    program: Program
+    certificate: Certificate
+    asked: Callable[[Source], Self]
+    record: Record = field(default_factory=Record)
+    kept: Kept | None = None
+
+    @property
+    def z(self) -> Array:
+        """The deviations (n,) in units of their scales.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
+        >>> bool(abs(result.z * result.problem.parameters.free.scale - result.x).max() == 0)
+        True
+        """
+        return self.x / self.problem.parameters.free.scale
+
+    # --- the robot that was found ------------------------------------------------------------------------------
+
+    @property
+    def robot(self) -> Robot:
+        """The robot with its identified MDH parameters; ratios, eccentricities and compliances are no part of it.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
+        >>> (1e3 * (result.robot.mdh - result.problem.robot.mdh)[:, 3]).round(2)  # deviations of d [mm]
+        array([0.17, 0.45, 0.45, 0.45, 3.82, 0.7 ])
+        """
+        mdh = self.problem.robot.mdh.copy()
+        free = self.problem.parameters.free
+        places = {f"{c}{i + 1}": (i, j) for i in range(len(mdh)) for j, c in enumerate(MDH)}
+        for name, deviation in zip(free.names, self.x, strict=True):
+            if name in places:
+                mdh[places[name]] += deviation
+        return replace(self.problem.robot, mdh=mdh)
+
+    def forward(self, q: Array, marker: str = "", torque: Array | None = None) -> Array:
+        """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
+
+        Base, robot and tool, gears and joints' elasticity included; of `robot` alone: `forward_kinematics`.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m].
+        marker
+            The reflector; the only one by default.
+        torque
+            (N, dof) joint torques [Nm], where the compliance of joints is identified.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
+        >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
+        array([ 0.822, -0.026,  0.197])
+        """
+        return self._at(q, transform, marker, torque).modelled(self.x)[0].reshape(-1, 4, 4)
+
+    def predict(self, q: Array, marker: str = "", torque: Array | None = None) -> Prediction:
+        """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
+
+        Positions in the instrument's frame; their covariance J C J', without the noise of a new measurement, at
+        coverage factor 1. `Uncertainty.predict` states the factor of a confidence.
+
+        Raises
+        ------
+        InputError
+            For a penalty without covariance (lasso).
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+        >>> where = result.predict(np.radians([[10, 20, -30, 40, 50, 60]]))
+        >>> where.position.round(3), (1e3 * where.standard).round(3)  # [m], [mm]
+        (array([[ 1.522, -0.347,  0.972]]), array([[0.013, 0.014, 0.012]]))
+        """
+        if not self.linear_penalty:
+            accepted = "a squared penalty or none; `forward` gives the positions alone"
+            raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
+        problem = self._at(q, position, marker, torque)
+        J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
+        return Prediction(problem.modelled(self.x)[0], self.spread.of_positions(J))
+
+    def _at(self, q: Array, measurement: Measurement, marker: str, torque: Array | None) -> CalibrationProblem:
+        """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
+        torques = None
+        if torque is not None:
+            torques = np.reshape(np.asarray(torque, dtype=float), (len(q), 1, -1))
+        block = replace(data.blocks[0], markers=(marker,), torque=torques)
+        return self.problem.on(replace(data, blocks=(block,)))
+
+    # --- errors ------------------------------------------------------------------------------------------------
+
+    def error_vectors(self, data: Dataset | None = None, nominal: bool = False) -> Array:
+        """Return measured minus modelled position of every row, (N, 3) [m]; NaN where no position was measured.
+
+        Parameters
+        ----------
+        data
+            The rows; of the identification data by default.
+        nominal
+            Of the model before calibration, as in `nominal_errors`.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("paper_arm")
+        >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1e-3)
+        >>> (1e3 * result.error_vectors(instance.validation, nominal=True)[0]).round(2)  # [mm]
+        array([-2.13, -0.71, -2.93])
+        """
+        source, x = self.problem, self.x
+        if nominal:
+            source, x = self._nominal
+        if data is not None:
+            source = source.on(data)
+        return np.concatenate([diagnosis.error_vectors(part, x) for part in source.rows()])
+
+    def measured_positions(self, data: Dataset | None = None) -> Array:
+        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("cable").problem, ro.tikhonov, weight=1.0)
+        >>> result.measured_positions()[0].round(2)  # [m]
+        array([0.41, 0.35, 1.53])
+        """
+        source = self.problem
+        if data is not None:
+            source = source.on(data)
+        return np.concatenate([self._positions(part.data) for part in source.rows()])
+
+    def _positions(self, data: Dataset) -> Array:
+        points = np.empty((len(data), 3))
+        for block in data.blocks:
+            names = list(block.measurement.columns)
+            torque = None
+            if block.torque is not None:
+                torque = block.torque[:, 0]
+            points[block.row] = self.forward(block.q[:, 0], block.markers[0], torque)[:, :3, 3]
+            if {"x", "y", "z"} <= set(names):
+                points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
+        return points
+
+    def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
+        """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
+
+        Parameters
+        ----------
+        data
+            The rows; the identification data by default.
+        dimension
+            ``"length"``, or ``"angle"`` for the orientation error [rad], NaN for rows that are no poses.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("pose")
+        >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1.0)
+        >>> [f"{1e3 * result.errors(instance.validation, d).mean():.3f}" for d in ("length", "angle")]  # mm, mrad
+        ['0.044', '0.101']
+        """
+        source = self.problem
+        if data is not None:
+            source = source.on(data)
+        return source.errors(self.x, dimension)
+
+    def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
+        """Return the error of every row before calibration, (N,) [m]; arguments as for `errors`.
+
+        The robot is as its drawing says. Frames (base, reflectors, anchors, ...) that the calibration identifies
+        are fitted to the identification data first: before that they say nothing about the robot.
+        """
+        source, x = self._nominal
+        if data is not None:
+            source = source.on(data)
+        return source.errors(x, dimension)
+
+    @cached_property
+    def _nominal(self) -> tuple[Source, Array]:
+        """The problem that identifies frames alone, and its solution under the prior that the scales state."""
+        return fitted_frames(self.problem)
+
+    # --- how the fit is, and what it rests on ------------------------------------------------------------------
+
+    @property
+    def penalty_weight(self) -> float:
+        """The weight, zero where there is no penalty."""
+        if self.formulation.penalty is None:
+            return 0.0
+        return self.weight
+
+    @property
+    def squared_loss(self) -> bool:
+        """Whether the loss that was asked for is a square; triangles may have stood for another one."""
+        return self.program.formulation is self.formulation and self.program.loss_form is not None
+
+    @property
+    def linear_penalty(self) -> bool:
+        """Whether the penalty is a quadratic, or there is none: the estimate is then linear in the data."""
+        return self.program.linear_penalty
+
+    @cached_property
+    def linear(self) -> LinearModel:
+        """The last linearization, of the rows that a robust loss trusts (`Program.trusted`).
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3).linear.A.shape
+        (27, 26)
+        """
+        if self.kept is not None and self.kept.linear is not None:
+            return self.kept.linear
+        return diagnosis.trusted(self.problem, self.program, self._trust, self.x)
+
+    @cached_property
+    def equations(self) -> int:
+        """How many equations the fit rests on: all m, with a robust loss those that it trusts."""
+        return self.linear.equations
+
+    @cached_property
+    def degrees_of_freedom(self) -> float:
+        """Degrees of freedom of the fit, sum s_i^2 / (s_i^2 + weight) with the singular values s_i of `linear`.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> [round(ro.calibrate(problem, ro.tikhonov, weight).degrees_of_freedom, 1) for weight in (1e-3, 1e3)]
+        [19.8, 5.9]
+        """
+        return self.spread.degrees_of_freedom
+
+    @cached_property
+    def spread(self) -> Spread:
+        """What the uncertainty rests on: the equations that the fit trusts, and its penalty.
+
+        Raises
+        ------
+        InputError
+            For a penalty that is no squared norm (it stands for no normal prior), or a loss that no squared one stands
+            for.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> spread = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).spread
+        >>> spread.noise.shape, round(spread.noise_variance, 2)
+        ((34, 34), 1.04)
+        """
+        if not self.linear_penalty:
+            found = f"formulation '{self.formulation.name}'"
+            raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
+        linear = self.linear
+        form = ridge(linear, self.program.penalty_form)
+        return Spread(linear, form, self.penalty_weight, self.z, self._factor)
+
+    @cached_property
+    def _factor(self) -> float:
+        """By how much a robust loss weighs the rows that it trusts, against the squared loss."""
+        if self.kept is not None:
+            return self.kept.factor
+        return diagnosis.factor(self.program, self._trust)
+
+    @cached_property
+    def _trust(self) -> Trusted | None:
+        return diagnosis.trust(self.problem, self.formulation, self.program, self.x)
+
+    @cached_property
+    def noise_variance(self) -> float:
+        """sigma^2 = RSS / (m - dof) in units of the declared variance, or 1 where no equation is left over.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+        >>> round(result.noise_variance, 2), result.equations, round(result.degrees_of_freedom, 1)
+        (1.04, 120, 26.5)
+        """
+        return self.spread.noise_variance
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S.
+
+        That is the Bayesian covariance with the prior that the penalty stands for (`Uncertainty` takes it apart).
+        It holds for a squared loss, or for what a robust loss trusts, a squared penalty and inactive bounds.
+        Directions that neither data nor penalty see are infinite.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
+        >>> deviation = 1e3 * np.sqrt(np.diag(result.covariance))
+        >>> f"a2 to {deviation[result.problem.parameters.free.names.index('a2')]:.3f} mm"
+        'a2 to 0.007 mm'
+        """
+        return self.spread.covariance
+
+    @cached_property
+    def flagged(self) -> tuple[Flag, ...]:
+        """Rows that the fit distrusts, the worst first.
+
+        Those beyond `trust.outlying`, with the noise that the other rows show. After a squared loss blunders may
+        hide behind each other: a robust loss finds them.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
+        >>> len(result.flagged), len(result.without_flagged().flagged)
+        (5, 1)
+        """
+        return diagnosis.flagged(self.problem, self.x)
+
+    def without_flagged(self) -> Self:
+        """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
+        >>> [len(result.problem.labels) - len(result.without_flagged().problem.labels), len(result.flagged)]
+        [5, 5]
+        """
+        kept = self.problem.without({flag.label for flag in self.flagged})
+        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in self.flagged}
+        record = replace(self.record, excluded={**self.record.excluded, **reasons})
+        return replace(self.asked(kept), record=record)
+
+    @cached_property
+    def held(self) -> tuple[Held, ...]:
+        """What the tolerances cost: the parameters that a bound holds back, the costliest first.
+
+        ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
+        the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong
+        data, or a drawing that does not describe this robot.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> tight = problem.parameters.toleranced({"length_mm": 0.5})
+        >>> result = ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), ro.bounded, weight=1e-3)
+        >>> [f"{held.name} at {1e3 * held.bound:+.1f} mm, gain {held.gain:.2g}" for held in result.held[:2]]
+        ['d6 at +0.5 mm, gain 0.085', 'a3 at -0.5 mm, gain 0.032']
+        """
+        if self.kept is not None:
+            return self.kept.held
+        return diagnosis.held(self.program, self.z, self.weight)

@@ -1,0 +1,107 @@
+"""The result of a calibration: what was asked, what was found, how the loop ended, and all of it in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rpim_opt.calibration import words
+from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
+
+__all__ = ["Calibration", "Iteration", "Kept", "Prediction"]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(Outcome):
+    """The result of a calibration.
+
+    Parameters
+    ----------
+    problem, formulation
+        What was asked.
+    x
+        (n,) identified deviations [SI], in the order of ``problem.parameters.free``.
+    weight, selection
+        The weight, and the choice it comes from (None when it was given).
+    converged, message
+        Whether the loop came to rest at a solution that the certificate confirms, and how it ended.
+    history
+        One entry a pass.
+    program
+        The convex program at the last linearization.
+    certificate
+        Evidence that this is a solution, computed anew from the functions that state it.
+    asked
+        `calibrate` with all that it was given but the problem.
+    record
+        Where the data come from, for files and reports.
+    kept
+        What functions said that a file cannot hold; None where they can be asked.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("paper_arm")
+    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
+    >>> for name, errors in (("nominal", result.nominal_errors), ("identified", result.errors)):
+    ...     print(f"{name:10} {1e3 * errors(instance.validation).mean():.3f} mm")
+    nominal    2.649 mm
+    identified 0.032 mm
+    >>> result.selector, result.linear_penalty, result.penalty_weight == result.weight, result.equations
+    ('l_curve', True, True, 27)
+    >>> result.parameter_rows()[1]["name"], round(result.parameter_rows()[1]["deviation"], 2)  # [mm]
+    ('a1', 0.01)
+    >>> print(result.parameter_table().splitlines()[0])
+     parameter   unit    nominal   identified   deviation      std
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "save":
+            raise AttributeError("Calibration.save is now rpim_opt.store.save_result(result, path, record)")
+        raise AttributeError(f"'Calibration' object has no attribute '{name}'")
+
+    @property
+    def selector(self) -> str:
+        """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""
+        return words.selector(self)
+
+    def weight_sentence(self) -> str:
+        """Say the weight and where it came from.
+
+        >>> import rpim_opt as ro
+        >>> print(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).weight_sentence())
+        Weight 1 (given), formulation 'Tikhonov'.
+        """
+        return words.weight_sentence(self)
+
+    def remarks(self) -> list[str]:
+        """Say what a reader must know besides the figures: blunders, bounds that hold, what did not converge.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0, max_iterations=1).remarks()
+        ['Not converged: 1 pass was not enough; give more (max_iterations).']
+        """
+        return words.remarks(self)
+
+    def parameter_rows(self) -> list[dict[str, Any]]:
+        """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
+
+        ``std`` is None where the formulation has no covariance, or an infinite one.
+        """
+        return words.parameter_rows(self)
+
+    def parameter_table(self) -> str:
+        """Return the identified parameters as a table of text."""
+        return words.parameter_table(self)
+
+    def __str__(self) -> str:
+        """Return the parameters and errors as a person reads them."""
+        return words.as_text(self)
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return words.in_short(self)
+
+    def _repr_html_(self) -> str:
+        """Return the same as the text for a notebook."""
+        return words.as_html(self)

@@ -1,0 +1,143 @@
+"""A calibration in words: its parameters as a table, its weight, and what a reader must know besides."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.markup import html_table
+from rpim_opt.basics.text import table
+from rpim_opt.basics.units import display
+from rpim_opt.calibration.diagnosis import Held
+from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.convex.select import disagreement
+
+MOST_ROWS, MOST_BOUNDS = 8, 5
+"""Distrusted rows and bounds that are named one by one."""
+
+
+def standard_deviations(result: Outcome) -> Array:
+    """Return standard deviations (n,) [SI]; infinite where the formulation has none (lasso, minimax)."""
+    try:
+        return np.sqrt(np.diag(result.covariance))
+    except InputError:  # a penalty that is no prior, or a loss that no squared one stands for
+        return np.full(len(result.x), np.inf)
+
+
+def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
+    """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit."""
+    free = result.problem.parameters.free
+    values, std = free.values(result.x), standard_deviations(result)
+    rows: list[dict[str, Any]] = []
+    for i, name in enumerate(free.names):
+        unit, si = display(free.dimensions[i])
+        row = {
+            "name": name,
+            "unit": unit,
+            "nominal": float(free.nominal[i] / si),
+            "identified": float(values[i] / si),
+            "deviation": float(result.x[i] / si),
+            "std": None,
+        }
+        if np.isfinite(std[i]):
+            row["std"] = float(std[i] / si)
+        rows.append(row)
+    return rows
+
+
+def parameter_table(result: Outcome) -> str:
+    """Return the identified parameters as a table of text."""
+    return table(*_columns(result))
+
+
+def _columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
+    head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
+    return head, [_cells(row) for row in parameter_rows(result)]
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    std = "-"
+    if row["std"] is not None:
+        std = f"{row['std']:.4f}"
+    figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}", std]
+    return [row["name"], row["unit"], *figures]
+
+
+def as_text(result: Outcome) -> str:
+    """Return the parameters and errors as a person reads them."""
+    return "\n".join([parameter_table(result), "", *_sentences(result)])
+
+
+def as_html(result: Outcome) -> str:
+    """Return the same for a notebook."""
+    return html_table(*_columns(result), notes=_sentences(result))
+
+
+def in_short(result: Outcome) -> str:
+    """Return one line: what was asked, and how it ended."""
+    count = len(result.x)
+    return (
+        f"<Calibration '{result.formulation.name}', {count} parameters, weight {result.weight:.4g}: {result.message}>"
+    )
+
+
+def _sentences(result: Outcome) -> list[str]:
+    before = 1e3 * result.nominal_errors().mean()
+    after = 1e3 * result.errors().mean()
+    errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
+    return [errors, weight_sentence(result), *remarks(result)]
+
+
+def selector(result: Outcome) -> str:
+    """Return the name of the rule that chose the weight, ``given`` for a number, ``none`` without a penalty."""
+    if result.formulation.penalty is None:
+        return "none"
+    if result.selection is None:
+        return "given"
+    return result.selection.name
+
+
+def weight_sentence(result: Outcome) -> str:
+    """Say the weight and where it came from."""
+    name = result.formulation.name
+    if result.formulation.penalty is None:
+        return f"Formulation '{name}' has no penalty and needs no weight."
+    if result.selection is None:
+        return f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."
+    text = f"Weight {result.weight:.4g} ({selector(result)}: {result.selection.note}), formulation '{name}'."
+    return " ".join(filter(None, [text, disagreement(result.program)]))
+
+
+def remarks(result: Outcome) -> list[str]:
+    """Say what a reader must know besides the figures: blunders, bounds that hold, what did not converge."""
+    lines = _distrust(result)
+    lines += [_bound(result, held) for held in result.held[:MOST_BOUNDS]]
+    if not result.formulation.solvable:
+        lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")
+    return [*lines, result.message]
+
+
+def _distrust(result: Outcome) -> list[str]:
+    flagged = result.flagged
+    if not flagged:
+        return []
+    named = [f"{flag.label} ({flag.sigmas:.0f} sigmas, {flag.error_mm:.2f} mm)" for flag in flagged[:MOST_ROWS]]
+    text = f"Distrusted rows: {', '.join(named)}"
+    if len(flagged) > MOST_ROWS:
+        text += f" and {len(flagged) - MOST_ROWS} more"
+    lines = [f"{text}."]
+    if result.squared_loss:
+        lines.append("A squared loss lets such rows pull the fit: use formulation 'robust', or leave them out.")
+    return lines
+
+
+def _bound(result: Outcome, held: Held) -> str:
+    unit, si = display(result.problem.parameters.dimension_of(held.name))
+    tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
+    return (
+        f"{held.name} is held at {held.bound / si:+.3g} {unit}: loosening its tolerance by {tenth} would lower the "
+        f"whitened RMS by {held.gain:.2g}."
+    )
