@@ -6,7 +6,7 @@ import numpy as np
 
 import rpim_opt as ro
 
-ARM = ro.Robot(
+ARM = ro.robot.Robot(
     "test arm",
     np.array(
         [
@@ -29,7 +29,7 @@ def simulated(
     rng = np.random.default_rng(seed)
     q = rng.uniform(-2.0, 2.0, (configurations, robot.dof))
     tool = [0.03, -0.02, 0.06, 0.0, 0.0, 0.0]
-    parameters = ro.model_parameters(robot, tools={"": tool}).identify(identify)
+    parameters = ro.robot.model_parameters(robot, tools={"": tool}).identify(identify)
     parameters = parameters.scaled({"base_mm": 5.0, "base_mrad": 5.0, "tool_mm": 5.0})
     empty = ro.Dataset.of(q, np.zeros((configurations, 3)), sigma)
     truth = size * rng.normal(size=len(parameters.free)) * parameters.free.scale

@@ -6,11 +6,11 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rpim_opt import cli
-from rpim_opt.instances import problems_folder
+from rpim_opt.convex.interior import Found
+from rpim_opt.store.named import problems_folder
 
 KEYS = {"nominal", "identification", "validation", "weight", "selector", "formulation", "converged", "iterations",
         "flagged", "parameters"}  # fmt: skip
@@ -191,8 +191,8 @@ def test_fewer_equations_than_needed(monkeypatch, capsys, folder) -> None:
 
 
 def test_a_solver_failure_writes_nothing(monkeypatch, capsys, folder) -> None:
-    nothing = np.zeros(0)
-    monkeypatch.setattr("rpim_opt.conic.Conic.solve", lambda *_: ("out of luck", nothing, nothing))
+    for solver in ("interior", "by_solver"):
+        monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
     out = folder / "out"
     assert run(monkeypatch, "calibrate", str(folder), "--formulation", "robust", "--out", str(out)) == 3
     assert "out of luck" in capsys.readouterr().err

@@ -17,18 +17,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.exchange.chain import link_of
-from rpim_opt.files import read_toml
-from rpim_opt.kinematics import frame_numbers
-from rpim_opt.measurement import pose, position
-from rpim_opt.naming import parse_units, rename
-from rpim_opt.robot import MDH
-from rpim_opt.validation import validate
+from rpim_opt.basics.files import read_toml
+from rpim_opt.convex.interior import Found
+from rpim_opt.data.models import pose, position
+from rpim_opt.data.naming import parse_units, rename
+from rpim_opt.robot.chain import link_of
+from rpim_opt.robot.kinematics import frame_numbers
+from rpim_opt.robot.mdh import MDH
+from rpim_opt.use.validation import validate
+from tests import SHARED
+from tests.robot.test_exchange import CONF, YAML_PLAIN
 from tests.simulate import ARM, simulated
 from tests.test_cli import run
-from tests.test_exchange import CONF, YAML_PLAIN
 
-SHARED = Path(__file__).parents[2] / "shared"
 BENCH, REAL = SHARED / "bench", SHARED / "data"
 HEADER = ["x1", "y1", "z1", *(f"joint_{i}" for i in range(1, 7))]
 
@@ -319,18 +320,18 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
 
 def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
     (tmp_path / "calibration.conf").write_text(CONF)
-    nominal = ro.read_robot(Path(ro.__file__).parent / "robots" / "ur10.toml")
+    nominal = ro.read_robot(Path(ro.__file__).parent / "robot" / "ready" / "ur10.toml")
     problem, _ = simulated(robot=nominal, identify=("alpha?", "a?", "theta?", "d?", "beta[23]"), size=0.3)
     result = ro.calibrate(problem, ro.tikhonov, 1.0)
-    result.save(tmp_path / "result.json")
+    ro.store.save_result(result, tmp_path / "result.json")
     assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
                "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
     assert "alpha1 and a1" in capsys.readouterr().out
     read, q = ro.read_ur_calibration(tmp_path / "new.conf", nominal), np.random.default_rng(0).uniform(-2, 2, (9, 6))
     mdh = result.robot.mdh.copy()
     mdh[0, :2] = nominal.mdh[0, :2]  # where the base is, not how the robot is
-    there = ro.forward_kinematics(replace(nominal, mdh=mdh), q)
-    found = ro.forward_kinematics(read.robot, q)
+    there = ro.robot.forward_kinematics(replace(nominal, mdh=mdh), q)
+    found = ro.robot.forward_kinematics(read.robot, q)
     bridge = np.linalg.inv(there) @ found  # one constant tool, read as such
     assert np.abs(bridge - bridge[0]).max() < 1e-9
 
@@ -359,9 +360,9 @@ FORMULATIONS = {
 def test_uncertainty_of_compensation_survives_the_file(tmp_path, name: str) -> None:
     problem, _ = simulated(("theta?", "d?", "tool_[xyz]"), configurations=25, noise=5e-5)
     live = ro.calibrate(problem, FORMULATIONS[name], 0.5)
-    live.save(tmp_path / "result.json")
+    ro.store.save_result(live, tmp_path / "result.json")
     q = np.random.default_rng(1).uniform(-2, 2, (5, 6))
-    std = [ro.compensate(result, q).std for result in (live, ro.load_result(tmp_path))]
+    std = [ro.use.compensate(result, q).std for result in (live, ro.load_result(tmp_path))]
     assert np.array_equal(np.isfinite(std[0]), np.isfinite(std[1]))
     assert np.isfinite(std[0]).all() == (name != "lasso")
     finite = np.isfinite(std[0])
@@ -466,7 +467,8 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
 
 
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
-    monkeypatch.setattr("rpim_opt.conic.Conic.solve", lambda *_: ("out of luck", np.zeros(0), np.zeros(0)))
+    for solver in ("interior", "by_solver"):
+        monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
     assert run(monkeypatch, "calibrate", str(made), "--formulation", "robust", "--json") == 3
     said = capsys.readouterr()
     assert said.out == ""
@@ -475,7 +477,7 @@ def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
 
 def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
     problem, _ = simulated(("theta?", "ratio2"), configurations=20)
-    ro.calibrate(problem, ro.tikhonov, 1.0).save(tmp_path / "result.json")
+    ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), tmp_path / "result.json")
     assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 2
     assert "found ratio2" in capsys.readouterr().err
     assert not (tmp_path / "arm.csv").exists()

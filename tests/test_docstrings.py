@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import doctest
+import importlib
 import inspect
 import re
 from collections.abc import Iterator
@@ -18,10 +19,11 @@ import pytest
 from matplotlib import pyplot
 
 import rpim_opt as ro
-from tests.test_exchange import CONF, YAML_PLAIN
+from tests import ROOT
+from tests.robot.test_exchange import CONF, YAML_PLAIN
 
 mpl.use("agg")
-PACKAGE = Path(__file__).parents[1] / "rpim_opt"
+PACKAGE = ROOT / "rpim_opt"
 SHAPE = re.compile(r"\(((\w{1,10}|\d)( or \d|[+-]\d)?, ?)+((\w{1,10}|\d)( or \d|[+-]\d)?)?\)")
 """``(N, 3)``, ``(n,)``, ``(n+1, n+1)``, ``(1 or N, k, k)``."""
 ARRAY = re.compile(r"\bArray\b|ndarray")
@@ -35,7 +37,9 @@ URDF = """<robot name="arm"><link name="base"/><link name="arm"/><link name="tip
 FILES = {"targets.csv": TARGETS, "arm.urdf": URDF, "kinematics.yaml": YAML_PLAIN, "calibration.conf": CONF}
 """What a user has in the folder, to whom an example reads a file."""
 
-WITHOUT_EXAMPLE = {"on_cluster": "it needs a cluster, which test_streaming.py starts"}
+NAMESPACES = ("select", "constraints", "plot", "baselines")
+"""Modules that a user sees as ``ro.select``; what they list is public."""
+WITHOUT_EXAMPLE = {"problem.parts.on_cluster": "it needs a cluster, which test_streaming.py starts"}
 
 
 def documented(module: str, node: ast.AST, outer: str = "") -> Iterator[tuple[str, tuple[str, int]]]:
@@ -60,23 +64,40 @@ for file in sorted(PACKAGE.rglob("*.py")):
 EXAMPLES = [name for name, (text, _) in DOCS.items() if ">>> " in text]
 
 
-def members() -> Iterator[tuple[str, str, Any]]:
-    """Every public method and property of the public classes: the class's name, its own, and what it is."""
-    for name in ro.__all__:
-        value = getattr(ro, name)
-        if inspect.isclass(value):
-            own = {f.name for f in fields(value)} if is_dataclass(value) else set()
+def exported() -> Iterator[tuple[str, Any]]:
+    """Every public name: where it is defined, ``robot.mdh.Robot``, and what it is."""
+    for stub in sorted(PACKAGE.glob("*/__init__.pyi")):
+        folder = importlib.import_module(f"rpim_opt.{stub.parent.name}")
+        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                for alias in node.names:
+                    yield f"{stub.parent.name}.{node.module}.{alias.name}", getattr(folder, alias.name)
+    for name in NAMESPACES:
+        module = getattr(ro, name)
+        for member in module.__all__:
+            value = getattr(module, member)
+            yield f"{value.__module__.removeprefix('rpim_opt.')}.{member}", value
+
+
+def members(names: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Every public method and property of the public classes."""
+    for name, value in names.items():
+        if inspect.isclass(value) and not getattr(value, "_is_protocol", False):  # whose members others have
+            own = set(getattr(value, "_fields", ()))  # of a NamedTuple
+            if is_dataclass(value):
+                own = {field.name for field in fields(value)}
             for member, what in vars(value).items():
                 if not member.startswith("_") and member not in own:
-                    yield name, member, what
+                    yield f"{name}.{member}", what
 
 
-MEMBERS = {f"{name}.{member}": what for name, member, what in members()}
-PUBLIC = {**{name: getattr(ro, name) for name in ro.__all__}, **MEMBERS}
+NAMES = dict(exported())
+MEMBERS = dict(members(NAMES))
+PUBLIC = {**NAMES, **MEMBERS}
 
 
 def doc(name: str) -> str:
-    return DOCS.get(f"{ro._MODULE_OF[name.partition('.')[0]]}.{name}", ("", 0))[0]
+    return DOCS.get(name, ("", 0))[0]
 
 
 def entries(text: str) -> dict[str, str]:
@@ -97,7 +118,7 @@ def signature(what: Any) -> inspect.Signature | None:
 
 def test_there_is_something_to_check() -> None:
     assert len(MEMBERS) > 60
-    assert len(EXAMPLES) > len(ro.__all__)
+    assert len(EXAMPLES) > len(NAMES) > 100
 
 
 @pytest.mark.parametrize("name", PUBLIC)
@@ -108,6 +129,7 @@ def test_a_public_name_describes_parameters_and_shapes(name: str) -> None:
         return
     inherited, described = re.search(r"\b[Aa]rguments( and errors)? as for `", text), entries(text)
     parameters = [p for p in called.parameters.values() if p.name not in ("self", "cls") and p.kind != p.VAR_KEYWORD]
+    parameters = [p for p in parameters if not p.name.startswith("_")]
     for p in parameters:
         if not inherited and len(parameters) > 1:
             assert p.name in described, f"parameter {p.name} is not described"
@@ -120,12 +142,18 @@ def test_a_public_name_describes_parameters_and_shapes(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in PUBLIC if name not in WITHOUT_EXAMPLE])
 def test_a_public_name_has_an_example(name: str) -> None:
     """Its own, which uses it unless it is a class; that of a member may stand at its class or at another member."""
-    owner, _, member = name.partition(".")
-    shown = [name] if not member else [n for n in PUBLIC if n.partition(".")[0] == owner]
+    owner, _, last = name.rpartition(".")
+    shown = [name] if name in NAMES else [n for n in PUBLIC if n == owner or n.startswith(f"{owner}.")]
     sources = [e.source for n in shown for e in doctest.DocTestParser().get_examples(doc(n))]
     assert sources, "no example"
     if not inspect.isclass(PUBLIC[name]):
-        assert any(re.search(rf"\.{member or owner}\b", source) for source in sources), "no example that uses it"
+        assert any(re.search(rf"\.{last}\b", source) for source in sources), "no example that uses it"
+
+
+def test_the_top_level_has_nothing_of_its_own() -> None:
+    known = {id(value) for value in NAMES.values()}
+    for name in ro.__all__:
+        assert id(getattr(ro, name)) in known, f"{name} is in no folder's stub"
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests import ROOT
 from tests.test_cli import run
 from tests.test_commands import write_cell
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```(?:\n+```text\n(.*?)```)?", README, flags=re.DOTALL)
 PYTHON = [(code, printed) for language, code, printed in BLOCKS if language == "python"]
 SHELL = [code.splitlines() for language, code, _ in BLOCKS if language == "sh"]
@@ -56,7 +57,7 @@ def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: P
 def test_the_main_table_is_the_studys() -> None:
     from pyarrow import parquet
 
-    path = Path(__file__).parents[1] / "studies" / "results" / "peers" / "replicates.parquet"
+    path = ROOT / "studies" / "results" / "peers" / "replicates.parquet"
     rows = parquet.read_table(path).to_pylist()
     lines = re.findall(r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("##")[0].replace("**", ""), flags=re.MULTILINE)
     assert len(lines) == 5
@@ -72,3 +73,15 @@ def test_the_main_table_is_the_studys() -> None:
             assert stated[3] == (f"{largest:.0f} mm" if largest > 10 else f"{largest:.1f} mm"), name
         clean = [row["seconds"] for row in own if row["situation"] == "clean52"]
         assert float(stated[4]) == pytest.approx(np.median(clean), rel=0.05), name
+
+
+def test_every_name_that_texts_say_is_there() -> None:
+    import rpim_opt as ro
+
+    said = [README, *(path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies").glob("*.py")))]
+    names = {name for text in said for name in re.findall(r"\bro\.(\w+(?:\.\w+)?)", text)}
+    assert len(names) > 40
+    for name in sorted(names):
+        first, _, second = name.partition(".")
+        value = getattr(ro, first)
+        assert not second or hasattr(value, second), f"ro.{name}"

@@ -1,0 +1,86 @@
+"""The usual methods: their steps are those of their textbooks, and they stop when they are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt import baselines
+from tests.simulate import simulated
+
+PROBLEM, TRUTH = simulated(("a[234]", "d5", "theta[23]"), noise=1e-6, sigma=1e-6)
+SCALE = PROBLEM.parameters.free.scale
+
+
+def squares(x: np.ndarray) -> float:
+    return float(np.sum(PROBLEM.whitened_residual(x) ** 2))
+
+
+def test_one_linear_step_is_that_of_the_normal_equations() -> None:
+    m = PROBLEM.linearize(0 * SCALE)
+    found = baselines.linear_least_squares(PROBLEM)
+    assert found.x == pytest.approx(SCALE * np.linalg.solve(m.A.T @ m.A, m.A.T @ m.b), rel=1e-6)
+    assert (found.iterations, found.method) == (1, "linear least squares")
+    assert baselines.gauss_newton(PROBLEM, iterations=1).x == pytest.approx(found.x, rel=1e-6)
+
+
+def test_passes_are_counted_and_limited() -> None:
+    for most in (1, 2, 3):
+        assert baselines.gauss_newton(PROBLEM, iterations=most, tolerance=0.0).iterations == most
+        found = baselines.gradient_descent(PROBLEM, iterations=most)
+        assert (found.iterations, found.method) == (most, "gradient descent")
+    loose = baselines.gauss_newton(PROBLEM, tolerance=1e-1)
+    tight = baselines.gauss_newton(PROBLEM)
+    assert loose.iterations < tight.iterations < 20
+
+
+def test_a_step_of_descent_is_the_exact_one_of_the_linear_model() -> None:
+    m = PROBLEM.linearize(0 * SCALE)
+    for preconditioned in (False, True):
+        J = m.A / SCALE
+        unit = 1 / np.linalg.norm(J, axis=0) if preconditioned else np.ones(len(SCALE))
+        J = J * unit
+        g = -J.T @ m.b
+        want = -(g @ g) / np.sum((J @ g) ** 2) * g * unit
+        found = baselines.gradient_descent(PROBLEM, iterations=1, preconditioned=preconditioned)
+        assert found.x == pytest.approx(want, rel=1e-9)
+        assert found.method.endswith("preconditioned") == preconditioned
+
+
+def test_descent_falls_at_every_step() -> None:
+    falls = [squares(baselines.gradient_descent(PROBLEM, iterations=k, preconditioned=True).x) for k in range(5)]
+    assert (np.diff(falls) < 0).all()
+    assert falls[-1] < 0.1 * falls[0]
+
+
+def test_all_end_where_the_data_decide() -> None:
+    want = baselines.gauss_newton(PROBLEM).x
+    assert baselines.levenberg_marquardt(PROBLEM).x == pytest.approx(want, rel=1e-4, abs=1e-9)
+    one, more = baselines.extended_kalman_filter(PROBLEM), baselines.extended_kalman_filter(PROBLEM, passes=4)
+    assert (one.iterations, more.iterations) == (1, 4)
+    tikhonov = ro.calibrate(PROBLEM, ro.tikhonov, 1.0).x
+    assert more.x == pytest.approx(tikhonov, rel=1e-6, abs=1e-10)
+    two = baselines.extended_kalman_filter(PROBLEM, passes=2)
+    left = [float(np.linalg.norm((found.x - tikhonov) / SCALE)) for found in (one, two, more)]
+    m = PROBLEM.linearize(0 * SCALE)
+    linear = np.linalg.solve(m.A.T @ m.A + np.eye(len(SCALE)), m.A.T @ m.b)
+    assert left[0] < 0.5 * np.linalg.norm(linear - tikhonov / SCALE)  # linearized anew at every configuration
+    assert left[1] < 0.1 * left[0]
+
+
+def test_a_kalman_filter_of_linear_data_is_ridge_regression() -> None:
+    """One pass over data that are almost linear: the order does not matter, the prior is one scale."""
+    near, _ = simulated(("a[234]", "d5"), noise=1e-6, sigma=1e-4, size=0.01)
+    m = near.linearize(np.zeros(4))
+    want = np.linalg.solve(m.A.T @ m.A + np.eye(4), m.A.T @ m.b) * near.parameters.free.scale
+    assert baselines.extended_kalman_filter(near).x == pytest.approx(want, rel=1e-2, abs=1e-8)
+
+
+def test_too_few_equations_are_said() -> None:
+    few, _ = simulated(configurations=3)
+    with pytest.raises(ro.InputError, match="fewer equations than parameters"):
+        baselines.levenberg_marquardt(few)
+    just, truth = simulated(("a2", "theta1", "d5"), configurations=1, sigma=1e-6)
+    met = just.errors(baselines.levenberg_marquardt(just).x)
+    assert met.max() < 1e-3 * just.errors(0 * truth).max()

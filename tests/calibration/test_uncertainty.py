@@ -1,0 +1,72 @@
+"""Uncertainty: intervals cover what they promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from tests.simulate import simulated
+
+Q = np.random.default_rng(77).uniform(-2, 2, (50, 6))
+
+
+def covered(seeds: range) -> np.ndarray:
+    """Share of predicted coordinates inside their 95 % intervals, calibration by calibration."""
+    hits = []
+    for seed in seeds:
+        problem, truth = simulated(noise=5e-5, seed=seed, configurations=25)
+        found = ro.calibration.Uncertainty(ro.calibrate(problem, ro.tikhonov, ro.reml)).predict(Q)
+        want = problem.on(ro.Dataset.of(Q, np.zeros((50, 3)), 1.0)).modelled(truth)[0]
+        hits.append(np.mean(np.abs(found.position - want) <= found.expanded))
+    return np.array(hits)
+
+
+def test_intervals_of_predicted_positions_cover() -> None:
+    # 60 calibrations: the share's standard error is about 0.006
+    assert 0.93 < covered(range(60)).mean() < 0.97
+
+
+@pytest.mark.slow
+def test_intervals_of_predicted_positions_cover_in_a_thousand_calibrations() -> None:
+    assert 0.93 < covered(range(1000)).mean() < 0.97
+
+
+def test_noise_and_prior_add_up_and_monte_carlo_agrees() -> None:
+    problem, _ = simulated(noise=5e-5, seed=3, configurations=25)
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    u = ro.calibration.Uncertainty(result)
+    scale = np.outer(problem.parameters.free.scale, problem.parameters.free.scale)
+    assert np.abs((u.noise + u.prior - u.total) / scale).max() < 1e-12
+    drawn = ro.calibration.monte_carlo(result, 1500)
+    # the standard error of a standard deviation from 1500 draws is 1.8 %
+    assert drawn.std(axis=0) / np.sqrt(np.diag(u.noise)) == pytest.approx(np.ones(34), abs=0.08)
+    assert np.abs(drawn.mean(axis=0) - result.x).max() < 5 * np.sqrt(np.diag(u.total)).max()
+
+
+def test_the_noise_is_compared_with_the_declared() -> None:
+    for factor, word in ((1.0, "as declared"), (5.0, "rows are wrong"), (0.2, "too large")):
+        problem, _ = simulated(noise=factor * 5e-5, seed=1)
+        test = ro.calibration.Uncertainty(ro.calibrate(problem, ro.tikhonov, ro.reml)).noise_test()
+        assert test.ratio == pytest.approx(factor, rel=0.25)
+        assert word in test.verdict
+
+
+def test_what_active_bounds_do_is_said() -> None:
+    instance = ro.load("constrained", "wrong_tolerance")
+    u = ro.calibration.Uncertainty(ro.calibrate(instance.problem, instance.formulation, instance.weight))
+    assert "a5" in u.at_bound
+    assert "a5 *" in u.budget()
+    assert "held by a bound" in u.budget()
+    with pytest.raises(ro.InputError, match="uncertainty: found formulation 'lasso'"):
+        ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.lasso, 1.0))
+    with pytest.raises(ro.InputError, match="confidence: found 95"):
+        ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.tikhonov, 1.0), confidence=95)
+
+
+def test_a_robust_fit_is_as_certain_as_one_of_the_rows_it_trusts() -> None:
+    instance = ro.load("blunders")
+    robust = ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.robust, 1.0))
+    clean = ro.calibration.Uncertainty(ro.calibrate(robust.result.without_flagged().problem, ro.tikhonov, 1.0))
+    q = instance.problem.data.q[:20]
+    assert robust.predict(q).expanded == pytest.approx(clean.predict(q).expanded, rel=0.25)

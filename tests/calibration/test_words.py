@@ -1,0 +1,112 @@
+"""A calibration in words: what is named, in which unit, and how much of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.calibration import words
+from rpim_opt.calibration.certificate import Certificate
+from rpim_opt.calibration.diagnosis import Flag, Held
+from rpim_opt.calibration.loop import _message
+from tests.calibration.test_loop import state
+
+RESULT = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1e-3)
+FREE = RESULT.problem.parameters.free
+
+
+def test_rows_are_in_the_parameters_units() -> None:
+    values = FREE.values(RESULT.x)
+    rows = RESULT.parameter_rows()
+    assert [row["name"] for row in rows] == list(FREE.names)
+    for i, row in enumerate(rows):
+        si = {"mm": 1e-3, "mrad": 1e-3, "deg": np.pi / 180}[row["unit"]]
+        assert row["nominal"] == pytest.approx(FREE.nominal[i] / si, rel=1e-12, abs=1e-12)
+        assert row["identified"] == pytest.approx(values[i] / si, rel=1e-12, abs=1e-12)
+        assert row["deviation"] == pytest.approx(row["identified"] - row["nominal"], abs=1e-9)
+        variance = RESULT.covariance[i, i]
+        if np.isfinite(variance):
+            assert row["std"] == pytest.approx(np.sqrt(variance) / si, rel=1e-9)
+        else:
+            assert row["std"] is None
+
+
+def test_a_parameter_without_covariance_has_a_dash() -> None:
+    lasso = ro.calibrate(ro.load("paper_arm").problem, ro.lasso, 1.0)
+    assert all(row["std"] is None for row in lasso.parameter_rows())
+    assert lasso.parameter_table().splitlines()[-1].rstrip().endswith("-")
+    assert np.isinf(words.standard_deviations(lasso)).all()
+
+
+def flagged(count: int, squared_loss: bool = False) -> list[str]:
+    flags = tuple(Flag(f"r{k}", 10.4 + k, 1.234) for k in range(count))
+    held = tuple(Held("a2", 0.0005, 1.0, 0.05) for _ in range(count))
+    stand_in: Any = SimpleNamespace(
+        flagged=flags,
+        held=held,
+        squared_loss=squared_loss,
+        problem=RESULT.problem,
+        formulation=ro.tikhonov,
+        message="Done.",
+    )
+    return words.remarks(stand_in)
+
+
+def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
+    assert flagged(0) == ["Done."]
+    eight = flagged(8)[0]
+    assert eight.startswith("Distrusted rows: r0 (10 sigmas, 1.23 mm), ")
+    assert "r7 (17 sigmas" in eight
+    assert "more" not in eight
+    eleven = flagged(11)
+    assert eleven[0].endswith("and 3 more.")
+    assert "r8" not in eleven[0]
+    bounds = [line for line in eleven if "is held at" in line]
+    assert len(bounds) == 5
+    assert bounds[0] == (
+        "a2 is held at +0.5 mm: loosening its tolerance by 0.05 mm would lower the whitened RMS by 0.05."
+    )
+    assert not any("A squared loss lets" in line for line in eleven)
+    assert any("A squared loss lets" in line for line in flagged(1, True))
+
+
+def test_what_a_file_could_not_hold_is_said() -> None:
+    stand_in: Any = SimpleNamespace(
+        flagged=(), held=(), formulation=replace(ro.tikhonov, solvable=False), message="Done."
+    )
+    assert "cannot be solved again" in words.remarks(stand_in)[0]
+
+
+def test_errors_before_and_after_are_in_millimetres() -> None:
+    before, after = 1e3 * RESULT.nominal_errors().mean(), 1e3 * RESULT.errors().mean()
+    assert f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after." in str(RESULT)
+
+
+def test_a_weight_is_said_with_where_it_came_from() -> None:
+    assert words.weight_sentence(RESULT) == "Weight 0.001 (given), formulation 'Tikhonov'."
+    free = ro.calibrate(ro.load("position").problem, ro.least_squares)
+    assert words.weight_sentence(free) == "Formulation 'least squares' has no penalty and needs no weight."
+    assert (free.selector, free.penalty_weight) == ("none", 0.0)
+    assert (RESULT.selector, RESULT.penalty_weight) == ("given", 1e-3)
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, "0 passes"), (1, "1 pass"), (2, "2 passes")])
+def test_passes_are_counted(count: int, said: str) -> None:
+    evidence = Certificate(None, 0.0, 0.0, 0.0)
+    before = state(history=(None,) * count, outcome="rest")
+    assert _message(before, evidence, True, 500, False) == f"Converged after {said}."
+    far = _message(before, evidence, True, 500, True)
+    assert far.startswith(f"Converged after {said}. Frames were stated far from")
+    noted = replace(before, choice=replace(before.choice, note="It alternates."))
+    assert _message(noted, evidence, True, 500, False) == f"Converged after {said}. It alternates."
+    stuck = _message(replace(before, outcome="stuck"), evidence, False, 500, False)
+    assert "no step lowers the nonlinear objective" in stuck
+    doubted = _message(before, Certificate(None, 0.0, 0.0, 0.5), False, 500, False)
+    assert "still promises 0.5 of the objective" in doubted
+    ended = _message(replace(before, outcome="", history=()), evidence, False, 7, False)
+    assert ended == "Not converged: 7 passes were not enough; give more (max_iterations)."

@@ -1,0 +1,167 @@
+"""The estimators against certified values, selectors against brute force, baselines against the convex programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt import baselines
+from rpim_opt.convex.select import SELECTORS
+from rpim_opt.convex.select_held_out import held_out_error
+from rpim_opt.convex.selection import weight_grid
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.robot.parameters import Parameters
+from tests import SHARED
+from tests.nist import sets
+from tests.simulate import simulated
+
+
+def model_of(A: np.ndarray, b: np.ndarray, group: np.ndarray | None = None) -> LinearModel:
+    n = A.shape[1]
+    names = tuple(f"a{i}" for i in range(n))
+    p = Parameters(names, ("length",) * n, np.zeros(n), np.ones(n), np.full(n, np.inf), np.ones(n, dtype=bool))
+    return LinearModel(A, b, np.arange(len(b)) if group is None else group, p)
+
+
+@pytest.mark.parametrize("name", sets())
+def test_nists_certified_coefficients(name: str) -> None:
+    X, y, coefficients = sets()[name]
+    scale = np.linalg.norm(X, axis=0)
+    program = ro.convex.pose(ro.least_squares, model_of(X / scale, y))
+    assert program.model.rank == X.shape[1]
+    certified = scale * coefficients
+    s = np.linalg.svd(X / scale, compute_uv=False)
+    condition = s[0] / s[-1]
+    left = np.linalg.norm(X @ coefficients - y)
+    # what one rounding of the data changes (Wedin's bound): QR on any processor stays at a fifth of it or below
+    rounding = np.finfo(float).eps * condition * (np.linalg.norm(certified) + condition * left / s[0])
+    for z in (program.solve().z, program.path([0.0])[0].z):
+        assert np.abs(z - certified).max() < rounding
+
+
+def tikhonov_program(noise: float = 5e-5, seed: int = 0, configurations: int = 40):
+    problem, _ = simulated(noise=noise, seed=seed, configurations=configurations)
+    return ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+
+
+def test_leaving_configurations_out_in_closed_form_is_leaving_them_out() -> None:
+    program = tikhonov_program()
+    chosen = ro.leave_one_out(program)
+    some = chosen.weights[::40]
+    assert np.sqrt(chosen.score[::40] / len(program.model.b)) == pytest.approx(held_out_error(program, some), rel=1e-6)
+
+
+def test_gcv_is_its_formula_and_close_to_leaving_out() -> None:
+    program = tikhonov_program()
+    A, b, m = program.model.A, program.model.b, len(program.model.b)
+    chosen = ro.gcv(program)
+
+    def score(w: float) -> float:
+        H = A @ np.linalg.solve(A.T @ A + w * np.eye(A.shape[1]), A.T)
+        return float(np.sum((b - H @ b) ** 2) / (m - np.trace(H)) ** 2)
+
+    for k in (50, 120, 180):
+        assert chosen.score[k] == pytest.approx(score(chosen.weights[k]), rel=1e-6)
+    assert score(chosen.weight) <= min(score(chosen.weight * f) for f in (0.9, 1.1))
+
+
+def test_the_discrepancy_is_the_declared_noise() -> None:
+    program = tikhonov_program(noise=2e-4)  # four times as declared: no weight fits that well
+    assert not ro.discrepancy(program).interior
+    assert "too small" in ro.discrepancy(program).note
+    program = tikhonov_program(noise=4.9e-5, seed=4)
+    chosen = ro.discrepancy(program)
+    assert chosen.interior
+    e, s = program.path([chosen.weight])[0], program.model.svd[1]
+    dof = np.sum(s**2 / (s**2 + chosen.weight))
+    assert e.loss == pytest.approx(1.1**2 * (len(program.model.b) - dof), rel=1e-3)
+
+
+def test_the_corner_without_a_grid_is_the_corner() -> None:
+    model = model_of(*ill_posed())
+    program = ro.convex.pose(ro.tikhonov, model)
+    grid, search = ro.l_curve(program), ro.corner(program)
+    assert grid.interior
+    assert search.interior
+    assert abs(np.log10(search.weight / grid.weight)) < 0.5
+    assert len(search.weights) < 60
+
+
+def ill_posed(n: int = 32, noise: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Shaw's image reconstruction (Shaw 1972, J. Math. Anal. Appl. 37:83), as in Hansen's Regularization Tools."""
+    t = (np.arange(n) + 0.5) * np.pi / n - np.pi / 2
+    u = np.pi * (np.sin(t)[:, None] + np.sin(t)[None, :])
+    A = (np.cos(t)[:, None] + np.cos(t)[None, :]) ** 2 * np.sinc(u / np.pi) ** 2 * np.pi / n
+    x = 2 * np.exp(-6 * (t - 0.8) ** 2) + np.exp(-2 * (t + 0.5) ** 2)
+    b = A @ x
+    return A / noise, (b + noise * np.random.default_rng(1).normal(size=n)) / noise
+
+
+@pytest.mark.parametrize("name", [n for n in SELECTORS if n not in ("robust_gcv", "ncp", "two_step")])
+def test_every_selector_comes_near_the_best_weight_on_a_robot(name: str) -> None:
+    ratios = []
+    for seed in range(6):
+        problem, truth = simulated(noise=5e-5, seed=seed, configurations=25)
+        program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(truth))))
+        q = np.random.default_rng(99).uniform(-2, 2, (60, 6))
+        there = problem.on(ro.Dataset.of(q, np.zeros((60, 3)), 1.0))
+        want, scale = there.modelled(truth)[0], problem.parameters.free.scale
+
+        def error(weight: float, program=program, there=there, want=want, scale=scale) -> float:
+            z = program.path([weight])[0].z
+            return float(np.linalg.norm(there.modelled(scale * z)[0] - want))
+
+        best = min(error(w) for w in weight_grid(program)[::8])
+        ratios.append(error(SELECTORS[name](program).weight) / best)
+    assert np.median(ratios) < {"quasi_optimality": 30, "discrepancy": 3.5}.get(name, 1.6)
+
+
+def test_selectors_work_on_robust_and_constrained_formulations() -> None:
+    instance = ro.load("constrained", "everything")
+    program = ro.convex.pose(
+        instance.formulation, instance.problem.linearize(np.zeros(len(instance.problem.parameters.free)))
+    )
+    for rule in (ro.reml, ro.gcv):
+        assert 0.05 < rule(program).weight < 100
+    blunders = ro.load("blunders").problem
+    robust = ro.convex.pose(ro.robust, blunders.linearize(np.zeros(len(blunders.parameters.free))))
+    assert 0.05 < ro.gcv(robust).weight < 100
+    assert ro.k_fold(robust, folds=5).weight < 1e4
+    with pytest.raises(ro.InputError, match="selector gcv: found formulation 'lasso'"):
+        ro.gcv(ro.convex.pose(ro.lasso, robust.model))
+    with pytest.raises(ro.InputError, match=r"robust_gcv: found .* equations for .* directions"):
+        ro.robust_gcv(tikhonov_program(configurations=12))
+
+
+def test_selectors_that_disagree_are_said() -> None:
+
+    from rpim_opt.convex.select import disagreement
+
+    assert disagreement(tikhonov_program()) == ""
+    real = SHARED / "data" / "wam_jacobi"
+    if real.is_dir():
+        instance = ro.load(real)
+        result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+        assert "selectors disagree by" in result.weight_sentence()
+
+
+def test_baselines_agree_where_the_data_decide() -> None:
+    problem, _ = simulated(("a[234]", "theta[234]", "d5"), noise=5e-5, configurations=20)
+    scale = problem.parameters.free.scale
+    want = ro.calibrate(problem, ro.least_squares).x / scale
+    for method in (baselines.gauss_newton, baselines.levenberg_marquardt):
+        assert np.abs(method(problem).x / scale - want).max() < 1e-8
+    descent = baselines.gradient_descent(problem, 5000, preconditioned=True)
+    assert np.abs(descent.x / scale - want).max() < 1e-4
+    raw = baselines.gradient_descent(problem, descent.iterations)
+    assert problem.errors(raw.x).mean() >= problem.errors(descent.x).mean() - 1e-12
+    assert np.abs(baselines.linear_least_squares(problem).x / scale - want).max() < 0.05
+
+
+def test_an_iterated_kalman_filter_is_tikhonov_with_weight_one() -> None:
+    problem, _ = simulated(noise=5e-5)
+    scale = problem.parameters.free.scale
+    want = ro.calibrate(problem, ro.tikhonov, 1.0).x
+    assert np.abs((baselines.extended_kalman_filter(problem, 8).x - want) / scale).max() < 1e-8
+    assert np.abs((baselines.extended_kalman_filter(problem).x - want) / scale).max() < 0.5

@@ -1,0 +1,196 @@
+"""A program's values, slopes and solutions against the formulas and the CVXPY problem that it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex.objective import Damping
+from rpim_opt.convex.program import Estimate
+from tests.convex.test_formulation import model
+
+MODEL = model(condition=30.0).scaled(np.full(30, 3.0))
+N = 12
+Z = np.random.default_rng(2).normal(size=N)
+
+
+def box(half: float) -> ro.constraints.Box:
+    return ro.constraints.Box("box", lambda p: (np.full(len(p), -half), np.full(len(p), half)))
+
+
+DENSE = np.random.default_rng(4).normal(size=(N, N))
+FORMULATIONS = {
+    "tikhonov": ro.tikhonov,
+    "least squares": ro.least_squares,
+    "robust": ro.robust,
+    "norms": ro.sum_of_norms,
+    "lasso": ro.lasso,
+    "groups": ro.group_lasso,
+    "huber": ro.Formulation("huber", loss=ro.huber(1.0), penalty=cp.sum_squares),
+    "dense": ro.Formulation("dense", penalty=lambda z: cp.sum_squares(DENSE @ z - 1.0)),
+    "shifted": ro.Formulation("shifted", loss=lambda r: 2 * cp.sum_squares(r - 0.5) + 3.0, penalty=cp.sum_squares),
+    "weighed": ro.Formulation("weighed", loss=lambda v: 2 * cp.sum_squares(v), loss_over="configuration"),
+}
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+def test_a_gradient_is_the_slope_of_the_objective(name: str, weight: float) -> None:
+    program = ro.convex.pose(FORMULATIONS[name], MODEL)
+    h = 1e-6
+    want = [(program.objective(Z + h * e, weight) - program.objective(Z - h * e, weight)) / (2 * h) for e in np.eye(N)]
+    assert program.gradient(Z, weight) == pytest.approx(np.array(want), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+def test_a_value_is_that_of_the_written_problem(name: str, weight: float) -> None:
+    program = ro.convex.pose(FORMULATIONS[name], replace(MODEL, offset=2.5))
+    written = program.problem(weight)
+    [z] = [v for v in written.variables() if v.name() == "z"]
+    objective = cp.Problem(written.objective, [*written.constraints, z == Z]).solve(solver=cp.CLARABEL)
+    assert program.objective(Z, weight) == pytest.approx(objective, rel=1e-6)
+    loss, penalty = program.value(Z)
+    if weight == 0:
+        assert program.objective(Z, weight) == loss
+    else:
+        assert program.objective(Z, weight) == pytest.approx(loss + weight * penalty, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", FORMULATIONS)
+@pytest.mark.parametrize("constraints", [(), (box(0.3),), (ro.in_ball(0.5, "*"),)])
+@pytest.mark.parametrize("damped", [False, True])
+def test_a_solution_is_that_of_the_written_problem(name: str, constraints: tuple[Any, ...], damped: bool) -> None:
+    formulation = replace(FORMULATIONS[name], constraints=constraints)
+    program = ro.convex.pose(formulation, MODEL)
+    damping = Damping(np.linspace(-0.2, 0.2, N), np.geomspace(0.5, 3.0, N)) if damped else None
+    ours = program.solve(0.7, damping=damping)
+    theirs = program.solve(0.7, damping=damping, solver="CLARABEL")
+
+    def objective(z: np.ndarray) -> float:
+        value = program.objective(z, 0.7)
+        return value + float(np.sum((damping.size * (z - damping.centre)) ** 2)) if damping else value
+
+    assert objective(ours.z) == pytest.approx(objective(theirs.z), rel=1e-6)
+    assert ours.z == pytest.approx(theirs.z, abs=2e-3)
+    assert ours.loss + ours.weight * ours.penalty == pytest.approx(ours.objective, rel=1e-12)
+    assert program.violation(ours.z) <= 1e-7
+    for mine, other in zip(ours.duals, theirs.duals, strict=True):
+        assert mine == pytest.approx(other, rel=2e-2, abs=2e-2 * max(1.0, np.abs(mine).max()))
+    assert ours.seconds > 0
+    assert (ours.iterations == 0) == (program.quadratic and program.box is not None)  # a formula, or an active set
+
+
+def test_a_written_problem_is_parametrized_with_parameters_of_the_users_own_too() -> None:
+    price, radius = cp.Parameter(nonneg=True, value=2.0), cp.Parameter(nonneg=True, value=0.5)
+    mine = ro.Formulation(
+        "mine", penalty=lambda z: price * cp.norm1(z), constraints=(lambda z, p: cp.norm(z) <= radius,)
+    )
+    program = ro.convex.pose(mine, MODEL)
+    written = program.problem(0.7)
+    assert written.is_dcp(dpp=True)
+    written.solve(solver=cp.CLARABEL)
+    assert written.value == pytest.approx(program.solve(0.7).objective, rel=1e-6)
+    price.value, radius.value = 0.1, 5.0
+    written.param_dict["weight"].value = 3.0
+    written.solve(solver=cp.CLARABEL)
+    assert written.value == pytest.approx(ro.convex.pose(mine, MODEL).solve(3.0).objective, rel=1e-6)
+
+
+def test_a_solvers_steps_are_told() -> None:
+    program = ro.convex.pose(ro.lasso, MODEL)
+    assert program.solve(0.7).iterations > 0
+    assert program.solve(0.7, solver="CLARABEL").iterations > 0
+    assert program.solve(0.7, settings={"max_iter": 100}).iterations > 0
+
+
+def test_an_estimates_objective_leaves_out_a_penalty_without_weight() -> None:
+    assert Estimate(Z, 0.0, 3.0, float("inf")).objective == 3.0
+    formula = Estimate(Z, 2.0, 3.0, 4.0)
+    assert formula.objective == 11.0
+    assert (formula.status, formula.iterations, formula.seconds, formula.duals) == ("optimal", 0, 0.0, ())
+
+
+def test_a_largest_norm_is_missed_relative_to_itself() -> None:
+    norms = ro.convex.pose(ro.tikhonov, MODEL).norms(Z)
+    worst = float(norms.max())
+    assert norms == pytest.approx(np.linalg.norm((MODEL.A @ Z - MODEL.b).reshape(-1, 3), axis=1), rel=1e-12)
+    for share in (0.25, 0.8, 1.25):
+        program = ro.convex.pose(replace(ro.tikhonov, largest=share * worst), MODEL)
+        assert program.excess(Z) == pytest.approx(max(0.0, 1 / share - 1), rel=1e-12)
+        assert program.violation(Z) == pytest.approx(program.excess(Z), rel=1e-12)
+    assert ro.convex.pose(ro.tikhonov, MODEL).excess(Z) == 0.0
+
+
+def test_a_point_outside_a_domain_is_moved_inside() -> None:
+    entropy = ro.Formulation("entropy", penalty=lambda z: cp.sum(cp.kl_div(z + 1, 1)))
+    program = ro.convex.pose(entropy, MODEL)
+    edge = np.full(N, -1.0)
+    outside = edge - 1e-10
+    assert not np.isfinite(program.objective(outside, 1.0))
+    for distance in (3e-10, 5e-8, 5e-6, 5e-4):
+        outside = edge - distance
+        inside = program.inside(outside, Z, 1.0)
+        assert np.isfinite(program.objective(inside, 1.0))
+        assert np.abs(inside - outside).max() < 200 * distance
+    assert program.inside(0.5 * edge, Z, 1.0) is not None
+    assert (program.inside(0.5 * edge, Z, 1.0) == 0.5 * edge).all()
+    far = np.full(N, -30.0)
+    assert (program.inside(far, far, 1.0) == far).all()
+
+
+def test_multipliers_go_to_the_box_that_states_the_bound() -> None:
+    tight, wide = box(0.1), box(0.3)
+    both = ro.Formulation("both", penalty=cp.sum_squares, constraints=(wide, tight))
+    alone = ro.Formulation("alone", penalty=cp.sum_squares, constraints=(tight,))
+    of_wide, of_tight = ro.convex.pose(both, MODEL).solve(0.7).duals
+    [want] = ro.convex.pose(alone, MODEL).solve(0.7).duals
+    assert np.abs(of_wide).max() == 0.0
+    assert of_tight == pytest.approx(want, rel=1e-9)
+    twice = ro.Formulation("twice", penalty=cp.sum_squares, constraints=(tight, tight))
+    first, second = ro.convex.pose(twice, MODEL).solve(0.7).duals
+    assert first == pytest.approx(want, rel=1e-9)
+    assert np.abs(second).max() == 0.0
+
+
+def test_a_robust_path_is_its_solutions() -> None:
+    program = ro.convex.pose(ro.robust, MODEL)
+    weights = [0.1, 1.0]
+    for found, weight in zip(program.path(weights), weights, strict=True):
+        assert found.z == pytest.approx(program.solve(weight).z, abs=1e-9)
+        assert found.weight == weight
+
+
+def test_squares_of_a_loss_have_its_value() -> None:
+    for name in ("tikhonov", "shifted", "weighed"):
+        program = ro.convex.pose(FORMULATIONS[name], replace(MODEL, offset=2.5))
+        squared = program.squared
+        value = np.sum((squared.A @ Z - squared.b) ** 2) + squared.offset
+        assert value == pytest.approx(program.value(Z)[0], rel=1e-9)
+    with pytest.raises(ro.InputError, match="a loss that is no square"):
+        _ = ro.convex.pose(ro.robust, MODEL).squared
+
+
+def test_what_mixes_configurations_is_one() -> None:
+    mixed = ro.Formulation("mixed", loss=lambda r: cp.sum_squares(np.tri(30) @ r), penalty=cp.sum_squares)
+    assert set(ro.convex.pose(mixed, MODEL).squared.group.tolist()) == {0}
+    assert (ro.convex.pose(FORMULATIONS["shifted"], MODEL).squared.group == MODEL.group).all()
+
+
+def test_what_is_trusted_is_told_by_the_norms() -> None:
+    b = MODEL.b.copy()
+    b[4] += 1e4
+    program = ro.convex.pose(ro.robust, MODEL.with_values(b))
+    z = program.solve(1.0).z
+    trusted = program.trusted(z)
+    assert set(MODEL.group.tolist()) - set(trusted.group.tolist()) == {1}
+    assert ro.convex.pose(ro.tikhonov, MODEL).trust(Z) is None
+    by_equation = ro.convex.pose(FORMULATIONS["huber"], MODEL.with_values(b))
+    trust = by_equation.trust(by_equation.solve(1.0).z)
+    assert trust is not None
+    assert 0 < trust.factor <= 1

@@ -1,0 +1,141 @@
+"""Selectors: their formulas, and that they say when there is nothing to find."""
+
+from __future__ import annotations
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex.select_curve import _curvature, menger
+from rpim_opt.convex.select_held_out import held_out_error
+from rpim_opt.convex.selection import weight_grid
+from tests.convex.test_formulation import model
+from tests.simulate import simulated
+
+
+def test_curvature_is_that_of_the_curve() -> None:
+    program = ro.convex.pose(ro.tikhonov, model())
+    t = np.linspace(-8, 0, 4001)
+    u, v = 0.5 * np.log([[e.loss, e.penalty] for e in program.path(np.exp(t))]).T
+    u1, v1 = np.gradient(u, t), np.gradient(v, t)
+    kappa = (u1 * np.gradient(v1, t) - v1 * np.gradient(u1, t)) / (u1**2 + v1**2) ** 1.5
+    inner = slice(10, -10)
+    assert _curvature(program, np.exp(t))[inner] == pytest.approx(kappa[inner], rel=2e-3, abs=1e-4)
+
+
+def test_menger_curvature_of_a_circle() -> None:
+    t = np.linspace(0, 2, 50)
+    points = 3 * np.column_stack([np.cos(t), np.sin(t)])
+    assert menger(points)[1:-1] == pytest.approx(1 / 3, rel=1e-12)
+    assert menger(points[::-1])[1:-1] == pytest.approx(-1 / 3, rel=1e-12)
+
+
+def test_the_corner_is_a_maximum_inside_the_grid() -> None:
+    program = ro.convex.pose(ro.tikhonov, model(condition=1e5))
+    corner = ro.l_curve(program)
+    assert corner.interior
+    around = _curvature(program, corner.weight * np.array([0.99, 1.0, 1.01]))
+    assert around[1] > max(around[0], around[2])
+    assert around[1] >= corner.score.max()
+
+
+def test_analytic_and_three_point_corners_agree() -> None:
+    """A constraint that is never active makes the path numerical, not different."""
+    loose = ro.Formulation("loose", penalty=cp.sum_squares, constraints=(lambda z, p: cp.abs(z) <= 1e6,))
+    m = model(condition=1e5)
+    analytic, numeric = ro.l_curve(ro.convex.pose(ro.tikhonov, m)), ro.l_curve(ro.convex.pose(loose, m))
+    step = numeric.weights[1] / numeric.weights[0]
+    assert 1 / step**2 < analytic.weight / numeric.weight < step**2
+
+
+def test_no_corner_is_said() -> None:
+    """Equal singular values and exact data: (u, v) bends the other way at every weight."""
+    m = model(condition=1.0)
+    exact = ro.problem.LinearModel(m.A, m.A @ np.ones(12), m.group, m.parameters)
+    choice = ro.l_curve(ro.convex.pose(ro.tikhonov, exact))
+    assert not choice.interior
+    assert "no corner" in choice.note
+    assert choice.weight == choice.weights[0]
+
+
+def test_the_grid_follows_the_units_of_the_data() -> None:
+    m = model()
+    program, tenfold = (
+        ro.convex.pose(ro.tikhonov, ro.problem.LinearModel(f * m.A, f * m.b, m.group, m.parameters)) for f in (1, 10)
+    )
+    assert weight_grid(tenfold) == pytest.approx(100 * weight_grid(program))
+    assert ro.l_curve(tenfold).weight == pytest.approx(100 * ro.l_curve(program).weight, rel=1e-4)
+
+
+def test_held_out_error_is_that_of_fits_without_the_configuration() -> None:
+    m, weight = model(), 1e-3
+    total = 0.0
+    for group in range(10):
+        seen, out = m.group != group, m.group == group
+        A, b = m.A[seen], m.b[seen]
+        z = np.linalg.solve(A.T @ A + weight * np.eye(12), A.T @ b)
+        total += np.sum((m.A[out] @ z - m.b[out]) ** 2)
+    expected = np.sqrt(total / len(m.b))
+    assert held_out_error(ro.convex.pose(ro.tikhonov, m), np.array([weight]))[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:
+    program = ro.convex.pose(ro.tikhonov, model(condition=1e5))
+    choice = ro.two_step(program)
+    assert choice.weight < 1.7 * ro.l_curve(program).weight
+    assert len(choice.score) == 10
+    assert choice.weight == choice.weights[np.argmin(choice.score)]
+
+
+def test_a_selector_needs_a_penalty() -> None:
+    with pytest.raises(ro.InputError, match="without penalty"):
+        ro.l_curve(ro.convex.pose(ro.least_squares, model()))
+
+
+def test_reml_is_the_restricted_likelihood_of_the_normal_model() -> None:
+    problem, _ = simulated(noise=5e-5)
+    program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+    model, frames = program.model, program.model.parameters.of_frames
+    F, A, b, m = model.A[:, frames], model.A[:, ~frames], model.b, len(model.b)
+
+    def minus_two_log_likelihood(weight: float) -> float:
+        # Harville 1974: ln|V| + ln|F' V^-1 F| + (m - f) ln(b' P b), with V = A A' / weight + 1
+        V = A @ A.T / weight + np.eye(m)
+        inverse = np.linalg.inv(V)
+        G = F.T @ inverse @ F
+        P = inverse - inverse @ F @ np.linalg.solve(G, F.T @ inverse)
+        return np.linalg.slogdet(V)[1] + np.linalg.slogdet(G)[1] + (m - F.shape[1]) * np.log(b @ P @ b)
+
+    chosen = ro.reml(program)
+    assert chosen.interior
+    tried = chosen.weights[[60, 90, 120, 150]]
+    want = np.array([minus_two_log_likelihood(w) for w in tried])
+    got = np.array([chosen.score[list(chosen.weights).index(w)] for w in tried])
+    assert got - got[0] == pytest.approx(want - want[0], rel=1e-6, abs=1e-5)
+    around = [minus_two_log_likelihood(chosen.weight * f) for f in (0.97, 1.0, 1.03)]
+    assert around[1] == min(around)
+
+
+def test_reml_finds_the_ratio_of_noise_and_deviations() -> None:
+    logs = []
+    for seed in range(30):
+        problem, _ = simulated(noise=5e-4, sigma=5e-5, seed=seed)  # ten times the declared noise
+        program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+        logs.append(np.log10(ro.reml(program).weight))
+    # deviations are of the size of the scales: the weight is the noise's variance over the declared, 100
+    assert np.mean(logs) == pytest.approx(2.0, abs=0.15)
+
+
+def test_reml_says_what_it_cannot_choose() -> None:
+    problem, _ = simulated(noise=5e-5)
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    with pytest.raises(ro.InputError, match="selector reml: found formulation 'lasso', accepted: a quadratic penalty"):
+        ro.reml(ro.convex.pose(ro.lasso, model))
+    few, _ = simulated(("a[234]", "d5"), noise=5e-5, configurations=12)
+    with pytest.raises(ro.InputError, match="found a loss that rests on a few equations, accepted: another selector"):
+        ro.reml(ro.convex.pose(ro.minimax, few.linearize(np.zeros(4))))
+    sphere = ro.load("sphere").problem
+    chosen = ro.reml(ro.convex.pose(ro.tikhonov, sphere.linearize(np.zeros(len(sphere.parameters.free)))))
+    assert (chosen.weight, chosen.interior) == (1.0, False)
+    assert "taken at their word" in chosen.note

@@ -1,0 +1,78 @@
+"""Tables and parameters: units, standard deviations, scales and tolerances reach the equations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from tests.simulate import ARM
+
+ARM2 = ro.robot.Robot("two joints", ARM.mdh[:2], ("revolute", "prismatic"))
+NOISE = {"position_mm": 0.03}
+
+
+def read(tmp_path: Path, text: str, noise: dict[str, float] | None = None) -> ro.Dataset:
+    path = tmp_path / "data.csv"
+    path.write_text(text, encoding="utf-8")
+    return ro.read_data(path, ARM2, NOISE if noise is None else noise)
+
+
+def test_units_of_the_header_are_converted(tmp_path: Path) -> None:
+    mixed = read(tmp_path, "q1_mrad,q2_mm,x_m,y_mm,z_um\n500,20,1,2,3\n")
+    assert mixed.q[0] == pytest.approx([0.5, 0.02])
+    assert mixed.blocks[0].y[0] == pytest.approx([1.0, 2e-3, 3e-6])
+    assert mixed.label == ("1",)
+    assert mixed.blocks[0].covariance[0] == pytest.approx(9e-10 * np.eye(3))
+
+
+def test_a_row_may_state_its_own_standard_deviations(tmp_path: Path) -> None:
+    head = "label,q1_deg,q2_mm,x_mm,y_mm,z_mm"
+    row = read(tmp_path, f"{head},sigma_mm\na,0,0,0,0,0,0.1\nb,0,0,0,0,0,0.2\n")
+    assert row.blocks[0].covariance == pytest.approx(np.array([1e-8, 4e-8])[:, None, None] * np.eye(3))
+    axis = read(tmp_path, f"{head},sigma_z_mm\na,0,0,0,0,0,0.1\n")
+    assert np.sqrt(np.diag(axis.blocks[0].covariance[0])) == pytest.approx([3e-5, 3e-5, 1e-4])
+    declared = read(tmp_path, f"{head}\na,0,0,0,0,0\n", {"x_mm": 1, "y_mm": 2, "z_mm": 3})
+    assert np.sqrt(np.diag(declared.blocks[0].covariance[0])) == pytest.approx([1e-3, 2e-3, 3e-3])
+
+
+def test_standard_deviations_are_asked_for_and_positive(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match="no standard deviation for 'x', accepted: position_mm"):
+        read(tmp_path, "q1_deg,q2_mm,x_mm,y_mm,z_mm\n0,0,0,0,0\n", {})
+    with pytest.raises(ro.InputError, match="row b, column sigma_mm: found 0, accepted: an uncertainty"):
+        read(tmp_path, "label,q1_deg,q2_mm,x_mm,y_mm,z_mm,sigma_mm\na,0,0,0,0,0,1\nb,0,0,0,0,0,0\n")
+
+
+def test_rows_of_one_configuration_stay_together(tmp_path: Path) -> None:
+    head = "configuration,q1_deg,q2_mm,x_mm,y_mm,z_mm"
+    data = read(tmp_path, f"{head}\nA,0,0,0,0,0\nB,1,0,0,0,0\nA,0,0,0,0,0\n")
+    parameters = ro.robot.model_parameters(ARM2).identify(["a?"])
+    group = ro.CalibrationProblem(ARM2, parameters, data).linearize(np.zeros(2)).group
+    assert group.tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 0]
+
+
+def test_a_prismatic_joint_wants_a_length(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match="'q2_deg' without a unit that fits, accepted: q2_m, q2_mm, q2_um"):
+        read(tmp_path, "q1_deg,q2_deg,x_mm,y_mm,z_mm\n0,0,0,0,0\n")
+
+
+def test_a_single_parameters_scale_goes_before_a_patterns_before_a_groups() -> None:
+    table = ro.robot.model_parameters(ARM).scaled({"d2_mm": 3, "d?_mm": 2, "length_mm": 4, "tool_mm": 7})
+    scale = dict(zip(table.names, table.scale, strict=True))
+    assert [scale[n] for n in ("d2", "d3", "a3", "tool_x")] == pytest.approx([3e-3, 2e-3, 4e-3, 7e-3])
+    assert scale["alpha1"] == pytest.approx(1e-3)
+    assert scale["base_x"] == pytest.approx(0.1)
+
+
+def test_limits_carry_the_unit_of_their_joint(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text('name = "r"\n[[joint]]\nlimits_deg = [-90, 180]\n')
+    assert ro.read_robot(path).limits[0] == pytest.approx([-np.pi / 2, np.pi])
+    path.write_text('name = "r"\n[[joint]]\ntype = "prismatic"\nlimits_deg = [-90, 180]\n')
+    with pytest.raises(ro.InputError, match=r"joint 1.limits_deg: found a unit that does not fit.*limits_mm"):
+        ro.read_robot(path)
+    path.write_text('name = "r"\ncoupling = [[1, 0]]\n[[joint]]\n')
+    with pytest.raises(ro.InputError, match=r"coupling: .* 1 rows of 1 numbers"):
+        ro.read_robot(path)

@@ -1,0 +1,69 @@
+"""Configurations to measure next: the design that lowers the uncertainty of what is predicted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
+from tests.simulate import simulated
+from tests.test_cli import run
+
+Q = np.random.default_rng(77).uniform(-2, 2, (50, 6))
+
+
+@pytest.mark.parametrize("criterion", ["D", "A", "E", "V"])
+def test_a_design_is_near_the_best_and_better_than_chance(criterion: str) -> None:
+    problem = ro.load("position").problem
+    q = random_candidates(problem.robot, 300, 1)
+    found = choose(problem, q, 40, criterion)
+    assert found.gap < 0.05
+    assert len(set(found.chosen.tolist())) == 40
+    assert found.weights.sum() == pytest.approx(40)
+    assert (found.bound >= found.value) == (criterion in "DE")
+    assert f"{criterion}-optimal" in str(found)
+    assert "no other set is more than" in str(found)
+
+
+def test_a_designed_set_predicts_better_than_the_best_of_two_hundred_random_ones() -> None:
+    problem, truth = simulated(seed=5)
+    robot = ro.robot.Robot("limited", problem.robot.mdh, limits=np.tile([-2.0, 2.0], (6, 1)))
+    q, scale = random_candidates(robot, 300, 2), problem.parameters.free.scale
+    rng, there = np.random.default_rng(3), problem.on(ro.Dataset.of(Q, np.zeros((50, 3)), 1.0))
+    want = there.modelled(truth)[0]
+    exact = problem.on(ro.Dataset.of(q, np.zeros((300, 3)), 5e-5)).modelled(truth)[0]
+
+    def predicted(index: np.ndarray) -> float:
+        """Root mean square error over draws of the noise, each solved at the truth's linearization."""
+        part = problem.on(ro.Dataset.of(q[index], exact[index], 5e-5))
+        model = part.linearize(truth)
+        inverse = np.linalg.inv(model.A.T @ model.A + np.eye(len(scale)))
+        J = there.jacobian(truth) * scale
+        z = truth / scale
+        bias = J @ (inverse @ z)
+        noise = np.einsum("ij,jk,ik->i", J @ inverse, model.A.T @ model.A, J @ inverse)
+        return float(np.sqrt(np.mean(bias**2 + noise)))
+
+    chosen = choose(problem, q, 40, "V", predicted=Q).chosen
+    random = [predicted(rng.choice(300, 40, replace=False)) for _ in range(200)]
+    assert predicted(chosen) < min(random)
+    data = ro.Dataset.of(q[chosen], exact[chosen] + 5e-5 * rng.normal(size=(40, 3)), 5e-5)
+    result = ro.calibrate(problem.on(data), ro.tikhonov, 1.0)
+    assert np.sqrt(np.mean((there.modelled(result.x)[0] - want) ** 2)) < 1.3 * predicted(chosen)
+
+
+def test_design_from_the_command_line(monkeypatch, capsys, tmp_path) -> None:
+    out = tmp_path / "next.csv"
+    assert run(monkeypatch, "design", "position", "--count", "40", "--candidates", "200", "--out", str(out)) == 0
+    assert "40 of 200 configurations, V-optimal" in capsys.readouterr().out
+    robot = ro.load("position").problem.robot
+    q = read_candidates(out, robot)
+    assert q.shape == (40, 6)
+    again = tmp_path / "again.csv"
+    cells = joint_cells(robot, q, np.arange(40))
+    again.write_text(csv_text(cells, zip(*cells.values(), strict=True)))
+    assert run(monkeypatch, "design", "position", "--count", "35", "--table", str(again), "--criterion", "D") == 0
+    assert run(monkeypatch, "design", "position", "--criterion", "Q") == 2
+    assert "criterion: found 'Q', accepted: D, A, E, V" in capsys.readouterr().err

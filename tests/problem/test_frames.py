@@ -1,0 +1,133 @@
+"""Closed-form starts: exact on exact data, refused with a reason where the data cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.problem.placing import hand_eye, register, tool_from_distances
+from tests.simulate import ARM, simulated
+
+
+def transform(seed: int, size: float = 3.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    T[:3, 3] = size * np.random.default_rng(seed).normal(size=3)
+    return T
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("flat", [False, True])
+def test_registration_finds_a_motion(seed: int, flat: bool) -> None:
+    rng = np.random.default_rng(seed)
+    T, p = transform(seed), rng.normal(size=(8, 3))
+    p[:, 2] *= not flat
+    q = p @ T[:3, :3].T + T[:3, 3]
+    assert np.abs(register(p, q) - T).max() < 1e-12
+    q[0] += 1.0
+    weights = np.append(0.0, rng.uniform(0.5, 2.0, 7))
+    assert np.abs(register(p, q, weights) - T).max() < 1e-12
+
+
+def test_registration_minimizes_the_weighted_sum_of_squares() -> None:
+    rng = np.random.default_rng(1)
+    p, q, w = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), rng.uniform(0.1, 3.0, 6)
+
+    def cost(T: np.ndarray) -> float:
+        return float(w @ np.sum((p @ T[:3, :3].T + T[:3, 3] - q) ** 2, axis=1))
+
+    best = register(p, q, w)
+    assert np.linalg.det(best[:3, :3]) == pytest.approx(1.0)
+    for k in range(200):
+        near = best.copy()
+        near[:3, :3] = Rotation.from_rotvec(1e-3 * rng.normal(size=3)).as_matrix() @ near[:3, :3]
+        near[:3, 3] += 1e-3 * rng.normal(size=3) * (k % 2)
+        assert cost(near) > cost(best)
+
+
+def test_mirrored_points_get_a_proper_rotation() -> None:
+    p = np.random.default_rng(4).normal(size=(9, 3))
+    assert np.linalg.det(register(p, p * [1, 1, -1])[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (np.zeros((2, 3)), "2 with a weight"),
+        (np.ones((5, 3)), "points on a line, or all in one place"),
+        (np.outer(np.arange(5.0), [1.0, 2.0, 3.0]), "points on a line, or all in one place"),
+        (np.zeros((4, 2)), "shapes"),
+    ],
+)
+def test_degenerate_points_are_refused(points: np.ndarray, found: str) -> None:
+    with pytest.raises(ro.InputError, match=found):
+        register(points, points)
+
+
+def test_a_tool_offset_from_distances_needs_no_base() -> None:
+    rng = np.random.default_rng(2)
+    flange = ro.robot.forward_kinematics(ARM, rng.uniform(-2, 2, (30, 6)))
+    offset, T = np.array([0.03, -0.05, 0.12]), transform(3)
+    points = (flange[:, :3, :3] @ offset + flange[:, :3, 3]) @ T[:3, :3].T + T[:3, 3]
+    assert np.abs(tool_from_distances(flange, points) - offset).max() < 1e-9
+    with pytest.raises(ro.InputError, match="configurations: found 1"):
+        tool_from_distances(flange[:1], points[:1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_hand_eye_finds_base_and_tool(seed: int) -> None:
+    flange = ro.robot.forward_kinematics(ARM, np.random.default_rng(seed).uniform(-2, 2, (6, 6)))
+    Z, X = transform(seed), transform(seed + 100, 0.2)
+    base, tool = hand_eye(flange, Z @ flange @ X)
+    assert np.abs(base - Z).max() < 1e-9
+    assert np.abs(tool - X).max() < 1e-9
+
+
+def test_hand_eye_refuses_turns_about_one_axis() -> None:
+    q = np.zeros((6, 6))
+    q[:, 0] = np.linspace(-1, 1, 6)
+    flange = ro.robot.forward_kinematics(ARM, q)
+    with pytest.raises(ro.InputError, match="rotations about one axis only"):
+        hand_eye(flange, transform(1) @ flange @ transform(2))
+    with pytest.raises(ro.InputError, match="poses: found 2"):
+        hand_eye(flange[:2], flange[:2])
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi / 2, np.pi])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_base_metres_and_half_a_turn_off_does_not_matter(turn: float, axis: int) -> None:
+    problem, _ = simulated(noise=3e-5, seed=3)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(turn * np.eye(3)[axis]).as_matrix()
+    T[:3, 3] = [4.0, -3.0, 2.0]
+    moved = problem.data.blocks[0].y @ T[:3, :3].T + T[:3, 3]
+    near = ro.calibrate(problem, ro.tikhonov, ro.reml)
+    far = ro.calibrate(problem.on(ro.Dataset.of(problem.data.q, moved, 5e-5)), ro.tikhonov, ro.reml)
+    assert near.converged
+    assert far.converged
+    # the same robot, up to what a prior of 5 mm on a base that is metres away does
+    assert far.errors().mean() == pytest.approx(near.errors().mean(), rel=0.02)
+
+
+def test_a_base_nobody_knows_is_registered() -> None:
+    instance = ro.load("position")
+    p = instance.problem.parameters
+    base = [p.nominal[p.names.index(f"base_{c}")] for c in "xyz"]
+    # the truth in problem.toml is 1800, -700, 350 mm; registration on the nominal robot is good to its errors
+    assert np.abs(np.array(base) - [1.8, -0.7, 0.35]).max() < 5e-3
+
+
+def test_anchors_and_spheres_are_located_where_none_is_stated(tmp_path) -> None:
+    import shutil
+
+    from rpim_opt.store.named import problems_folder
+
+    folder = shutil.copytree(problems_folder() / "sphere", tmp_path / "sphere")
+    text = (folder / "problem.toml").read_text()
+    start = text.index("[sphere]")
+    (folder / "problem.toml").write_text(text[:start] + text[text.index("[simulation]") :])
+    p = ro.load(folder).problem.parameters
+    found = [p.nominal[p.names.index(f"sphere_{c}")] for c in "xyzr"]
+    assert np.abs(np.array(found) - [0.7, 0.15, 0.3, 0.3]).max() < 0.05

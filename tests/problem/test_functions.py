@@ -1,0 +1,192 @@
+"""What a script's own measurement reads may change: every call asks it anew, a frozen problem asks once."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.problem.functions import Kept, _built, _ready, asked
+
+ZERO = 0.0
+COLUMNS = {"z": "length"}
+
+
+class Probe:
+    """A probe whose reading starts at an attribute."""
+
+    zero = 0.0
+
+    def read(self, T: Any) -> Any:
+        return T[2, 3] + self.zero
+
+
+def by_global() -> tuple[ro.data.Measurement, Callable[[float], None]]:
+    def change(value: float) -> None:
+        global ZERO
+        ZERO = value
+
+    return ro.data.Measurement("height", lambda T: T[2, 3] + ZERO, COLUMNS), change
+
+
+def by_closure() -> tuple[ro.data.Measurement, Callable[[float], None]]:
+    zero = 0.0
+
+    def change(value: float) -> None:
+        nonlocal zero
+        zero = value
+
+    return ro.data.Measurement("height", lambda T: T[2, 3] + zero, COLUMNS), change
+
+
+def by_attribute() -> tuple[ro.data.Measurement, Callable[[float], None]]:
+    probe = Probe()
+    return ro.data.Measurement("height", lambda T: probe.read(T), COLUMNS), lambda v: setattr(probe, "zero", v)
+
+
+def by_method() -> tuple[ro.data.Measurement, Callable[[float], None]]:
+    probe = Probe()
+    return ro.data.Measurement("height", probe.read, COLUMNS), lambda v: setattr(probe, "zero", v)
+
+
+def by_residual() -> tuple[ro.data.Measurement, Callable[[float], None]]:
+    box = {"zero": 0.0}
+    minus = lambda y, m: y - m - box["zero"]  # noqa: E731
+    return ro.data.Measurement("height", lambda T: T[2, 3], COLUMNS, minus=minus), lambda v: box.update(zero=v)
+
+
+WAYS = [by_global, by_closure, by_attribute, by_method, by_residual]
+
+
+def heights(measurement: ro.data.Measurement) -> ro.CalibrationProblem:
+    arm = ro.load("position").problem
+    z = ro.robot.forward_kinematics(arm.robot, arm.data.q)[:, 2, 3:4]
+    data = ro.Dataset.of(arm.data.q, z, 1e-5, measurement=measurement)
+    return ro.CalibrationProblem(arm.robot, arm.parameters.identify(["base_z", "a2"]), data)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_measurement_is_asked_at_every_call(way) -> None:
+    measurement, change = way()
+    change(0.0)
+    problem = heights(measurement)
+    x = np.array([0.3e-3, 0.0])
+    before = problem.residual(x)
+    change(1e-3)
+    np.testing.assert_allclose(problem.residual(x), before - 1e-3, rtol=0, atol=1e-15)
+    b = problem.linearize(x).b
+    change(0.0)
+    # whitened by 10 um, and so 100 sigmas; to the rounding of values of some thousand sigmas
+    np.testing.assert_allclose(problem.linearize(x).b, b + 100, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_measurement_is_asked_at_every_calibration(way) -> None:
+    measurement, change = way()
+    problem = heights(measurement)
+    base_z = problem.parameters.free.names.index("base_z")
+    heights_of_base = []
+    for zero in (0.0, 1e-3, 2e-3):
+        change(zero)
+        heights_of_base.append(ro.calibrate(problem, ro.least_squares).x[base_z])
+    # the reading is z + zero: the base is found lower by as much
+    np.testing.assert_allclose(np.diff(heights_of_base), -1e-3, rtol=1e-9)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_frozen_problem_asks_once(way) -> None:
+    measurement, change = way()
+    change(0.0)
+    problem = heights(measurement)
+    frozen = problem.frozen()
+    x = np.zeros(2)
+    before = frozen.residual(x)
+    change(1e-3)
+    np.testing.assert_array_equal(frozen.residual(x), before)
+    part = frozen.on(frozen.data.take(range(5)))
+    np.testing.assert_array_equal(part.residual(x), before[:5])
+    assert frozen.frozen() is frozen
+    assert not np.allclose(problem.residual(x), before)
+
+
+def test_the_same_answer_builds_no_second_function() -> None:
+    measurement, change = by_closure()
+    problem = heights(measurement)
+    block = problem.data.blocks[0]
+    first = problem._functions(block)
+    change(1.0)
+    second = problem._functions(block)
+    change(0.0)
+    assert problem._functions(block) is first
+    assert second is not first
+    twin = ro.data.Measurement("height", lambda T: T[2, 3] + 0.0, COLUMNS)
+    assert heights(twin)._functions(replace(block, measurement=twin)) is first
+
+
+def test_ready_measurements_are_built_once() -> None:
+    problem = ro.load("pose").problem
+    block = problem.data.blocks[0]
+    assert problem._functions(block) is problem._functions(block)
+    hits = _built.cache_info()
+    _ready(*next(iter(problem.frozen().asked._functions)))
+    assert _built.cache_info() == hits
+
+
+def test_a_model_that_imitates_a_ready_one_gives_its_numbers() -> None:
+    ready = MEASUREMENTS["pose"]
+    problem = ro.load("pose").problem
+    block = problem.data.blocks[0]
+    own = replace(ready, name="mine")
+    data = replace(problem.data, blocks=(replace(block, measurement=own),))
+    x = 0.3 * problem.parameters.free.scale
+    there, here = problem.linearize(x), problem.on(data).linearize(x)
+    np.testing.assert_array_equal(here.A, there.A)
+    np.testing.assert_array_equal(here.b, there.b)
+
+
+def test_threads_get_the_serial_numbers() -> None:
+    zero = threading.local()
+    measurement = ro.data.Measurement("height", lambda T: T[2, 3] + zero.value, COLUMNS)
+    problem = heights(measurement)
+    x = np.zeros(2)
+    zero.value = 0.0
+    alone = problem.residual(x)
+    wrong: list[float] = []
+
+    def work(value: float) -> None:
+        zero.value = value
+        for _ in range(40):
+            wrong.append(float(np.abs(problem.residual(x) - (alone - value)).max()))
+
+    threads = [threading.Thread(target=work, args=(v,)) for v in (0.0, 1e-3, 2e-3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(wrong) == 120
+    assert max(wrong) < 1e-15
+
+
+def test_a_kept_function_is_the_one_of_its_structure() -> None:
+    kept = Kept()
+    problem = heights(by_closure()[0])
+    one = replace(problem, asked=kept)
+    block = problem.data.blocks[0]
+    both = one._functions(block)
+    other = one.identifying(problem.parameters.identify(["base_z"]).identified)
+    assert other._functions(block)["jacobian"].size_in(0) == (1, 1)
+    assert one._functions(block) is both
+
+
+def test_a_wrong_number_of_components_is_named() -> None:
+    wrong = ro.data.Measurement("height", lambda T: ca.vertcat(T[2, 3], 1), COLUMNS, components=COLUMNS)
+    with pytest.raises(ro.InputError, match="height: found 2 components of the residual, accepted: 1"):
+        heights(wrong).residual(np.zeros(2))
+    assert callable(asked)

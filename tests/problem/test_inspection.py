@@ -1,0 +1,123 @@
+"""Inspection: likely mistakes are found where they were made, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.problem.inspection import inspect
+from tests.test_cli import run
+
+CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axis", "tracker", "scara", "paper_arm")
+
+
+@pytest.mark.parametrize("name", CLEAN)
+def test_good_data_raise_no_suspicion(name: str) -> None:
+    found = inspect(ro.load(name).problem)
+    assert not [text for text in found.warnings if "better" in text or "?" in text]
+    assert "directions that the data see" in str(found)
+
+
+def changed(name: str, q=lambda q: q, y=lambda y: y) -> ro.CalibrationProblem:
+    problem = ro.load(name).problem
+    blocks = tuple(replace(b, q=q(b.q.copy()), y=y(b.y.copy())) for b in problem.data.blocks)
+    return problem.on(replace(problem.data, blocks=blocks))
+
+
+def flip(i: int):
+    def turned(q: np.ndarray) -> np.ndarray:
+        q[..., i] *= -1
+        return q
+
+    return turned
+
+
+def shift(i: int):
+    def moved(q: np.ndarray) -> np.ndarray:
+        q[..., i] += np.pi / 2
+        return q
+
+    return moved
+
+
+MISTAKES = {
+    "degrees as radians": ("position", {"q": np.degrees}, "degrees, not radians"),
+    "radians as degrees": ("position", {"q": np.radians}, "radians, not degrees"),
+    "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
+    "metres as millimetres": ("position", {"y": lambda y: 1e-3 * y}, "a thousand times larger"),
+    "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
+    "joint 3 the other way": ("seven_axis", {"q": flip(2)}, "joint 3 counted the other way"),
+    "joint 2 from another zero": ("position", {"q": shift(1)}, "joint 2 shifted by -90 deg"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_likely_mistakes_are_named(mistake: str) -> None:
+    name, change, expected = MISTAKES[mistake]
+    warnings = inspect(changed(name, **change)).warnings
+    assert any(expected in text and "times better" in text for text in warnings), warnings
+
+
+def test_rows_that_stand_out_are_named() -> None:
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    y = block.y.copy()
+    y[[3, 17]] += [0.05, 0.0, 0.0]
+    found = inspect(problem.on(replace(problem.data, blocks=(replace(block, y=y),))))
+    assert set(found.standing_out) == {"c3", "c17"}
+    assert "Nominal error stands out: " in str(found)
+
+
+def test_repeated_rows_tell_the_repeatability() -> None:
+    problem = ro.load("position").problem
+    data = problem.data.take(np.repeat(np.arange(20), 3))
+    data = replace(data, label=tuple(f"{label}.{i % 3}" for i, label in enumerate(data.label)))
+    y = data.blocks[0].y + 2e-5 * np.random.default_rng(1).normal(size=data.blocks[0].y.shape)
+    found = inspect(problem.on(replace(data, blocks=(replace(data.blocks[0], y=y),))))
+    assert len(found.repeated) == 20
+    assert ("c0.0", "c0.1", "c0.2") in found.repeated
+    assert found.repeatability == pytest.approx(2e-5, rel=0.2)
+
+
+def test_copied_values_limits_and_coverage() -> None:
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    y, q = block.y.copy(), block.q.copy()
+    y[5] = y[4]
+    q[7, 0, 1] = 3.0
+    q[:, 0, 4] = 0.3
+    warnings = inspect(problem.on(replace(problem.data, blocks=(replace(block, q=q, y=y),)))).warnings
+    assert any("rows c4 and c5 have the same measured values" in text for text in warnings)
+    assert any("joint 2 leaves its limits" in text for text in warnings)
+    assert any("joint 5 moves only 0.00 deg" in text for text in warnings)
+
+
+def test_parallel_axes_are_proposed() -> None:
+    problem = ro.load("position").problem
+    without = ro.CalibrationProblem(problem.robot, problem.parameters.identify(["a?", "base_*"]), problem.data)
+    assert inspect(without).proposals == ("the axes 2 and 3 are near parallel: add beta2 to `identify`.",)
+    assert inspect(problem).proposals == ()
+
+
+def test_the_command(monkeypatch, capsys) -> None:
+    assert run(monkeypatch, "inspect", "rank_deficient") == 0
+    out = capsys.readouterr().out
+    for part in (
+        "joint 6 moves only 0.00 deg",
+        "Not seen at all",
+        "Free to move without any effect",
+        "O1",
+        "typical sigma",
+    ):
+        assert part in out
+
+
+def test_simulate_and_robots_commands(monkeypatch, capsys, tmp_path) -> None:
+    assert run(monkeypatch, "simulate", "position", "--seed", "5", "--out", str(tmp_path)) == 0
+    assert (tmp_path / "truth.toml").read_text().startswith("# made by: rpim-opt simulate position")
+    assert run(monkeypatch, "robots") == 0
+    assert "Universal Robots UR5e" in capsys.readouterr().out
+    assert run(monkeypatch, "simulate", "paper_arm") == 2

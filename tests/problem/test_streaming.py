@@ -1,0 +1,220 @@
+"""Large data: the same answer from triangles, parts, threads and clusters as from the rows."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import stat
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.problem import parts as streaming
+from rpim_opt.problem.linear import reduced_rows
+from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.triangles import reduced
+from rpim_opt.robot import compiled as native
+
+PARTS, ROWS = 5, 1100
+
+
+@pytest.fixture(scope="module")
+def robot() -> ro.robot.Robot:
+    return ro.load("paper_arm").problem.robot
+
+
+@pytest.fixture(scope="module")
+def parameters(robot: ro.robot.Robot) -> ro.robot.Parameters:
+    chosen = ["alpha?", "a?", "theta?", "d?", "tool_[xyz]", "base_*"]
+    return ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]}).identify(chosen)
+
+
+def simulated(robot: ro.robot.Robot, parameters: ro.robot.Parameters, seed: int, blunders: int = 0) -> ro.Dataset:
+    rng = np.random.default_rng(seed)
+    truth = 0.3 * np.random.default_rng(99).normal(size=len(parameters.free)) * parameters.free.scale
+    q = rng.uniform(-2, 2, (ROWS, 6))
+    y = CalibrationProblem(robot, parameters, ro.Dataset.of(q, np.zeros((ROWS, 3)), 5e-5)).modelled(truth)[0]
+    y += 5e-5 * rng.normal(size=y.shape)
+    y[:blunders] += 3e-3
+    return ro.Dataset.of(q, y, 5e-5)
+
+
+@pytest.fixture(scope="module")
+def parts(robot: ro.robot.Robot, parameters: ro.robot.Parameters) -> list[ro.Dataset]:
+    return [simulated(robot, parameters, seed) for seed in range(PARTS)]
+
+
+@pytest.fixture(scope="module")
+def whole(robot: ro.robot.Robot, parameters: ro.robot.Parameters, parts: list[ro.Dataset]) -> CalibrationProblem:
+    return CalibrationProblem(robot, parameters, ro.Dataset.together(parts, [str(i) for i in range(PARTS)]))
+
+
+def partitioned(problem: CalibrationProblem, parts: list[ro.Dataset], compute=map) -> PartitionedProblem:
+    readers = tuple(partial(pickle.loads, pickle.dumps(part)) for part in parts)
+    return PartitionedProblem(problem.robot, problem.parameters, parts[0], readers, compute)
+
+
+def test_a_triangle_says_all_that_a_squared_loss_sees(whole: CalibrationProblem) -> None:
+    x = 0.1 * whole.parameters.free.scale
+    rows, triangle = whole.linearize(x), reduced(whole, x)
+    assert triangle.A.shape == (len(x) + 1, len(x))
+    assert triangle.equations == rows.equations == 3 * PARTS * ROWS
+    for z in np.random.default_rng(0).normal(size=(5, len(x))):
+        there, here = (np.linalg.norm(m.A @ z - m.b) for m in (rows, triangle))
+        assert here == pytest.approx(there, rel=1e-12)
+    gram = rows.A.T @ rows.A
+    np.testing.assert_allclose(triangle.A.T @ triangle.A, gram, atol=1e-12 * np.abs(gram).max())
+
+
+def test_triangles_of_fewer_rows_than_columns() -> None:
+    rows = np.random.default_rng(1).normal(size=(3, 5))
+    R = reduced_rows(rows)
+    assert R.shape == (5, 5)
+    np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-14)
+
+
+@pytest.mark.parametrize("rule", [ro.reml, ro.l_curve, ro.gcv, 1.0])
+def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: list[ro.Dataset], rule) -> None:
+    there, here = ro.calibrate(whole, ro.tikhonov, rule), ro.calibrate(partitioned(whole, parts), ro.tikhonov, rule)
+    assert here.converged
+    assert here.weight == pytest.approx(there.weight, rel=1e-3)  # it stays once steps are shorter than that
+    again = ro.calibrate(partitioned(whole, parts), ro.tikhonov, there.weight)
+    fixed = ro.calibrate(whole, ro.tikhonov, there.weight)
+    np.testing.assert_allclose(again.x, fixed.x, rtol=0, atol=1e-13)
+    assert again.equations == fixed.equations == 3 * PARTS * ROWS
+    assert again.noise_variance == pytest.approx(fixed.noise_variance, rel=1e-9)
+    assert 0.9 < again.noise_variance < 1.1  # as simulated
+    np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
+    assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
+
+
+def test_bounds_on_parts(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
+    tight = whole.parameters.toleranced({"length_mm": 0.2, "angle_mrad": 0.2, "tool_mm": 2, "base_mm": 20})
+    rows = CalibrationProblem(whole.robot, tight, whole.data)
+    there, here = (ro.calibrate(p, ro.bounded, 1.0) for p in (rows, partitioned(rows, parts)))
+    assert there.held
+    np.testing.assert_allclose(here.x, there.x, rtol=0, atol=1e-10)
+
+
+def test_robust_losses_are_reweighted_to_the_same_minimum(whole: CalibrationProblem) -> None:
+    bad = [simulated(whole.robot, whole.parameters, seed, blunders=40) for seed in range(2)]
+    rows = whole.on(ro.Dataset.together(bad, ["a", "b"]))
+    there = ro.calibrate(rows, ro.robust, 1.0)
+    here = ro.calibrate(partitioned(rows, bad), ro.robust, 1.0, max_iterations=200)
+    assert here.converged
+    assert here.formulation is ro.robust
+    assert not any("squared loss" in line for line in here.remarks())
+    assert (np.abs(here.x - there.x) / there.problem.parameters.free.scale).max() < 2e-6  # as exact as Clarabel's
+    assert all(b.objective <= a.objective * (1 + 1e-9) for a, b in zip(here.history, here.history[1:], strict=False))
+    squared = ro.calibrate(rows, ro.tikhonov, 1.0)
+    assert np.linalg.norm(squared.x - there.x) > 100 * np.linalg.norm(here.x - there.x)
+
+
+def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monkeypatch) -> None:
+    monkeypatch.setattr(streaming, "KEPT", 4000)
+    repeated = whole.data.take(np.repeat(np.arange(len(whole.data)), 2)[::-1])
+    cut = streaming.in_parts(whole.on(repeated))
+    assert isinstance(cut, PartitionedProblem)
+    seen = [set(part().configuration) for part in cut.parts]
+    assert sum(map(len, seen)) == len(set().union(*seen)) == len(whole.data)
+    assert sum(len(part()) for part in cut.parts) == len(repeated)
+    result = ro.calibrate(whole, ro.tikhonov, 1.0)
+    monkeypatch.undo()
+    np.testing.assert_allclose(result.x, ro.calibrate(whole, ro.tikhonov, 1.0).x, rtol=0, atol=1e-13)
+    assert result.problem is whole  # parts are how it is solved, not what was asked
+    assert result.equations == 3 * len(whole.data)
+
+
+def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
+    problem = partitioned(whole, parts[:1])
+    for rule in (ro.leave_one_out, ro.k_fold, ro.two_step, ro.ncp):
+        with pytest.raises(ro.InputError, match="triangle"):
+            ro.calibrate(problem, ro.tikhonov, rule)
+    with pytest.raises(ro.InputError, match="measurements in parts"):
+        ro.problem.inspect(problem)
+    with pytest.raises(ro.InputError, match="measurements in parts"):
+        ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), "nowhere.json")
+    with pytest.raises(ro.InputError, match="measurements in parts"):
+        ro.calibrate(problem, ro.Formulation("worst", loss=ro.minimax.loss, penalty=ro.minimax.penalty), 1.0)
+
+
+def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.Dataset], tmp_path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    files = []
+    for k, part in enumerate(parts):
+        block = part.blocks[0]
+        columns = {f"q{i + 1}_rad": block.q[:, 0, i] for i in range(6)}
+        columns |= {f"{axis}_m": block.y[:, i] for i, axis in enumerate("xyz")}
+        files.append(tmp_path / f"{k}.parquet")
+        parquet.write_table(pa.table(columns), files[-1])
+    readers = partitions(files, whole.robot, {"position_mm": 0.05})
+    wanted = ro.calibrate(whole, ro.tikhonov, 1.0).x
+    with ThreadPoolExecutor(2) as pool:
+        problem = PartitionedProblem(whole.robot, whole.parameters, parts[0], readers, pool.map)
+        np.testing.assert_allclose(ro.calibrate(problem, ro.tikhonov, 1.0).x, wanted, rtol=0, atol=1e-13)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
+        from distributed import Client, LocalCluster
+
+        with (
+            LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            problem = PartitionedProblem(whole.robot, whole.parameters, parts[0], readers, on_cluster(client))
+            np.testing.assert_allclose(ro.calibrate(problem, ro.tikhonov, 1.0).x, wanted, rtol=0, atol=1e-13)
+    with pytest.raises(ro.InputError, match="no file"):
+        partitions([], whole.robot, {"position_mm": 0.05})
+
+
+def test_ready_measurements_stay_the_same_in_other_processes() -> None:
+    for measurement in MEASUREMENTS.values():
+        assert pickle.loads(pickle.dumps(measurement)) is measurement
+
+
+def jacobian_of(problem: CalibrationProblem):
+    return problem._functions(problem.data.blocks[0])["jacobian"]
+
+
+def test_machine_code_agrees_with_the_virtual_machine(whole, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    native.compiled.cache_clear()
+    function = jacobian_of(whole)
+    made = native.compiled(function)
+    if made is None:
+        pytest.skip("no C compiler here")
+    libraries = list((tmp_path / "rpim_opt").glob("*.so"))
+    assert len(libraries) == 1
+    assert stat.S_IMODE((tmp_path / "rpim_opt").stat().st_mode) == 0o700
+    from rpim_opt.robot.kinematics import call_rows
+
+    x, rows = 0.2 * whole.parameters.free.scale, np.random.default_rng(0).uniform(-2, 2, (300, 9))
+    for a, b in zip(*(call_rows(f, [x, whole.parameters.nominal], rows) for f in (function, made)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
+    written = libraries[0].stat().st_mtime_ns
+    native.compiled.cache_clear()
+    assert native.compiled(function) is not None  # taken from the cache
+    assert libraries[0].stat().st_mtime_ns == written
+
+
+def test_where_nothing_can_be_compiled_the_virtual_machine_stays(whole, tmp_path: Path, monkeypatch) -> None:
+    function = jacobian_of(whole)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for name, value in (("CC", "no-such-compiler"), ("CC", "false"), (native.SWITCH, "0")):
+        with monkeypatch.context() as context:
+            context.setenv(name, value)
+            native.compiled.cache_clear()
+            assert native.compiled(function) is None
+    (tmp_path / "rpim_opt").mkdir(exist_ok=True)
+    os.chmod(tmp_path / "rpim_opt", 0o777)  # others could put their code there
+    native.compiled.cache_clear()
+    assert native.compiled(function) is None
+    native.compiled.cache_clear()

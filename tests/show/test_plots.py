@@ -1,0 +1,106 @@
+"""Figures show what was chosen."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+
+mpl.use("Agg")
+from matplotlib import pyplot as plt
+
+
+@pytest.fixture
+def ax():
+    figure, axes = plt.subplots()
+    yield axes
+    plt.close(figure)
+
+
+def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
+    problem = ro.load("position").problem
+    program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+    selections = {rule.__name__: rule(program) for rule in (ro.l_curve, ro.gcv, ro.reml)}
+    ro.plot.l_curve(program, selections, ax)
+    assert [text.get_text().split(",")[0] for text in ax.get_legend().get_texts()] == list(selections)
+    curve, *marks = ax.lines
+    assert (np.diff(curve.get_xdata()) > 0).all()  # the residual grows with the weight, the solution shrinks
+    assert (np.diff(curve.get_ydata()) < 0).all()
+    assert len(marks) == 3
+    ax.figure.savefig(tmp_path / "l.svg")
+
+
+def test_the_choice_of_every_selector_can_be_drawn(ax) -> None:
+    problem = ro.load("position").problem
+    program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+    for rule in (ro.corner, ro.gcv, ro.reml, ro.leave_one_out, ro.discrepancy, ro.quasi_optimality, ro.ncp):
+        ax.clear()
+        chosen = rule(program)
+        ro.plot.selection(chosen, ax)
+        assert ax.lines[1].get_xdata()[0] == chosen.weight
+        assert chosen.name in ax.get_ylabel()
+
+
+def test_distrusted_rows_are_marked(ax) -> None:
+    instance = ro.load("blunders")
+    result = ro.calibrate(instance.problem, ro.robust, 1.0)
+    ro.plot.errors(result, ax=ax)
+    assert len(ax.lines[0].get_xdata()) == len(result.flagged) == 5
+    assert ax.get_ylabel() == "error [mm]"
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[ro.store.Instance, ro.calibration.Calibration]:
+    instance = ro.load("constrained", "wrong_tolerance")
+    return instance, ro.calibrate(instance.problem, instance.formulation, instance.weight)
+
+
+def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
+    instance, result = fitted
+    ro.plot.error_histogram(result, instance.validation, ax)
+    assert sum(bar.get_height() for bar in ax.patches) == 2 * len(instance.validation)  # nothing outside the bins
+    ax.clear()
+    ro.plot.error_axes(result, instance.validation, ax)
+    want = 1e3 * result.error_vectors(instance.validation).mean(axis=0)
+    assert ax.lines[3].get_ydata() == pytest.approx(want, rel=1e-12)
+    ax.clear()
+    ro.plot.parameters(result, ax=ax)
+    names = [text.get_text() for text in ax.get_yticklabels()]
+    x = dict(zip(result.problem.parameters.free.names, 1e3 * result.x, strict=True))
+    assert ax.lines[0].get_xdata() == pytest.approx([x[name] for name in names], rel=1e-12)
+    assert set(np.abs(ax.lines[3].get_xdata())) == {1.5}  # the tolerance that the file states
+    ax.clear()
+    ro.plot.picard(result.program, result.weight, ax)
+    beta, s, _ = result.program.model.svd
+    assert np.array_equal(ax.lines[0].get_ydata(), s[s > 0])
+    assert np.array_equal(ax.lines[1].get_ydata(), np.abs(beta[s > 0]))
+    ax.clear()
+    ro.plot.selectors(result.program, {"reml": result.selection}, ax)
+    assert ax.lines[0].get_xdata()[0] == result.weight
+
+
+def test_axes_are_made_and_carry_units(fitted) -> None:
+    _, result = fitted
+    axes = [
+        ro.plot.errors(result), ro.plot.error_histogram(result), ro.plot.error_axes(result), ro.plot.parameters(result),
+        ro.plot.parameters(result, "angle"), ro.plot.picard(result.program), ro.plot.error_vectors(result),
+    ]  # fmt: skip
+    said = [ax.get_xlabel() + ax.get_ylabel() for ax in axes]
+    assert all("[" in text for text in said)
+    assert "enlarged" in axes[-1].get_title()
+    for ax in axes:
+        plt.close(ax.figure)
+
+
+def test_errors_have_a_direction_where_a_position_was_measured() -> None:
+    instance = ro.load("mixed")
+    result = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
+    for nominal in (False, True):
+        length = np.linalg.norm(result.error_vectors(nominal=nominal), axis=1)
+        positions = np.isfinite(length)
+        assert 0 < positions.sum() < len(length)
+        want = result.nominal_errors() if nominal else result.errors()
+        assert length[positions] == pytest.approx(want[positions], rel=1e-12)
+    assert np.isfinite(result.measured_positions()).all()

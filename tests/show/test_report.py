@@ -1,0 +1,298 @@
+"""The report: what it says, that nothing a user wrote becomes markup, and, in a browser, that it works."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.show.report import page
+from rpim_opt.show.svg import Axis
+from tests.browser import NAMES, PROGRAM, Browser, browser
+from tests.simulate import simulated
+from tests.test_cli import run
+
+EVIL = ["</script><script>alert(1)</script>", "\"'><img src=x onerror=alert(1)>", "<!--", "]]>", "&lt;b&gt;", "{{7*7}}"]
+
+
+class Reader(HTMLParser):
+    """Collects elements with their attributes, and the text outside scripts."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words, self.scripts, self.open = "", [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self.open = tag
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_endtag(self, tag) -> None:
+        self.open = ""
+
+    def handle_data(self, data) -> None:
+        if self.open == "script":
+            self.scripts[-1] += data
+        elif self.open != "style":
+            self.words += data
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+def result_of(name: str, formulation: ro.Formulation | None = None) -> ro.calibration.Calibration:
+    instance = ro.load(name)
+    result = ro.calibrate(instance.problem, formulation or instance.formulation, instance.weight)
+    return replace(result, record=instance.record)
+
+
+@pytest.fixture(scope="module")
+def arm() -> ro.calibration.Calibration:
+    return result_of("paper_arm")
+
+
+@pytest.fixture(scope="module")
+def evil() -> str:
+    """The report of a calibration in which every text of a user's is an attempt at markup."""
+    problem, _ = simulated(noise=5e-5)
+    y = problem.data.blocks[0].y.copy()
+    y[:6] += 0.01
+    label = (*EVIL, *map(str, range(34)))
+    data = ro.Dataset.of(problem.data.q, y, 5e-5, label)
+    robot = ro.robot.Robot(EVIL[0], problem.robot.mdh, source=EVIL[1])
+    result = ro.calibrate(ro.CalibrationProblem(robot, problem.parameters, data), ro.robust, 1.0)
+    result = replace(result, formulation=replace(result.formulation, name=EVIL[0]), message=EVIL[1])
+    record = ro.data.Record(
+        EVIL[0], EVIL[1], data, {EVIL[0]: EVIL[1]}, {EVIL[1]: EVIL[2]}, made=EVIL[0], versions={EVIL[3]: EVIL[4]}
+    )
+    return page(replace(result, record=record))
+
+
+def test_the_report_says_the_figures_of_the_result(arm) -> None:
+    text = " ".join(Reader(page(arm)).words.split())
+    assert (
+        "On 16 measurements that the calibration did not see, the mean position error falls from 2.649 mm to 0.032 mm"
+        in text
+    )
+    assert "No measurement depends on theta6." in text
+    assert "T8-6" in text  # left out, with its reason
+    assert "0.03 mm (x, y, z)" in text
+    for digest in arm.record.files.values():
+        assert digest in text
+    for row in arm.parameter_rows():
+        assert f"{row['name']} [{row['unit']}]" in text
+        assert f"{row['identified']:.4f}" in text
+    assert "loss sum_squares of each equation, penalty sum_squares, constraints: none" in text
+
+
+def test_one_file_that_loads_nothing(arm) -> None:
+    text = page(arm)
+    assert len(text) < 1_500_000
+    read = Reader(text)
+    for _, attributes in read.elements:
+        assert not {"src", "srcset", "style", "onclick", "onload"} & set(attributes)
+        assert not str(attributes.get("href", "#")).startswith("http")
+    assert not read.all("link")
+    assert "url(" not in text
+    assert "@import" not in text
+    (policy,) = [m["content"] for m in read.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert re.fullmatch(r"default-src 'none'; style-src 'sha256-\S+'; script-src 'sha256-\S+'", str(policy))
+    assert page(arm) == text
+
+
+def test_headings_descend_and_figures_have_words(arm) -> None:
+    read = Reader(page(arm))
+    levels = [int(name[1]) for name, _ in read.elements if re.fullmatch("h[1-6]", name)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(b <= a + 1 for a, b in pairwise(levels))
+    assert all(svg.get("aria-label") and svg.get("role") for svg in read.all("svg"))
+    assert read.all("html")[0]["lang"] == "en"
+    names = {heading["id"] for heading in read.all("h2")}
+    assert {section["aria-labelledby"] for section in read.all("section")} == names
+
+
+def test_every_text_of_a_user_stays_text(evil) -> None:
+    read = Reader(evil)
+    assert len(read.scripts) == 2
+    assert not read.all("img")
+    assert not read.all("b")
+    for label in EVIL:
+        assert label in read.words
+    labels = json.loads(read.scripts[0])["space"]["labels"]
+    assert labels[: len(EVIL)] == [f"{label} (validation)" for label in EVIL]
+    assert "</" not in read.scripts[0]
+    assert "alert(1)" not in read.scripts[1]
+
+
+def test_a_report_says_what_a_reader_must_know() -> None:
+    stopped = ro.load("position")
+    result = ro.calibrate(stopped.problem, ro.tikhonov, 1.0, max_iterations=1)
+    text = page(result)
+    assert "This calibration did not converge and should not be used." in text
+    assert "40 validation rows repeat" in page(replace(result, record=ro.data.Record(validation=result.problem.data)))
+    assert "(none were kept apart to check it)" in text
+    assert "Without validation data" in text
+    text = page(result_of("blunders", ro.robust))
+    assert "The measurements are simulated." in text
+    assert "Distrusted rows: c" in text
+    assert "huber(2.0) of each configuration" in text
+
+
+@pytest.mark.parametrize("formulation", [ro.least_squares, ro.lasso, ro.minimax], ids=lambda f: f.name)
+def test_other_formulations_have_a_report(formulation) -> None:
+    problem, _ = simulated(("a?", "theta?", "base_*"), noise=5e-5)
+    weight = 0.0 if formulation is ro.least_squares else 1.0
+    text = page(ro.calibrate(problem, formulation, weight))
+    assert ("No intervals" in text) == (formulation is not ro.least_squares)
+    assert ('id="weight"' in text) == (formulation is not ro.least_squares)
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("cable", "joints", "markers", "scara", "seven_axis")]
+
+
+@pytest.mark.parametrize("name", ["distance", "mixed", "plane", "pose", "rank_deficient", *SLOW])
+def test_every_measurement_has_a_report(name: str) -> None:
+    read = Reader(page(result_of(name)))
+    curves = [path["d"] for path in read.all("path") if "line" in str(path["class"])]
+    assert curves
+    assert not any("nan" in str(d) or "inf" in str(d) for d in curves)
+    assert ("Orientation error" in read.words) == (name == "pose")
+
+
+def test_a_result_of_a_lost_formulation_has_a_report(tmp_path: Path) -> None:
+    problem, _ = simulated(noise=5e-5)
+    mine = ro.Formulation("mine", penalty=ro.tikhonov.penalty, constraints=(lambda z, p: z[0] <= 9,))
+    ro.store.save_result(ro.calibrate(problem, mine, 1.0), tmp_path / "result.json")
+    text = page(ro.load_result(tmp_path))
+    assert "it cannot be solved again" in text
+    assert "a function of a script, not in the file" in text
+    assert "Checked anew" in text
+
+
+def test_the_command(monkeypatch, capsys, tmp_path: Path) -> None:
+    assert run(monkeypatch, "calibrate", "paper_arm", "--out", str(tmp_path)) == 0
+    assert run(monkeypatch, "report", str(tmp_path)) == 0
+    first = (tmp_path / "report.html").read_text()
+    assert run(monkeypatch, "report", str(tmp_path / "result.json"), "--out", str(tmp_path / "b" / "r.html")) == 0
+    assert (tmp_path / "b" / "r.html").read_text() == first
+    capsys.readouterr()
+    assert run(monkeypatch, "report", str(tmp_path / "nothing.json")) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "nothing.json, the file: found nothing, accepted: result.json" in said.err
+    (tmp_path / "file").write_text("")
+    assert run(monkeypatch, "report", str(tmp_path), "--out", str(tmp_path / "file" / "r.html")) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ends", [(0, 1), (-3.7, 12.2), (0, 5), (1e-6, 1.1e-6), (-40.0, -39.0)])
+def test_ticks_are_round_and_few(ends) -> None:
+    ticks = Axis("x", ends).ticks()
+    assert 3 <= len(ticks) <= 7
+    assert all(float(text) == pytest.approx(value, rel=1e-5, abs=1e-12) for value, text in ticks)
+    steps = np.diff([value for value, _ in ticks])
+    assert steps == pytest.approx(np.full(len(steps), steps[0]), rel=1e-6)
+
+
+# --- in a browser ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    if PROGRAM is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed")
+    with browser() as one:
+        yield one
+
+
+@pytest.fixture
+def opened(chromium: Browser, arm, tmp_path: Path) -> Browser:
+    path = tmp_path / "report.html"
+    ro.show.write_report(arm, path)
+    chromium.open(path)
+    return chromium
+
+
+def test_nothing_is_fetched_and_nothing_complains(opened: Browser) -> None:
+    assert opened.complaints() == []
+    assert [url.split(":")[0] for url in opened.requests()] == ["file"]
+    drawn = opened.run("[...document.querySelectorAll('svg path')].map(p => p.getTotalLength())")
+    assert len(drawn) > 30
+    outlines = opened.run(
+        "[...document.querySelectorAll('svg .line, #space path')].filter(p => !p.getAttribute('d')).length"
+    )
+    assert outlines == 0
+    assert opened.run("document.querySelectorAll('svg .bar').length") >= 2 * (16 + 9)
+
+
+def test_the_slider_tells_of_every_weight(opened: Browser) -> None:
+    says = "document.getElementById('weight-says').textContent"
+    first = opened.run(says)
+    assert "(chosen)" in first
+    assert "taken by l_curve" in first
+    opened.run("document.getElementById('weight').focus()")
+    place = opened.run("document.getElementById('cursor').getAttribute('cx')")
+    opened.press("ArrowRight")
+    second = opened.run(says)
+    assert second != first
+    assert "residual norm" in second
+    for _ in range(20):
+        opened.press("ArrowRight")
+    assert float(opened.run("document.getElementById('cursor').getAttribute('cx')")) > float(place) + 10
+    curve = "document.getElementById('cursor').ownerSVGElement"
+    opened.run(f"{curve}.scrollIntoView()")
+    box = opened.run(f"(b => [b.left, b.top, b.width, b.height])({curve}.getBoundingClientRect())")
+    at = (box[0] + 0.95 * box[2], box[1] + 0.8 * box[3])
+    opened.mouse("mouseMoved", *at)
+    assert opened.run(says) not in (first, second)
+
+
+def test_the_view_turns_by_mouse_and_keyboard(opened: Browser) -> None:
+    drawn = "document.querySelector('#space .vectors').getAttribute('d')"
+    first = opened.run(drawn)
+    assert first.count("M") == 25
+    opened.run("document.getElementById('space').focus()")
+    opened.press("ArrowLeft")
+    second = opened.run(drawn)
+    box = "document.getElementById('space').getBoundingClientRect()"
+    x, y = opened.run(f"(b => [b.left + b.width / 2, b.top + b.height / 2])({box})")
+    opened.mouse("mousePressed", x, y, held=True)
+    opened.mouse("mouseMoved", x + 60, y + 20, held=True)
+    opened.mouse("mouseReleased", x + 60, y + 20)
+    third = opened.run(drawn)
+    opened.run("document.querySelector('button[data-view=\"0,90\"]').click()")
+    above = opened.run(drawn)
+    opened.run("document.querySelector('input[value=before]').click()")
+    assert len({first, second, third, above, opened.run(drawn)}) == 5
+    assert "before calibration" in opened.run("document.getElementById('space-says').textContent")
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_narrow_windows_and_dark_ones(chromium: Browser, evil: str, tmp_path: Path, dark: bool) -> None:
+    path = tmp_path / "report.html"
+    path.write_text(evil, encoding="utf-8")
+    chromium.open(path, width=400, dark=dark)
+    assert chromium.complaints() == []
+    assert [url.split(":")[0] for url in chromium.requests()] == ["file"]
+    assert chromium.run("document.documentElement.scrollWidth") <= 400
+    paper, ink = chromium.run("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+    lightness = [sum(map(int, re.findall(r"\d+", color)[:3])) for color in (paper, ink)]
+    assert (lightness[0] < lightness[1]) == dark
+
+
+def test_it_prints(opened: Browser, tmp_path: Path) -> None:
+    opened.print(tmp_path / "report.pdf")
+    pages = (tmp_path / "report.pdf").read_bytes().count(b"/Type /Page\n")
+    assert 3 <= pages <= 12

@@ -1,0 +1,445 @@
+"""Compensation: the true robot at the corrected commands is where the nominal one would be."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.data.models import pose
+from rpim_opt.robot.library import find_robot
+from rpim_opt.store.named import problems_folder
+from tests.simulate import ARM, simulated
+
+SCARA = ro.read_robot(problems_folder() / "scara" / "robot.toml")
+ROBOTS = {
+    "six axes": ARM,
+    "seven axes": ro.read_robot(find_robot("iiwa14")),
+    "SCARA": SCARA,
+    "coupled": ro.read_robot(find_robot("lrmate200id")),
+}
+
+
+def commands(robot: ro.robot.Robot, count: int = 60, seed: int = 1) -> np.ndarray:
+    """Joint values well inside the limits."""
+    low, high = np.clip(robot.limits, -2.0, 2.0).T
+    return np.random.default_rng(seed).uniform(0.8 * low, 0.8 * high, (count, robot.dof))
+
+
+@cache
+def calibrated(
+    name: str = "six axes", noise: float = 5e-5, seed: int = 0
+) -> tuple[ro.calibration.Calibration, np.ndarray]:
+    """Return a calibration from noisy positions, and the true deviations."""
+    problem, truth = simulated(noise=noise, seed=seed, robot=ROBOTS[name], configurations=60)
+    return ro.calibrate(problem, ro.tikhonov, 1.0), truth
+
+
+@cache
+def known(name: str = "six axes") -> ro.calibration.Calibration:
+    """Return a calibration that knows its robot exactly."""
+    result, truth = calibrated(name)
+    return replace(result, x=truth)
+
+
+def reading(result: ro.calibration.Calibration, x: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the reflector's poses (N, 7) in the instrument's frame."""
+    y = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(q), 1))
+    return result.problem.on(ro.Dataset.of(q, y, np.eye(6), measurement=pose)).modelled(x)[0]
+
+
+def wanted(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
+    """Return the poses that the nominal robot with the nominal tool would have in the base as identified."""
+    base = [name.startswith("base_") for name in result.problem.parameters.free.names]
+    return reading(result, np.where(base, result.x, 0.0), q)
+
+
+def misses(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances and the angles between poses (N, 7)."""
+    turn = Rotation.from_quat(a[:, [4, 5, 6, 3]]) * Rotation.from_quat(b[:, [4, 5, 6, 3]]).inv()
+    return np.linalg.norm(a[:, :3] - b[:, :3], axis=1), turn.magnitude()
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def ok(found: ro.use.Compensation) -> np.ndarray:
+    return np.array(found.status) == "ok"
+
+
+def exact(found: ro.use.Compensation) -> np.ndarray:
+    """Rows that reach their target by a small correction: what keeps a command weighs 1e-10, not nothing."""
+    return ok(found) & (np.abs(found.q - found.nominal) < 0.1).all(axis=1)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_true_robot_misses_by_no_more_than_the_calibration(name: str) -> None:
+    result, truth = calibrated(name)
+    q = commands(ROBOTS[name], 300)
+    found = ro.use.compensate(result, q, largest=0.5)
+    good = ok(found)
+    assert good.mean() > 0.75
+    there = wanted(result, q)
+    before = misses(reading(result, truth, q), there)[0][good]
+    after = misses(reading(result, truth, found.q), there)[0][good]
+    fresh = ro.Dataset.of(q, reading(result, truth, q)[:, :3], 1.0)
+    validation = result.errors(fresh)
+    assert before.mean() > 2e-3
+    assert rms(after) == pytest.approx(rms(validation), rel=0.2)
+    assert rms(found.std) == pytest.approx(rms(validation), rel=0.5)
+    assert found.position_before[good] == pytest.approx(before, abs=4 * rms(validation))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_robot_that_is_known_exactly_goes_exactly_there(name: str) -> None:
+    result, q = known(name), commands(ROBOTS[name])
+    found = ro.use.compensate(result, q, largest=0.5)
+    place, turn = misses(reading(result, result.x, found.q), wanted(result, q))
+    good = exact(found)
+    assert good.mean() > 0.4
+    assert found.position_error[ok(found)].max() <= 1e-7
+    assert place[good].max() < 1e-10
+    assert place == pytest.approx(found.position_error, abs=1e-12)
+    # Rotation.magnitude takes the root of a rounding error
+    assert turn == pytest.approx(found.orientation_error, abs=3e-8)
+    if name == "SCARA":  # roll and pitch of four joints stay as they are
+        assert found.orientation_error.max() < 2 * found.orientation_before.max()
+    else:
+        assert found.orientation_error[good].max() < 1e-10
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_positions_alone_need_smaller_corrections(name: str) -> None:
+    result, q = known(name), commands(ROBOTS[name])
+    both, place = ro.use.compensate(result, q), ro.use.compensate(result, q, orientation=False)
+    assert np.isnan(place.orientation_error).all()
+    good = exact(place)
+    assert good.mean() > 0.4
+    assert misses(reading(result, result.x, place.q), wanted(result, q))[0][good].max() < 1e-10
+    good &= exact(both)
+    spans = ranges(ROBOTS[name])
+    short, long = (np.linalg.norm((each.q - q)[good] / spans, axis=1) for each in (place, both))
+    assert (short <= 1.1 * long).all()  # the shortest, to first order
+
+
+@pytest.mark.parametrize(("name", "orientation"), [("seven axes", True), ("six axes", False)])
+def test_a_redundant_robot_makes_the_shortest_correction(name: str, orientation: bool) -> None:
+    """Its part along the directions that move nothing is of second order."""
+    result, robot = known(name), ROBOTS[name]
+    found = ro.use.compensate(result, commands(robot), orientation=orientation)
+    spans = ranges(robot)
+    for q, corrected in zip(found.nominal[ok(found)], found.q[ok(found)], strict=True):
+        J = numeric_jacobian(result, q)[: 6 if orientation else 3] * spans
+        D = (corrected - q) / spans
+        still = np.linalg.svd(J)[2][len(J) :]
+        assert np.linalg.norm(still @ D) < 10 * np.linalg.norm(D) * np.abs(corrected - q).max()
+
+
+def ranges(robot: ro.robot.Robot) -> np.ndarray:
+    """Return the joints' ranges, in units of the smallest among revolute and among prismatic ones."""
+    turns = np.array(robot.joint_types) == "revolute"
+    spans = np.where(np.isfinite(robot.limits).all(axis=1), np.ptp(robot.limits, axis=1), 2 * np.pi)
+    return np.where(turns, spans / spans[turns].min(), 1.0)  # of prismatic ones there is at most one
+
+
+def numeric_jacobian(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
+    """Return the derivative (6, n) of the true reflector's pose by joint values, by central differences."""
+    h, columns = 1e-5, []
+    for step in h * np.eye(len(q)):
+        a, b = reading(result, result.x, np.array([q + step, q - step]))
+        turn = Rotation.from_quat(a[[4, 5, 6, 3]]) * Rotation.from_quat(b[[4, 5, 6, 3]]).inv()
+        columns.append(np.concatenate([a[:3] - b[:3], turn.as_rotvec()]) / (2 * h))
+    return np.column_stack(columns)
+
+
+def pose_error(result: ro.calibration.Calibration, q: np.ndarray, target: np.ndarray) -> np.ndarray:
+    is_ = reading(result, result.x, q[None])[0]
+    turn = Rotation.from_quat(target[[4, 5, 6, 3]]) * Rotation.from_quat(is_[[4, 5, 6, 3]]).inv()
+    return np.concatenate([target[:3] - is_[:3], turn.as_rotvec()])
+
+
+def test_damped_rows_minimize_what_the_docstring_says() -> None:
+    result, largest = known(), 0.1
+    q = commands(ARM, 40)
+    q[:, 4] = np.random.default_rng(2).uniform(-0.01, 0.01, 40)
+    found, target = ro.use.compensate(result, q, largest=largest), wanted(result, q)
+    rows = [i for i, s in enumerate(found.status) if s == "near singular"]
+    inside = [i for i in rows if np.abs(found.q[i] - q[i]).max() < 0.99 * largest]
+    assert len(inside) > 20
+    for i in inside[:8]:
+        U, s, Vt = np.linalg.svd(numeric_jacobian(result, q[i]))
+        e = U.T @ pose_error(result, q[i], target[i])
+        P = Vt.T * np.maximum((e / largest) ** 2 - s**2, 0.0) @ Vt
+
+        def objective(D: np.ndarray, i: int = i, P: np.ndarray = P) -> float:
+            return float(np.sum(pose_error(result, q[i] + D, target[i]) ** 2) + D @ P @ D)
+
+        D = found.q[i] - q[i]
+        best, h = objective(D), 1e-3
+        for step in h * np.eye(6):
+            assert best <= objective(D + step)
+            assert best <= objective(D - step)
+
+
+def test_corrections_stay_small_at_a_singular_wrist() -> None:
+    result, largest = known(), 0.1
+    q = np.tile(commands(ARM, 1)[0], (201, 1))
+    q[:, 4] = np.linspace(-0.3, 0.3, 201)
+    found = ro.use.compensate(result, q, largest=largest)
+    change = found.q - q
+    assert np.abs(change).max() <= largest + 1e-12
+    assert found.status[100] == "near singular"
+    assert found.status[0] == found.status[-1] == "ok"
+    total = np.hypot(found.position_error, found.orientation_error)
+    assert (total <= np.hypot(found.position_before, found.orientation_before)).all()
+    # at the singularity the joints hardly move along it: what is left is orientation about one axis, mostly
+    assert np.abs(change[100]).max() < 0.03
+    assert "Near singular: " in str(found)
+
+
+def limited() -> tuple[ro.calibration.Calibration, np.ndarray]:
+    """Return an exactly known robot and commands, of which every second stands at a limit of some joint."""
+    q = commands(ARM, 40)
+    limits = np.tile([-2.0, 2.0], (6, 1))
+    q[::2, 1] = 2.0
+    q[::4, 3] = -2.0
+    result = known()
+    problem = ro.CalibrationProblem(
+        ro.robot.Robot("limited", ARM.mdh, limits=limits), result.problem.parameters, result.problem.data
+    )
+    return replace(result, problem=problem), q
+
+
+def test_joint_limits_hold_and_the_rest_is_the_best_within_them() -> None:
+    result, q = limited()
+    found, target = ro.use.compensate(result, q, largest=0.5), wanted(result, q)
+    assert (np.abs(found.q) <= 2.0).all()
+    rows = [i for i, s in enumerate(found.status) if s == "limited"]
+    assert len(rows) > 5
+    assert any(s == "ok" for s in found.status[::2])  # a limit that the correction leaves does not matter
+    for i in rows:
+        low, high = np.maximum(q[i] - 0.5, -2.0), np.minimum(q[i] + 0.5, 2.0)
+        inner = np.clip(found.q[i], low + 1e-9, high - 1e-9)
+        best = least_squares(
+            lambda v, i=i: pose_error(result, v, target[i]), inner, bounds=(low, high), xtol=1e-14, ftol=1e-14
+        )
+        mine = np.sum(pose_error(result, found.q[i], target[i]) ** 2) / 2
+        assert mine <= best.cost * (1 + 1e-6) + 1e-20
+    outside = q.copy()
+    outside[:, 0] = 2.3
+    assert (np.abs(ro.use.compensate(result, outside).q) <= 2.0).all()
+
+
+def test_poses_are_reached_from_a_start_and_without_one() -> None:
+    result, _ = limited()
+    q = commands(ARM, 200, seed=5)
+    poses = nominal_poses(result, q)
+    near = q + np.random.default_rng(0).uniform(-0.05, 0.05, q.shape)
+    found = ro.use.compensate(result, near, poses, largest=0.5)
+    same = ro.use.compensate(result, q, largest=0.5)
+    close = (np.abs(found.nominal - q).max(axis=1) < 1e-7) & ok(same)  # not the other branch of a singularity
+    assert close.mean() > 0.8
+    assert found.q[close] == pytest.approx(same.q[close], abs=1e-6)
+    searched = ro.use.compensate(result, poses=poses, largest=0.5)
+    assert (np.abs(searched.nominal) <= 2.0).all()
+    place, turn = misses(nominal_poses(result, searched.nominal), poses)
+    assert ((place < 1e-7) & (turn < 1e-7)).mean() > 0.99  # every one can be had; limits are narrow
+    assert ok(ro.use.compensate(result, poses=poses[:, :3])).mean() > 0.98
+
+
+def nominal_poses(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
+    """Return the nominal poses (N, 7) in the robot's base."""
+    return reading(result, np.zeros_like(result.x), q)  # the simulated base is stated at the origin
+
+
+def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
+    result = known()
+    far = np.array([[3.0, 0.5, 1.0], [0.0, -4.0, 0.2], [0.2, 0.1, 0.4]])
+    found = ro.use.compensate(result, poses=far)
+    assert found.status[:2] == ("unreachable", "unreachable")
+    for i in (0, 1):
+
+        def error(q: np.ndarray, i: int = i) -> np.ndarray:
+            return far[i] - base_position(result, q)
+
+        nearest = min(least_squares(error, start, max_nfev=60).cost for start in commands(ARM, 4))
+        assert found.position_error[i] == pytest.approx(
+            np.sqrt(2 * nearest), abs=3e-4
+        )  # the outstretched arm: a flat valley
+        assert np.linalg.norm(error(found.q[i])) == pytest.approx(found.position_error[i], abs=1e-10)
+    assert f"Unreachable: 1 ({1e3 * found.position_error[0]:.3f} mm left)" in str(found)
+
+
+def base_position(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
+    """Return where the true reflector is in the robot's base."""
+    free = result.problem.parameters.free
+    x = np.where([name.startswith("base_") for name in free.names], 0.0, result.x)
+    return reading(result, x, q[None])[0, :3]
+
+
+def test_a_row_does_not_depend_on_the_others() -> None:
+    result, q = limited()
+    q[1::3, 4] = 0.0
+    together = ro.use.compensate(result, q)
+    assert set(together.status) >= {"ok", "limited", "near singular"}
+    for i in range(0, 40, 3):
+        alone = ro.use.compensate(result, q[i : i + 1])
+        assert alone.q[0] == pytest.approx(together.q[i], abs=1e-11)
+        assert alone.status[0] == together.status[i]
+        assert alone.std[0] == pytest.approx(together.std[i])
+    poses = nominal_poses(result, q)
+    searched = ro.use.compensate(result, poses=poses)
+    assert ro.use.compensate(result, poses=poses[7:8]).q[0] == pytest.approx(searched.q[7], abs=1e-9)
+
+
+def test_the_predicted_uncertainty_covers_what_is_missed() -> None:
+    """Mean square miss over its prediction, 60 calibrations with deviations and noise as the scales say."""
+    ratios, q = [], commands(ARM, 40)
+    for seed in range(60):
+        problem, truth = simulated(noise=5e-5, seed=seed, configurations=30)
+        result = ro.calibrate(problem, ro.tikhonov, 1.0)
+        found = ro.use.compensate(result, q)
+        good = ok(found)
+        place = misses(reading(result, truth, found.q), wanted(result, q))[0]
+        ratios.append(np.mean((place / found.std)[good] ** 2))
+    # the standard error of the mean is about 0.04
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_base_is_compensated_only_when_asked() -> None:
+    result, q = known(), commands(ARM)
+    moved = ro.use.compensate(result, q, base=True, largest=0.5)
+    there = reading(result, np.zeros_like(result.x), q)  # base, robot and tool as stated
+    good = ok(moved)
+    assert good.mean() > 0.7
+    assert misses(reading(result, result.x, moved.q), there)[0][good].max() < 1e-10
+    stays = ro.use.compensate(result, q, largest=0.5)
+    assert misses(reading(result, result.x, stays.q), there)[0].min() > 1e-3
+
+
+def test_a_tool_of_ones_own_is_taken_as_it_is() -> None:
+    result, q = known(), commands(ARM)
+    tool = [0.1, 0.02, 0.15, 0.3, -0.2, 0.1]
+    found = ro.use.compensate(result, q, tool=tool, largest=0.5)
+    parameters = ro.robot.model_parameters(ARM, tools={"": tool}).identify(["alpha?", "a?", "theta?", "d?", "beta3"])
+    own = ro.CalibrationProblem(ARM, parameters, result.problem.data)
+    robot = ~result.problem.parameters.of_frames[result.problem.parameters.identified]
+    same = replace(result, problem=own, x=result.x[robot])
+    target = reading(same, np.zeros(robot.sum()), q)
+    good = ok(found)
+    assert good.mean() > 0.75
+    assert misses(reading(same, same.x, found.q), target)[0][good].max() < 1e-10
+    assert (found.std > ro.use.compensate(result, q).std).all()  # the flange is known less than the reflector
+
+
+def test_several_reflectors_and_torques() -> None:
+    instance = ro.load("markers")
+    result = ro.calibrate(instance.problem, instance.formulation, 1.0)
+    q = instance.problem.data.q[:5]
+    marker = instance.problem.data.blocks[0].markers[0]
+    assert ok(ro.use.compensate(result, q, marker=marker, orientation=False)).all()
+    with pytest.raises(ro.InputError, match="marker: found ''"):
+        ro.use.compensate(result, q)
+    elastic = ro.load("joints")
+    result = ro.calibrate(elastic.problem, elastic.formulation, 1.0)
+    block = elastic.problem.data.blocks[0]
+    q, torque = block.q[:20, 0], block.torque[:20, 0]
+    found = ro.use.compensate(result, q, torque=torque, orientation=False)
+    data = replace(ro.Dataset.of(found.q, np.zeros((20, 3)), 1.0))
+    loaded = replace(data, blocks=(replace(data.blocks[0], torque=torque[:, None]),))
+    is_ = result.problem.on(loaded).modelled(result.x)[0]
+    assert np.linalg.norm(is_ - wanted_position(result, q, torque), axis=1)[ok(found)].max() < 1e-7
+    with pytest.raises(ro.InputError, match="without joint torques"):
+        ro.use.compensate(result, q)
+
+
+def wanted_position(result: ro.calibration.Calibration, q: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    base = [name.startswith("base_") for name in result.problem.parameters.free.names]
+    data = ro.Dataset.of(q, np.zeros((len(q), 3)), 1.0)
+    loaded = replace(data, blocks=(replace(data.blocks[0], torque=torque[:, None]),))
+    return result.problem.on(loaded).modelled(np.where(base, result.x, 0.0))[0]
+
+
+def test_a_formulation_without_covariance_has_no_uncertainty() -> None:
+    result, _ = calibrated()
+    sparse = ro.calibrate(result.problem, ro.lasso, 1.0)
+    found = ro.use.compensate(sparse, commands(ARM, 5))
+    assert np.isinf(found.std).all()
+    assert "uncertainty" not in str(found)
+
+
+@pytest.mark.parametrize("orientation", ["qw,qx,qy,qz", "rx_deg,ry_deg,rz_deg", ""])
+def test_tables_of_targets_in_and_of_commands_out(tmp_path: Path, orientation: str) -> None:
+    result, q = known("SCARA"), commands(SCARA, 6)
+    names, unit = ["q1_deg", "q2_deg", "q3_mm", "q4_deg"], np.array([np.pi / 180, np.pi / 180, 1e-3, np.pi / 180])
+    poses = nominal_poses(result, q)
+    angles = Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_euler("xyz", degrees=True)
+    turn = {"qw,qx,qy,qz": poses[:, 3:], "rx_deg,ry_deg,rz_deg": angles, "": np.empty((6, 0))}[orientation]
+    head = ["label", *names, "x_mm", "y_mm", "z_mm", *orientation.split(",")]
+    write(tmp_path / "both.csv", head, np.hstack([q / unit, 1e3 * poses[:, :3], turn]))
+    write(tmp_path / "joints.csv", ["label", *names], q / unit)
+    write(tmp_path / "poses.csv", ["label", *head[5:]], np.hstack([1e3 * poses[:, :3], turn]))
+    targets = ro.read_targets(tmp_path / "both.csv", SCARA)
+    assert targets.label == tuple("ABCDEF")
+    assert targets.q == pytest.approx(q)
+    assert targets.poses == pytest.approx(poses[:, : 7 if orientation else 3], abs=1e-12)
+    assert ro.read_targets(tmp_path / "joints.csv", SCARA).poses is None
+    assert ro.read_targets(tmp_path / "poses.csv", SCARA).q is None
+    out = tmp_path / "out" / "commands.csv"
+    found = ro.use.compensate_file(result, tmp_path / "joints.csv", out)
+    with out.open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["label"] for row in rows] == list("ABCDEF")
+    assert [row["status"] for row in rows] == list(found.status)
+    written = np.array([[float(row[name]) for name in names] for row in rows]) * unit
+    assert written == pytest.approx(found.q, abs=1e-10)
+    assert float(rows[0]["std_mm"]) == pytest.approx(1e3 * found.std[0], abs=1e-6)
+    again = ro.use.compensate_file(result, tmp_path / "both.csv", out)
+    assert again.position_error.max() < 1e-7
+    assert "6 targets" in str(again)
+
+
+def write(path: Path, head: list[str], values: np.ndarray) -> None:
+    lines = [",".join(filter(None, head))]
+    lines += [",".join(["ABCDEF"[i], *(repr(float(v)) for v in row)]) for i, row in enumerate(values)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_bad_input_is_answered_in_a_sentence_and_leaves_the_file(tmp_path: Path) -> None:
+    result, q = known(), commands(ARM, 3)
+    wrong = {
+        "targets: found neither joint values nor poses": {},
+        r"q: found shape \(3, 5\), accepted: \(3, 6\)": {"q": q[:, :5]},
+        "q, row 2: found .* accepted: finite numbers": {"q": np.where([[0], [1], [0]], np.nan, q)},
+        r"poses: found shape \(3, 4\), accepted: \(3, 7\) or \(3, 3\)": {"poses": np.zeros((3, 4))},
+        "poses, row 1: found a quaternion of norm 0": {"poses": np.zeros((3, 7))},
+        r"torque: found shape \(2, 6\)": {"q": q, "torque": q[:2]},
+        "largest: found 0": {"q": q, "largest": 0},
+        "label: found 2 labels": {"q": q, "label": ("a", "b")},
+        r"tool: found \[1, 2\]": {"q": q, "tool": [1, 2]},
+        "marker: found 'B'": {"q": q, "marker": "B"},
+    }
+    for message, arguments in wrong.items():
+        with pytest.raises(ro.InputError, match=message):
+            ro.use.compensate(result, **arguments)
+    table, out = tmp_path / "targets.csv", tmp_path / "out.csv"
+    out.write_text("what was there")
+    for text, message in {
+        "label,speed\na,1\n": f"{table.name}, the header: found no targets",
+        "q1_deg,q2_deg\n1,2\n": "'q3'",
+        "x_mm,y_mm\n1,2\n": "'z'",
+        "x_mm,y_mm,z_mm,qw,qx,qy,qz\n0,0,0,2,0,0,0\n": "row 1: found a quaternion of norm 2",
+        "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n1,2,3,4,5,x\n": "row 1, column q6_deg: found 'x'",
+    }.items():
+        table.write_text(text)
+        with pytest.raises(ro.InputError, match=message):
+            ro.use.compensate_file(result, table, out)
+    assert out.read_text() == "what was there"
