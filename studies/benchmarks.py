@@ -22,12 +22,15 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt import conic
-from rpim_opt.phases import clock
-from rpim_opt.problem import ROWS, CalibrationProblem, reduced_rows
-from rpim_opt.streaming import PartitionedProblem, on_cluster, partitions
-from rpim_opt.study import Metric, Report, find_study, load_study
-from rpim_opt.text import markdown
+from rpim_opt.basics.phases import clock
+from rpim_opt.basics.text import markdown
+from rpim_opt.convex import conic
+from rpim_opt.problem.linear import reduced_rows
+from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.triangles import ROWS, reduced
+from rpim_opt.study.grid import find_study, load_study
+from rpim_opt.study.report import Metric, Report
 
 QUESTION = "How fast is a calibration, and what do a million configurations cost?"
 PART = 50_000
@@ -84,7 +87,7 @@ def _arm(bounds: bool) -> tuple[CalibrationProblem, np.ndarray, np.ndarray]:
         peers.write_problem(Path(folder), "clean52", 0)
         calib = np.loadtxt(Path(folder) / "calib.csv", delimiter=",", skiprows=1)
     robot = ro.load("paper_arm").problem.robot
-    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
     parameters = parameters.scaled({"length_mm": 1, "angle_mrad": 1, "tool_mm": 1})
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
     if bounds:
@@ -117,7 +120,7 @@ def _small() -> dict[str, Any]:
         "SciPy": _median(lambda: least_squares(lambda x: (positions(x, q) - p).ravel(), x0, method="lm"), 11),
     }
     bounded, _, _ = _arm(bounds=True)
-    program = ro.bounded.compile(bounded.linearize(np.zeros(27)))
+    program = ro.convex.pose(ro.bounded, bounded.linearize(np.zeros(27)))
     s = program.model.svd[1]
     weights = np.geomspace(1e-4 * s[s > 0][-1] ** 2, 10 * s[0] ** 2, 200)
     inside = [float(np.abs(e.z).max()) for e in program.path(weights)]
@@ -172,7 +175,7 @@ def _tables(folder: Path, count: int) -> tuple[PartitionedProblem, np.ndarray]:
     from pyarrow import parquet
 
     robot = ro.load("paper_arm").problem.robot
-    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]", "base_*"])
     truth = 0.3 * np.random.default_rng(0).normal(size=len(parameters.free)) * parameters.free.scale
     files = []
@@ -194,7 +197,7 @@ def _rows(count: int) -> dict[str, Any]:
         problem, truth = _tables(Path(folder), count)
         first = problem.parts[0]()
         warm = CalibrationProblem(problem.robot, problem.parameters, first)
-        warm.reduced(0 * truth)  # compiles, where that pays
+        reduced(warm, 0 * truth)  # compiles, where that pays
         ro.calibrate(warm.on(first.take(range(500))), ro.tikhonov, ro.reml)
         with clock() as running:
             start = time.perf_counter()
@@ -219,7 +222,6 @@ def _cluster(count: int) -> dict[str, Any]:
     """Return seconds and the workers' memory of a calibration on a Dask cluster of two processes on this machine."""
     warnings.simplefilter("ignore")
     off: Any = None  # the annotation says str
-    from dataclasses import replace
 
     from distributed import Client, LocalCluster
 
@@ -230,7 +232,10 @@ def _cluster(count: int) -> dict[str, Any]:
             Client(cluster) as client,
         ):
             start = time.perf_counter()
-            result = ro.calibrate(replace(problem, compute=on_cluster(client)), ro.tikhonov, ro.reml)
+            spread = PartitionedProblem(
+                problem.robot, problem.parameters, problem.sample().data, problem.parts, on_cluster(client)
+            )
+            result = ro.calibrate(spread, ro.tikhonov, ro.reml)
             seconds = time.perf_counter() - start
             peak: Any = client.run(lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     return {

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.baselines import levenberg_marquardt
-from rpim_opt.study import Metric, Report, distributions
-from rpim_opt.text import markdown
+from rpim_opt.basics.text import markdown
+from rpim_opt.calibration.baselines import levenberg_marquardt
+from rpim_opt.study.figures import distributions
+from rpim_opt.study.report import Metric, Report
 
 QUESTION = "How near do formulations come to the truth: 52 configurations, ten, or four blunders?"
 SITUATIONS = {"clean52": (52, 0), "few10": (10, 0), "blunders52": (52, 4)}
@@ -44,7 +45,7 @@ def run(situation: str, scales: str, seed: int) -> dict[str, float]:
     count, blunders = SITUATIONS[situation]
     robot = ro.load("paper_arm").problem.robot
     identify = ["alpha?", "a?", "theta?", "d?", "tool_[xyz]"]
-    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]}).identify(identify)
+    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]}).identify(identify)
     truth = rng.normal(size=len(parameters.free)) * parameters.scaled(SCALES["spread"]).free.scale
     limit = np.radians(120)
     q, q_valid = rng.uniform(-limit, limit, (count, 6)), rng.uniform(-limit, limit, (500, 6))

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.baselines import gauss_newton, levenberg_marquardt
-from rpim_opt.files import write_text
-from rpim_opt.observability import combination
-from rpim_opt.problem import CalibrationProblem
-from rpim_opt.robot import Array
-from rpim_opt.simulation import write_simulation
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.files import write_text
+from rpim_opt.basics.text import markdown
+from rpim_opt.calibration.baselines import gauss_newton, levenberg_marquardt
+from rpim_opt.problem.observability import combination
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.store.simulation import write_simulation
 from rpim_opt.study import Metric, Report
-from rpim_opt.text import markdown
 
 QUESTION = "What can which instrument identify, with how many configurations, and what do redundant parameters cost?"
 ROBOTS = ("ur10e", "kr6_r900", "irb4600_60_205", "panda")
@@ -95,7 +95,7 @@ def run(part: str, robot: str, instrument: str, count: int, seed: int) -> dict[s
 
 
 def _structure(problem: CalibrationProblem) -> dict[str, Any]:
-    seen = ro.observe(problem)
+    seen = ro.problem.observe(problem)
     return {
         "parameters": len(seen.names),
         "rank": seen.rank,
@@ -108,7 +108,7 @@ def _structure(problem: CalibrationProblem) -> dict[str, Any]:
 
 def _freedom(problem: CalibrationProblem) -> dict[str, Any]:
     """Fit everything, and then a set of independent parameters, by three methods that know no penalty."""
-    chosen = {next(iter(terms)) for terms in ro.observe(problem).base}
+    chosen = {next(iter(terms)) for terms in ro.problem.observe(problem).base}
     own = np.array([name in chosen for name in problem.parameters.names])
     found: dict[str, Any] = {}
     for name, each in (("all", problem), ("independent", problem.identifying(own & problem.parameters.identified))):

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.parameters import Parameters
-from rpim_opt.problem import LinearModel
-from rpim_opt.study import Metric, Report, distributions
-from rpim_opt.text import markdown
+from rpim_opt.basics.text import markdown
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.study.figures import distributions
+from rpim_opt.study.report import Metric, Report
 
 NOISES = (1e-1, 1e-2, 1e-3, 1e-4)
 SELECTORS = (ro.l_curve, ro.corner, ro.gcv, ro.reml, ro.discrepancy, ro.quasi_optimality, ro.leave_one_out, ro.ncp)
@@ -97,7 +98,7 @@ def run(problem: str, noise: float, seed: int, n: int = 64) -> dict[str, float]:
     size = np.linalg.norm(x) / np.sqrt(n)  # the scale: the root mean square of the solution
     names = tuple(f"a{i}" for i in range(n))
     p = Parameters(names, ("length",) * n, np.zeros(n), np.ones(n), np.full(n, np.inf), np.ones(n, dtype=bool))
-    program = ro.tikhonov.compile(LinearModel(A * size / sigma, b / sigma, np.arange(n), p))
+    program = ro.convex.pose(ro.tikhonov, LinearModel(A * size / sigma, b / sigma, np.arange(n), p))
 
     def error(weight: float) -> float:
         return float(np.linalg.norm(size * program.path([weight])[0].z - x))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
+from rpim_opt.basics.text import markdown
 from rpim_opt.study import Metric, Report
-from rpim_opt.text import markdown
 
 QUESTION = "How does the error fall with the noise and the number of configurations, and how near is it to the bound?"
 NOISES, COUNTS = (0.01, 0.03, 0.1, 0.3), (8, 12, 20, 35, 60, 100)
@@ -30,7 +30,7 @@ def run(noise_mm: float, count: int, seed: int) -> dict[str, float]:
     """Return the mean square error of predicted positions and its bound [mm^2], by Tikhonov and least squares."""
     rng, sigma = np.random.default_rng([seed, count, round(1e3 * noise_mm)]), 1e-3 * noise_mm
     robot, limit = ro.load("paper_arm").problem.robot, np.radians(120)
-    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
     parameters = parameters.scaled({"length_mm": 0.3, "angle_mrad": 1.0, "tool_mm": 0.5})
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
     truth = rng.normal(size=len(parameters.free)) * parameters.free.scale

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.baselines import gauss_newton, gradient_descent, linear_least_squares
-from rpim_opt.instances import problems_folder
-from rpim_opt.problem import CalibrationProblem
-from rpim_opt.robot import Array
-from rpim_opt.selection import weight_grid
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import markdown
+from rpim_opt.calibration.baselines import gauss_newton, gradient_descent, linear_least_squares
+from rpim_opt.convex.selection import weight_grid
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.store.named import problems_folder
 from rpim_opt.study import Metric, Report
-from rpim_opt.text import markdown
 
 QUESTION = "Which of the paper's tables and figures does its published data give, and how much better can one do?"
 METRICS = {
@@ -155,7 +155,7 @@ def _simulated(seed: int) -> dict[str, Any]:
     """Return errors at 52 simulated measurements, and true errors at the configurations of Table 8."""
     rng = np.random.default_rng([seed, 52])
     robot = ro.load("paper_arm").problem.robot
-    parameters = ro.model_parameters(robot, tools={"": [*TOOL, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [*TOOL, 0, 0, 0]})
     parameters = parameters.identify(["alpha?", "a?", "d?", "theta?", "beta[34]"])
     empty = CalibrationProblem(robot, parameters, ro.Dataset.of(np.zeros((1, 6)), np.zeros((1, 3)), SIGMA))
     q = spread(empty, 52, rng)

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.exceptions import RpimError
-from rpim_opt.files import write_json, write_text
+from rpim_opt.basics.exceptions import RpimError
+from rpim_opt.basics.files import write_json, write_text
+from rpim_opt.basics.text import markdown
 from rpim_opt.study import Metric, Report
-from rpim_opt.text import markdown
 
 QUESTION = "Is rpim_opt more accurate than pybotics, robotkinecal, figaroh and SciPy on the same measurements?"
 HERE = Path(__file__).resolve().parent
@@ -146,7 +146,7 @@ def write_problem(folder: Path, situation: str, seed: int) -> np.ndarray:
     q, q_valid = rng.uniform(-limit, limit, (count, 6)), rng.uniform(-limit, limit, (500, 6))
     spread = {"alpha": 1e-3, "a": 3e-4, "theta": 1e-3, "d": 3e-4}
     drawn = {name: rng.normal(0, scale, 6) for name, scale in spread.items()}
-    parameters = ro.model_parameters(robot, tools={"": [*tool, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [*tool, 0, 0, 0]})
     parameters = parameters.identify([f"{name}?" for name in spread] + ["tool_[xyz]"])
     place = {f"{name}{i + 1}": value for name, values in drawn.items() for i, value in enumerate(values)}
     place |= {f"tool_{axis}": value for axis, value in zip("xyz", rng.normal(0, 5e-4, 3), strict=True)}

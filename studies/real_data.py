@@ -1,4 +1,4 @@
-"""Calibrate every set of ../shared/data that is at hand, on its fixed split and with few configurations.
+"""Calibrate the sets of ../shared/data that are at hand, on its fixed split and with few configurations.
 
 The sets stay where they are; without them there is nothing to report. Weights by REML on the identification rows.
 """
@@ -11,18 +11,28 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.study import Metric, Report, distributions
-from rpim_opt.text import markdown
+from rpim_opt.basics.text import markdown
+from rpim_opt.study.figures import distributions
+from rpim_opt.study.report import Metric, Report
 
 QUESTION = "How accurate is a calibration on real measurements, with all configurations and with ten?"
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
+SETS = (
+    "franka_fr3_nadeau",
+    "irb120_cable_robotcali",
+    "irb120_wu",
+    "rokae_lmpytorch",
+    "ur5_jacobi",
+    "wam_jacobi",
+)
+"""What the committed results rest on; other sets of the folder are of measurements that the package does not know."""
 METHODS = ("nominal", "least squares", "rpim-opt")
 METRICS = {"rms_over_least_squares": Metric("lower", 0.02)}
 
 
 def cases(quick: bool) -> list[dict[str, Any]]:
     """Return every set with all its configurations, and with ten or twenty drawn at random."""
-    sets = sorted(p.name for p in FOLDER.iterdir() if (p / "problem.toml").is_file()) if FOLDER.is_dir() else []
+    sets = [name for name in SETS if (FOLDER / name / "problem.toml").is_file()]
     whole = [{"name": name, "count": 0, "seed": 0} for name in sets]
     counts, seeds = ((10,), range(2)) if quick else ((10, 20), range(10))
     return whole + [{"name": n, "count": c, "seed": s} for n in sets for c in counts for s in seeds]

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.study import Metric, Report, distributions
-from rpim_opt.text import markdown
+from rpim_opt.basics.text import markdown
+from rpim_opt.study.figures import distributions
+from rpim_opt.study.report import Metric, Report
 
 QUESTION = "Which selector comes nearest to the best weight on a robot?"
 RULES = (ro.reml, ro.l_curve, ro.corner, ro.gcv, ro.leave_one_out, ro.two_step, ro.discrepancy, ro.quasi_optimality)
@@ -38,7 +39,7 @@ def run(situation: str, seed: int) -> dict[str, float]:
     count, scales, excess = SITUATIONS[situation]
     rng = np.random.default_rng([seed, list(SITUATIONS).index(situation)])
     robot, limit, sigma = ro.load("paper_arm").problem.robot, np.radians(120), 3e-5
-    parameters = ro.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
+    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
     spread = {"length_mm": 0.3, "angle_mrad": 1.0, "tool_mm": 0.5}
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"]).scaled(spread)
     truth = rng.normal(size=len(parameters.free)) * parameters.free.scale
@@ -48,7 +49,7 @@ def run(situation: str, seed: int) -> dict[str, float]:
     y = empty.modelled(truth)[0] + excess * sigma * rng.normal(size=(count, 3))
     problem = empty.on(ro.Dataset.of(q, y, sigma))
     predicted = problem.on(ro.Dataset.of(there, np.zeros((200, 3)), 1.0))
-    want, program = predicted.modelled(truth)[0], ro.tikhonov.compile(problem.linearize(np.zeros_like(truth)))
+    want, program = predicted.modelled(truth)[0], ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros_like(truth)))
 
     def error(weight: float) -> float:
         z = program.path([weight])[0].z

@@ -31,8 +31,8 @@ def main(folder: Path, method: str) -> None:
     calibrate, problem_of, form = ro.calibrate, ro.CalibrationProblem, getattr(ro, formulation)  # imports them
     start = time.perf_counter()
     rows = np.array(table["alpha_a_theta_d"])
-    robot = ro.Robot("benchmark", np.column_stack([rows, np.zeros(len(rows))]))
-    parameters = ro.model_parameters(robot, tools={"": [*table["tool"], 0, 0, 0]}).scaled(scales)
+    robot = ro.robot.Robot("benchmark", np.column_stack([rows, np.zeros(len(rows))]))
+    parameters = ro.robot.model_parameters(robot, tools={"": [*table["tool"], 0, 0, 0]}).scaled(scales)
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
     problem = problem_of(robot, parameters, ro.Dataset.of(calib[:, 3:], calib[:, :3], NOISE))
     rule = getattr(ro, weight) if isinstance(weight, str) else weight
