@@ -11,7 +11,6 @@ from cvxpy.constraints.nonpos import Inequality
 from cvxpy.constraints.zero import Equality
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.conic import Conic
 from rpim_opt.convex.posed import Posed
 
 FEASIBLE = 1e-7
@@ -67,14 +66,9 @@ def _speeds(expression: Any, z: cp.Variable) -> Array:
 def nearest(posed: Posed, z: Array) -> Array:
     """Return the point of the constraints that is nearest to z (n,); z itself where none is found."""
     n = len(z)
-    program = _projection(posed)
+    program = posed.projection
     lift = np.vstack([np.eye(n), np.zeros((posed.r.size, n))])
     found = program.solve(lift, np.zeros(n + posed.r.size), 0.0, 2 * np.eye(n), -2 * z)
     if found.status != cp.OPTIMAL:
         return z
     return found.u
-
-
-def _projection(posed: Posed) -> Conic:
-    every = [constraint for group in posed.constraints for constraint in group]
-    return Conic(0.0 * cp.sum(posed.z), every, [posed.z, posed.r], None)

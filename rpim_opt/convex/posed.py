@@ -311,6 +311,12 @@ class Posed:
         return loss + weight * penalty, weight
 
     @cached_property
+    def projection(self) -> Conic:
+        """The constraints of z alone, with nothing to minimize yet: the distance from a point is added to it."""
+        every = [constraint for group in self.constraints for constraint in group]
+        return Conic(cp.Constant(0.0) * cp.sum(self.z), every, [self.z, self.r], None)
+
+    @cached_property
     def all_constraints(self) -> list[Any]:
         """The constraints of z, and of r where ``largest`` bounds it."""
         every = [constraint for group in self.constraints for constraint in group]
