@@ -1,6 +1,9 @@
 """Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``.
 
-Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet.
+Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet. That
+file has the hashes of all that may be downloaded, and is made by ``uv pip compile --universal --python-version 3.11
+--generate-hashes --no-header --no-annotate --all-extras pyproject.toml -o constraints.txt``. ``requirements.txt``, for
+an installation without tools, is the same without ``--all-extras`` and with ``-c constraints.txt``.
 """
 
 from __future__ import annotations
@@ -31,7 +34,9 @@ def environment() -> None:
     print(f"Setting up {ENVIRONMENT.name} (once, about a minute) ...", file=sys.stderr, flush=True)
     venv.create(ENVIRONMENT, with_pip=True, clear=ENVIRONMENT.exists())
     pip = [BIN / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
-    subprocess.run([*pip, "-c", ROOT / "constraints.txt", "-e", f"{ROOT}[dev]"], check=True)
+    # what is downloaded must have the hashes that were tested; the build backend comes from there, too
+    subprocess.run([*pip, "--require-hashes", "-r", ROOT / "constraints.txt"], check=True)
+    subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", ROOT], check=True)
     stamp.write_text(wanted.hexdigest())
 
 

@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+LONGEST = 1000
+"""Characters of a part of a sentence."""
+
 
 class RpimError(Exception):
     """Base of every error that this package raises on purpose.
@@ -43,15 +46,25 @@ class InputError(RpimError):
 
     def __init__(self, where: str, found: str, accepted: str, file: object = None):
         self.file = file
-        self.where = where
-        self.found = found
-        self.accepted = accepted
-        place = f"{file}, {where}" if file else where
-        super().__init__(f"{place}: found {found}, accepted: {accepted}.")
+        self.where = _one_line(where)
+        self.found = _one_line(found)
+        self.accepted = _one_line(accepted)
+        place = self.where
+        if file:
+            place = f"{_one_line(str(file))}, {self.where}"
+        super().__init__(f"{place}: found {self.found}, accepted: {self.accepted}.")
 
     def within(self, file: object) -> InputError:
         """Return the same error with the file it occurred in, unless it names one already."""
         return self if self.file else InputError(self.where, self.found, self.accepted, file)
+
+
+def _one_line(text: str) -> str:
+    """Return a part of a sentence: what files say may have lines, and be of any length."""
+    line = " ".join(text.splitlines())
+    if len(line) <= LONGEST:
+        return line
+    return f"{line[:LONGEST]}..."
 
 
 class RowError(InputError):

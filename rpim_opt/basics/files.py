@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import tempfile
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import to_jsonable_python
 
-from rpim_opt.basics.exceptions import InputError, RpimError, choices
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.inputs import LARGEST_DATA, read_text
 from rpim_opt.basics.units import UNITS, number, quantities
+from rpim_opt.basics.writing import write_text
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
+Mass = Annotated[float, "mass"]
+Name = Annotated[str, Field(max_length=200)]
+"""A name or a pattern of names: long ones would take for ever to be matched."""
 
 
 class Misfit(ValueError):
@@ -35,10 +36,10 @@ class Misfit(ValueError):
 class Table(BaseModel):
     """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
 
-    A field annotated ``Length`` or ``Angle`` (or listing both) is given under its name plus a unit.
+    A field annotated ``Length``, ``Angle`` or ``Mass`` (or listing several) is given under its name plus a unit.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     @classmethod
     def _dimensions(cls) -> dict[str, tuple[str, ...]]:
@@ -55,7 +56,7 @@ class Table(BaseModel):
         if not isinstance(table, dict):
             return table
         dimensions = cls._dimensions()
-        plain = [name for name in cls.model_fields if name not in dimensions]
+        plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
         others = {key: value for key, value in table.items() if key not in plain}
         si = _quantities(others, dimensions, plain)
         kept = {key: value for key, value in table.items() if key not in others}
@@ -96,22 +97,11 @@ def read_toml(path: Path) -> dict[str, Any]:
     InputError
         If there is no such file, or it is no TOML (with line and column).
     """
-    text = _text(path, "*.toml")
+    text = read_text(path, endings=[".toml"])
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep
         raise InputError("the TOML text", str(error), "TOML 1.0", path) from None
-
-
-def _text(path: Path, alike: str) -> str:
-    """Return a file's text, or say what the folder holds that is ``alike``."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        near = sorted(p.name for p in path.parent.glob(alike)) if path.parent.is_dir() else []
-        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
 
 
 def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
@@ -135,6 +125,8 @@ def _where(loc: tuple[int | str, ...]) -> str:
     """Format pydantic's location the way a person counts: ``joint 3.a``."""
     text = ""
     for part in loc:
+        if isinstance(part, str) and part.startswith("list["):  # which of several types, and no key
+            continue
         text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
     return text
 
@@ -166,36 +158,8 @@ def read_json(path: Path) -> Any:
     InputError
         If there is no such file, or it is no JSON (with line and column).
     """
-    text = _text(path, "*.json")
+    text = read_text(path, LARGEST_DATA, [".json"])
     try:
         return json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits; lists that deep
         raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write text so that ``path`` holds either the whole new text or what it held before."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-@contextmanager
-def refused(path: object) -> Iterator[None]:
-    """Turn what the system refuses while ``path`` is written into a sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise RpimError(f"{path}: cannot be written: {error}.") from None
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes so that ``path`` holds either all of them or what it held before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -5,19 +5,22 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.inputs import LARGEST_DATA, require_file
+from rpim_opt.basics.packed import read_excel, read_parquet
+from rpim_opt.basics.shape import Columns, narrow, rectangle, require_names
 from rpim_opt.basics.units import joint_columns
 
+FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")
+"""What a spreadsheet computes, be it behind apostrophes that keep it from that."""
 MARKERS = [chr(65 + i) for i in range(26)] + [f"M{i}" for i in range(1, 1000)]
-Columns = Mapping[str, Sequence[Any]]
-"""Column name to its cells: text from a CSV file, whatever the table holds elsewhere."""
 
 
 def read_columns(source: Any) -> Columns:
@@ -35,20 +38,23 @@ def read_columns(source: Any) -> Columns:
         If there is no such file, it cannot be read as what its name says, or the table has no rows, a column
         twice, or rows of different lengths.
     """
-    columns = _file(Path(source)) if isinstance(source, str | Path) else _frame(source)
-    if not columns or not len(next(iter(columns.values()))):
-        raise InputError("the table", "a header and no rows" if columns else "an empty table", "at least one row")
+    if isinstance(source, str | Path):
+        columns = _file(Path(source))
+    else:
+        columns = _frame(source)
+    if not columns:
+        raise InputError("the table", "an empty table", "at least one row")
+    if not len(next(iter(columns.values()))):
+        raise InputError("the table", "a header and no rows", "at least one row")
     return columns
 
 
 def _file(path: Path) -> Columns:
-    readers = {".csv": _csv, ".parquet": _parquet, ".xlsx": _excel}
+    readers = {".csv": _csv, ".parquet": read_parquet, ".xlsx": read_excel}
     kind = path.suffix.lower()
     if kind not in readers:
         raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(readers), path)
-    if not path.is_file():
-        near = [p.name for p in path.parent.glob("*") if p.suffix in readers]
-        raise InputError("the file", "nothing", choices(path.name, sorted(near)) if near else "a table there", path)
+    require_file(path, LARGEST_DATA, list(readers))
     return readers[kind](path)
 
 
@@ -56,40 +62,22 @@ def _frame(source: Any) -> Columns:
     """Return the columns of a data frame or a mapping."""
     names = list(getattr(source, "column_names", getattr(source, "columns", source)))
     for name in names:
-        if not isinstance(name, str) or names.count(name) > 1:
+        if not isinstance(name, str):
             raise InputError("the header", f"column {name!r}", "texts as names, every one once")
+    require_names(names)
     return {name.strip(): source[name] for name in names}
 
 
 def _csv(path: Path) -> Columns:
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [row for row in csv.reader(stream, strict=True) if any(cell.strip() for cell in row)]
+            rows = (narrow(row) for row in csv.reader(stream, strict=True) if any(cell.strip() for cell in row))
+            lines = [[_as_written(cell) for cell in row] for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError("the file", str(error), "a readable UTF-8 CSV file") from None
     if lines and len(lines[0]) == 1 and any(mark in lines[0][0] for mark in ";\t"):
         raise InputError("the header", "one column with semicolons or tabs", "columns separated by commas")
-    return _rectangle(lines)
-
-
-def _rectangle(lines: Sequence[Sequence[str]]) -> Columns:
-    """Return the columns of rows of text; the first row is the header."""
-    if not lines:
-        raise InputError("the table", "an empty file", "a header and at least one row")
-    header = [name.strip() for name in lines[0]]
-    _require_names(header)
-    for number, row in enumerate(lines[1:], start=1):
-        if len(row) != len(header):
-            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{len(header)} cells as in the header")
-    return {name: [row[i].strip() for row in lines[1:]] for i, name in enumerate(header)}
-
-
-def _require_names(header: Sequence[str]) -> None:
-    for name in header:
-        if not name:
-            raise InputError("the header", "a column without a name", "every column once, with its name")
-        if header.count(name) > 1:
-            raise InputError("the header", f"column '{name}' twice", "every column once, with its name")
+    return rectangle(lines)
 
 
 def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, list[float]]) -> Columns:
@@ -119,8 +107,7 @@ def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, lis
 
 def _robodk(path: Path, joints: Sequence[str]) -> tuple[dict[str, Sequence[Any]], np.ndarray]:
     """Return joints and measured point under our names, and the reflector's place (N, 3) [mm]."""
-    if not path.is_file():
-        raise InputError("the file", "nothing", "a CSV file of RoboDK")
+    require_file(path, LARGEST_DATA, [".csv"])
     table = list(_csv(path).values())
     if len(table) < len(joints) + 6:
         accepted = f"{len(joints)} joints, 3 measured and 3 of the tool"
@@ -144,62 +131,37 @@ def _marker(place: np.ndarray, tools: dict[str, list[float]]) -> str:
 
 
 def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Return a table as CSV text, one line a row."""
+    """Return a table as CSV text, one line a row.
+
+    A text that a spreadsheet would compute, ``=1+1``, gets an apostrophe before it, which `read_columns` takes away.
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(_harmless(name) for name in header)
+    writer.writerows([_harmless(cell) for cell in row] for row in rows)
     return stream.getvalue()
 
 
-def _parquet(path: Path) -> Columns:
-    parquet = _library("pyarrow.parquet", "Parquet files")
+def _harmless(cell: Any) -> Any:
+    """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
+    if not isinstance(cell, str) or not FORMULA.match(cell) or _is_number(cell):
+        return cell
+    return f"'{cell}"
+
+
+def _is_number(text: str) -> bool:
     try:
-        table = parquet.read_table(path)
-    except (OSError, ValueError) as error:  # pyarrow's own errors derive from these
-        raise InputError("the file", str(error).splitlines()[0], "a readable Parquet file") from None
-    for name in table.column_names:
-        if table.column_names.count(name) > 1:
-            raise InputError("the header", f"column '{name}' twice", "every column once")
-    return {name: _cells(table.column(name)) for name in table.column_names}
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
-def _cells(column: Any) -> Sequence[Any]:
-    """Return a column of numbers without gaps as an array, any other as a list."""
-    numeric = str(column.type) in ("float", "double") or str(column.type).startswith(("int", "uint"))
-    return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
-
-
-def _excel(path: Path) -> Columns:
-    openpyxl = _library("openpyxl", "Excel files")
-    try:
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        cells = list(book.worksheets[0].iter_rows(values_only=True))
-        rows = [[None if cell is None else str(cell) for cell in row] for row in cells]
-        book.close()
-    except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
-        raise InputError("the file", str(error) or type(error).__name__, "a readable Excel workbook (.xlsx)") from None
-    return _rectangle(_trimmed(rows))
-
-
-def _trimmed(rows: list[list[str | None]]) -> list[list[str]]:
-    """Return rows without those that are empty, and without empty columns at their end."""
-    filled = [row for row in rows if any(cell is not None for cell in row)]
-    width = max(map(_width, filled), default=0)
-    return [[cell or "" for cell in row[:width]] for row in filled]
-
-
-def _width(row: Sequence[str | None]) -> int:
-    """Return how far a row is filled."""
-    return max((place for place, cell in enumerate(row, start=1) if cell is not None), default=0)
-
-
-def _library(name: str, what: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError:
-        remedy = "pip install 'rpim-opt[tables]'"
-        raise InputError(what, f"no package {name.split('.')[0]}", remedy) from None
+def _as_written(cell: str) -> str:
+    """Return what `_harmless` was given."""
+    if cell.startswith("'") and FORMULA.match(cell):
+        return cell[1:]
+    return cell
 
 
 def numbers(cells: Sequence[Any], labels: Sequence[str], column: str) -> np.ndarray:

@@ -32,15 +32,23 @@ UNITS = {
     "mm_mrad": Unit("length angle", 1e-6),
     "deg": Unit("angle", math.pi / 180),
     "Nm": Unit("torque", 1.0),
+    "kg": Unit("mass", 1.0),
     "ppm": Unit("ratio", 1e-6),
     "rad_per_Nm": Unit("compliance", 1.0),
     "mrad_per_Nm": Unit("compliance", 1e-3),
 }
 
+LARGEST = 1e7
+"""Size of what can be measured or drawn [m, rad, ...]: map coordinates in metres, a million turns. Beyond it a double
+has no digits left for micrometres."""
+SMALLEST = 1e-15
+"""Standard deviations and scales [SI] that are not zero: below an atom's size, where squares still are numbers."""
+
 DISPLAY = {
     "length": "mm",
     "angle": "deg",
     "torque": "Nm",
+    "mass": "kg",
     "ratio": "ppm",
     "compliance": "mrad_per_Nm",
 }
@@ -98,9 +106,22 @@ def spelled(stem: str, dimensions: Iterable[str], count: int = 9) -> list[str]:
 
 def number(value: Any, where: str) -> float:
     """Return a finite number, or say what stands in its place."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(where, repr(value), "a finite number")
-    return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            if math.isfinite(value):
+                return float(value)
+        except OverflowError:  # an integer beyond all doubles
+            pass
+    raise InputError(where, repr(value)[:60], "a finite number")
+
+
+def require_size(value: Any, where: str, unit: Unit) -> None:
+    """Refuse a value [SI], or one in a list, that no robot and no instrument has: its digits would be lost."""
+    if isinstance(value, list):
+        for each in value:
+            require_size(each, where, unit)
+    elif not abs(value) <= LARGEST:
+        raise InputError(where, f"{value / unit.si:g}", f"a size of at most {LARGEST / unit.si:g}")
 
 
 def quantities(
@@ -132,7 +153,7 @@ def quantities(
     Raises
     ------
     InputError
-        For an unknown key, a missing or wrong unit, a value that is no finite number.
+        For an unknown key, a missing or wrong unit, a value that is no finite number or beyond all sizes.
     """
     result = {}
     for key, value in table.items():
@@ -146,6 +167,7 @@ def quantities(
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")
         result[stem, unit.dimension] = convert(value, place, unit.si)
+        require_size(result[stem, unit.dimension], place, unit)
     return result
 
 

@@ -5,19 +5,26 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import stat
 import subprocess
-import tempfile
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
 import casadi as ca
 
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes
+from rpim_opt.basics.writing import scratch_folder, write_files
+
 FLAGS = ("-O2", "-fPIC", "-shared")
 SWITCH = "RPIM_OPT_COMPILE"
 """Environment variable; 0 leaves everything to CasADi's virtual machine."""
+PATIENCE = 120
+"""Seconds that a compiler gets."""
+OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 @lru_cache(maxsize=256)
@@ -27,49 +34,110 @@ def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
     Without ``make`` only a library that was made before is taken.
 
     The library's name is a digest of its source, of the compiler and of the machine, so that a stale one is never
-    taken; it is made elsewhere and moved there whole. A cache folder that others may write to is not used.
+    taken, and the digest of its content stands beside it, so that a damaged one is made anew. A folder or a library
+    that others may write to is not used.
     """
-    compiler, folder = shutil.which(os.environ.get("CC", "cc")), _cache()
+    compiler = _compiler()
+    folder = _cache()
     if os.environ.get(SWITCH) == "0" or compiler is None or folder is None:
         return None
     generator = ca.CodeGenerator(function.name())
     generator.add(function)
     source = generator.dump()
-    made_of = "\0".join([source, compiler, _version(compiler), *FLAGS, platform.machine(), version("casadi")])
-    library = folder / f"{function.name()}-{hashlib.sha256(made_of.encode()).hexdigest()[:32]}.so"
-    if not library.is_file() and not make:
+    made_of = "\0".join([source, *compiler, _version(compiler), *FLAGS, platform.machine(), version("casadi")])
+    library = (
+        folder / f"{function.name()}-{hashlib.sha256(made_of.encode(errors='surrogateescape')).hexdigest()[:32]}.so"
+    )
+    if not _is_whole(library) and not (make and _make(library, source, compiler)):
         return None
-    if not library.is_file():
-        try:
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:
-                text, made = Path(scratch) / "function.c", Path(scratch) / "function.so"
-                text.write_text(source, encoding="utf-8")
-                command = [compiler, *FLAGS, str(text), "-o", str(made), "-lm"]
-                subprocess.run(command, check=True, capture_output=True, timeout=120)
-                made.replace(library)
-        except (OSError, subprocess.SubprocessError):
-            return None
     try:
         return ca.external(function.name(), str(library))
     except RuntimeError:
         return None
 
 
+def _compiler() -> tuple[str, ...] | None:
+    """Return the command of the compiler, with the options that the variable CC may have; None where there is none."""
+    try:
+        command, *options = shlex.split(os.environ.get("CC") or "cc")
+    except ValueError:  # an open quotation, or nothing
+        return None
+    found = shutil.which(command)
+    if found is None:
+        return None
+    return (found, *options)
+
+
 @lru_cache
-def _version(compiler: str) -> str:
-    done = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False)
+def _version(compiler: tuple[str, ...]) -> str:
+    try:
+        return _run([*compiler, "--version"]).decode(errors="replace")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _run(command: list[str]) -> bytes:
+    done = subprocess.run(command, check=True, stdin=subprocess.DEVNULL, capture_output=True, timeout=PATIENCE)
     return done.stdout
+
+
+def _make(library: Path, source: str, compiler: tuple[str, ...]) -> bool:
+    """Compile a library, and write it with the digest of its content; return whether that went well."""
+    try:
+        with scratch_folder(library.parent / "making") as scratch:
+            text = scratch / "function.c"
+            made = scratch / "function.so"
+            text.write_text(source, encoding="utf-8")
+            _run([*compiler, *FLAGS, str(text), "-o", str(made), "-lm"])
+            content = read_bytes(made, LARGEST_DATA)
+            files = {library: content, _digest_file(library): _digest(content)}
+            for file in files:
+                if os.path.lexists(file) and not _is_ours(file):
+                    file.unlink()
+            write_files(files)
+            for file in files:
+                file.chmod(0o600)  # whatever the umask lets others do
+    except (OSError, subprocess.SubprocessError, InputError):
+        return False
+    return _is_whole(library)
+
+
+def _digest_file(library: Path) -> Path:
+    return library.with_suffix(".sha256")
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.sha256(content).hexdigest().encode()
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is there as it was made, and nobody else may write to it."""
+    try:
+        if not (_is_ours(library) and _is_ours(_digest_file(library))):
+            return False
+        return _digest(read_bytes(library, LARGEST_DATA)) == read_bytes(_digest_file(library))
+    except (OSError, InputError):
+        return False
+
+
+def _is_ours(path: Path) -> bool:
+    found = path.lstat()
+    return stat.S_ISREG(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & OTHERS
 
 
 def _cache() -> Path | None:
     """Return the user's cache folder, if it is the user's alone."""
     if not hasattr(os, "getuid"):
         return None
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rpim_opt"
+    stated = Path(os.environ.get("XDG_CACHE_HOME") or "")
     try:
+        if not stated.is_absolute():  # as the specification of these folders has it
+            stated = Path.home() / ".cache"
+        folder = stated / "rpim_opt"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.stat()
-    except OSError:
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: a user without a home
         return None
-    others = stat.S_IWGRP | stat.S_IWOTH
-    return folder if found.st_uid == os.getuid() and not found.st_mode & others else None
+    if found.st_uid != os.getuid() or found.st_mode & OTHERS:
+        return None
+    return folder

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.inputs import inside
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.plain import read_mdh
 from rpim_opt.robot.urdf import read_urdf
@@ -30,7 +31,7 @@ def robots() -> list[str]:
 def find_robot(name: str, folder: Path | None = None) -> Path:
     """Return the file of a robot: one in ``folder``, or a ready robot by name."""
     if folder is not None and name.endswith(ROBOT_FILES):
-        return folder / name
+        return inside(folder, name, "key robot", folder / "problem.toml")
     if name in robots():
         return READY / f"{name}.toml"
     accepted = "a file .toml, .urdf, .csv or .json, or a ready robot: " + choices(name, robots())

@@ -2,28 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import frame_numbers
-
-LARGEST = 2**24
-"""Bytes that a description may have: a hundred times what the largest public ones need."""
-
-
-def read_bytes(path: Path) -> bytes:
-    """Return a file's content, or say that there is none or too much of it."""
-    try:
-        size = path.stat().st_size if path.is_file() else None
-        if size is None or size > LARGEST:
-            found = "nothing" if size is None else f"{size} bytes"
-            raise InputError("the file", found, f"a file of at most {LARGEST} bytes", path)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError("the file", str(error), "a readable file", path) from None
 
 
 def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:

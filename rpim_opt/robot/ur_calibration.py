@@ -9,11 +9,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_bytes
+from rpim_opt.basics.inputs import read_bytes
+from rpim_opt.basics.writing import write_bytes
 from rpim_opt.robot.chain import Chain, Described, describe, link_of, require_same_arm, without_beta
 from rpim_opt.robot.kinematics import frame_numbers
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.original import read_bytes, spliced
+from rpim_opt.robot.original import spliced
 from rpim_opt.robot.ur_numbers import JOINTS, REVOLUTE, finite
 
 DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}

@@ -10,11 +10,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import write_bytes
+from rpim_opt.basics.inputs import read_bytes
+from rpim_opt.basics.writing import write_bytes
 from rpim_opt.robot.chain import Chain, Described, corrected, describe, require_same_arm
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.original import origin_numbers, read_bytes, spliced
+from rpim_opt.robot.original import origin_numbers, spliced
 from rpim_opt.robot.ur_numbers import JOINTS, REVOLUTE, finite
 
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")

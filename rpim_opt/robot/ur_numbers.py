@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import LARGEST
 
 JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
@@ -20,6 +21,6 @@ def finite(text: str, where: str, path: Path) -> float:
         value = float(text)
     except ValueError:
         value = np.nan
-    if not np.isfinite(value) or "_" in text:
-        raise InputError(where, f"'{text[:40]}'", "a finite number", path)
+    if not abs(value) <= LARGEST or "_" in text:
+        raise InputError(where, f"'{text[:40]}'", f"a finite number, at most {LARGEST:g}", path)
     return value

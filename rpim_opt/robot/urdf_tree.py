@@ -18,8 +18,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.inputs import read_bytes
+from rpim_opt.basics.units import LARGEST
 from rpim_opt.robot.kinematics import numeric_frame
-from rpim_opt.robot.original import origin_numbers, read_bytes
+from rpim_opt.robot.original import origin_numbers
 
 DEEPEST = 100
 """How deep elements may be nested."""
@@ -117,7 +119,8 @@ class Joint:
         lower, upper = (float(self.numbers("limit", which, "0", 1)[0]) for which in ("lower", "upper"))
         if lower > upper:
             raise self.error("limit", f"{lower:g} to {upper:g}", "lower < upper")
-        unlimited = lower == upper or self.element.attributes.get("type") == "continuous"
+        far = max(abs(lower), abs(upper)) > LARGEST  # 1e16 is how some files say that there is none
+        unlimited = far or lower == upper or self.element.attributes.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
     def origin_edits(self, data: bytes, T: Array) -> dict[tuple[int, int], str]:
@@ -140,6 +143,20 @@ class Joint:
 
 def _is_number(text: str, largest: float) -> bool:
     return bool(NUMBER.fullmatch(text)) and abs(float(text)) < largest
+
+
+def floats(text: str, count: int) -> Array:
+    """Return the finite numbers of an attribute.
+
+    Raises
+    ------
+    ValueError
+        For others, or more or fewer of them.
+    """
+    parts = text.split()
+    if len(parts) != count or not all(_is_number(part, LARGEST_NUMBER) for part in parts):
+        raise ValueError(text)
+    return np.array([float(part) for part in parts])
 
 
 def _attributes(values: Mapping[str, str]) -> str:
@@ -168,6 +185,7 @@ class Urdf:
     joints: Mapping[str, Joint]
     above: Mapping[str, Joint]  # by child link
     links: tuple[str, ...]
+    bodies: Mapping[str, Element]
 
     def path_between(self, base: str | None, tip: str | None) -> list[Joint]:
         """Return the joints from link ``base`` to link ``tip``; by default from the root to the only leaf."""
@@ -218,7 +236,7 @@ def read_tree(path: Path) -> Urdf:
     every = {name: Joint(element, name, path) for name, element in joints.items()}
     above = _above(every, links, path)
     _require_tree(links, above, path)
-    return Urdf(path, data, root.attributes.get("name") or path.stem, every, above, tuple(links))
+    return Urdf(path, data, root.attributes.get("name") or path.stem, every, above, tuple(links), links)
 
 
 def _named(root: Element, path: Path) -> tuple[dict[str, Element], dict[str, Element]]:

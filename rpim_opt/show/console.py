@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Timer
-from typing import Any
+from typing import Any, TextIO
 
 
 def show(text: object, document: dict[str, Any], as_json: bool) -> None:
@@ -16,7 +17,37 @@ def show(text: object, document: dict[str, Any], as_json: bool) -> None:
         from rpim_opt.basics.files import json_text
 
         text = json_text(document).rstrip("\n")
-    print(text)  # noqa: T201
+    _say(str(text), sys.stdout)
+
+
+def _say(text: str, stream: TextIO) -> None:
+    """Print a text in which nothing is a command to a terminal, and know whether it arrived."""
+    from rpim_opt.basics.text import visible
+
+    shown = visible(text)
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print(shown.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+@contextmanager
+def arriving() -> Iterator[None]:
+    """End quietly when nobody reads any more, and with a sentence when what is printed cannot be written."""
+    try:
+        yield
+    except BrokenPipeError:
+        _close(sys.stdout)
+        sys.exit(1)
+    except OSError as error:
+        _close(sys.stdout)
+        fail(f"The output cannot be written: {error}.", 2)
+
+
+def _close(stream: TextIO) -> None:
+    """Let go of what a stream still holds; Python would try to write it at the end."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def fail(text: str, code: int) -> None:
@@ -25,13 +56,16 @@ def fail(text: str, code: int) -> None:
         from rpim_opt.basics.files import json_text
 
         text = json_text({"error": text}).rstrip("\n")
-    print(text, file=sys.stderr)  # noqa: T201
+    try:
+        _say(text, sys.stderr)
+    except OSError:  # nobody can be told
+        _close(sys.stderr)
     sys.exit(code)
 
 
 def written_to(path: Path | None, text: str) -> list[Path]:
     """Write a text where a path is given."""
-    from rpim_opt.basics.files import refused, write_text
+    from rpim_opt.basics.writing import refused, write_text
 
     if path is None:
         return []

@@ -9,8 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from rpim_opt.basics.files import write_text
 from rpim_opt.basics.markup import html, tag
+from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.show.section_errors import errors_section

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,6 +24,8 @@ from rpim_opt.store.touching import touching_poses
 
 TORQUE = 20.0
 """Simulated joint torques are uniform up to this [Nm]."""
+MOST = 1_000_000
+"""Configurations of a table."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +53,15 @@ class Shape:
 class Simulation(Table):
     """The keys of ``[simulation]``."""
 
-    seed: int
-    configurations: int = Field(gt=0)
-    validation: int = Field(default=0, ge=0)
+    seed: int = Field(ge=0)
+    configurations: int = Field(gt=0, le=MOST)
+    validation: int = Field(default=0, ge=0, le=MOST)
     spread: float = Field(default=1.0, ge=0)
     joint_share: float = Field(default=0.9, gt=0, le=1)
     blunders: int = Field(default=0, ge=0)
     blunder: Length = 0.0
     markers: dict[str, list[str]] = Field(default_factory=dict)
+    torques: Literal["measured", "gravity"] = "measured"
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -72,8 +75,10 @@ class Truth:
 
     @property
     def with_torques(self) -> bool:
-        """Whether joints give way, so that tables need torques."""
-        return any(name.startswith("compliance") for name in self.parameters.free.names)
+        """Whether joints give way to torques that tables state, and not to those of gravity."""
+        return self.plan.torques == "measured" and any(
+            name.startswith("compliance") for name in self.parameters.free.names
+        )
 
     def by_name(self) -> dict[str, tuple[str, float]]:
         """Return dimension and deviation [SI] by parameter."""

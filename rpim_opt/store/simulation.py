@@ -10,9 +10,11 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import validate, write_text
+from rpim_opt.basics.files import validate
+from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import display, quantities
+from rpim_opt.basics.writing import write_files
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.design import random_candidates
@@ -58,6 +60,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     rng = np.random.default_rng(plan.seed if seed is None else seed)
     if not np.isfinite(stated.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
+    _require_tables(stated)
     shapes = [Shape.of(stated, plan, i) for i in range(len(stated.observations))]
     parameters = _parameters(stated, shapes)
     truth = Truth(parameters, _deviations(parameters, plan, rng, stated.path), plan)
@@ -74,21 +77,44 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     return Simulated(tables, truth.by_name(), tuple(blunders))
 
 
+def _require_tables(stated: Stated) -> None:
+    """Refuse names that something else has: another table, or a file that is no table."""
+    taken: set[Path] = set()
+    for each in stated.observations:
+        for role in ("identification", "validation"):
+            file = getattr(each, role)
+            if not file:
+                continue
+            if not file.lower().endswith(".csv"):
+                raise InputError(f"key {role}", f"{file!r}", "a name ending in .csv, to be written", stated.path)
+            place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
+            if place in taken:
+                raise InputError(f"key {role}", f"{file!r} twice", "a name of its own for every table", stated.path)
+            taken.add(place)
+
+
 def _to_make(stated: Stated, shapes: Sequence[Shape], role: str, count: int) -> Iterator[tuple[Shape, Observation]]:
     """Yield the observations that have a table of a role."""
     for shape, each in zip(shapes, stated.observations, strict=True):
-        if count and getattr(each, role) is not None:
+        if count and getattr(each, role):
             yield shape, each
 
 
 def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
-    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files."""
+    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files.
+
+    All of them lie in it: names that lead elsewhere are refused.
+    """
     made = simulate(name, seed)
     folder = out or read_problem(name).path.parent
-    written = []
-    for file, table in made.tables.items():
-        written.append(folder / file)
-        write_text(written[-1], csv_text(table, zip(*table.values(), strict=True)))
+    texts = {file: csv_text(table, zip(*table.values(), strict=True)) for file, table in made.tables.items()}
+    texts["truth.toml"] = _truth_text(name, made)
+    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
+    write_files(places)
+    return list(places)
+
+
+def _truth_text(name: str | Path, made: Simulated) -> str:
     lines = [
         f"# made by: rpim-opt simulate {Path(name).name}",
         f"blunders = [{', '.join(map(repr, made.blunders))}]",
@@ -98,9 +124,7 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     for parameter, (dimension, value) in made.deviations.items():
         unit, si = display(dimension)
         lines.append(f"{parameter}_{unit} = {value / si:.12g}")
-    written.append(folder / "truth.toml")
-    write_text(written[-1], "\n".join(lines).replace("'", '"') + "\n")
-    return written
+    return "\n".join(lines).replace("'", '"') + "\n"
 
 
 def _parameters(stated: Stated, shapes: Sequence[Shape]) -> Parameters:

@@ -1,9 +1,13 @@
-"""Figures that several studies draw."""
+"""Figures that several studies draw, and a mean that several state."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
 
 
 def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
@@ -27,3 +31,8 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     ax.grid(axis="x", alpha=0.3)
     ax.set_xlabel(label)
     return figure
+
+
+def geometric_mean(ratios: Sequence[float] | Array) -> float:
+    """Return the mean of ratios that treats twice and half alike."""
+    return float(np.exp(np.mean(np.log(ratios))))

@@ -2,47 +2,83 @@
 
 from __future__ import annotations
 
+import io
 import json
-import platform
-import subprocess
+import os
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.record import PACKAGES
-from rpim_opt.study.grid import studies_folder
+from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, require_file
+from rpim_opt.basics.writing import refused
 
 Row = dict[str, Any]
 """A case with what was found."""
 
 
 class Journal:
-    """A file with one line a finished replicate, written at once: what was computed is not lost."""
+    """A file with one line a finished replicate, written at once: what was computed is not lost.
 
-    def __init__(self, path: Path, cases: Sequence[Mapping[str, Any]], resume: bool):
+    Its first line says which code computes; only that code goes on with it.
+    """
+
+    def __init__(self, path: Path, cases: Sequence[Mapping[str, Any]], code: Mapping[str, str], resume: bool):
         self.path = path
+        self.code = dict(code)
         self.cases = [(json.dumps(case, sort_keys=True), case) for case in cases]
         self.done: dict[str, Row] = {}
-        if resume and path.is_file():
+        if resume and (path.exists() or path.is_symlink()):
             self.done = self._finished()
-        elif not resume:
-            path.unlink(missing_ok=True)
+        else:
+            self.close()
+            self._write({"code": self.code})
 
     def _finished(self) -> dict[str, Row]:
-        """Return the replicates of an interrupted run; a line cut off by its end is left out."""
+        """Return the replicates of an interrupted run; a line cut off by its end is left out, and taken away."""
+        content = read_bytes(self.path, LARGEST_DATA)
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            with refused(self.path):
+                os.truncate(self.path, whole)
+        lines = [self._entry(line, number) for number, line in enumerate(content[:whole].splitlines(), start=1)]
+        if not lines:
+            self._write({"code": self.code})
+            return {}
+        self._require_same_code(lines[0])
         known = {key for key, _ in self.cases}
         done: dict[str, Row] = {}
-        for line in self.path.read_text(encoding="utf-8").splitlines():
-            try:
-                entry = json.loads(line)
-            except json.JSONDecodeError:
-                continue
-            key = json.dumps(entry["case"], sort_keys=True)
+        for number, entry in enumerate(lines[1:], start=2):
+            case = entry.get("case")
+            found = entry.get("found")
+            if not isinstance(case, dict) or not isinstance(found, dict):
+                raise self._odd(number, "no case with what was found")
+            key = json.dumps(case, sort_keys=True)
             if key in known:
-                done[key] = entry["found"]
+                done[key] = found
         return done
+
+    def _entry(self, line: bytes, number: int) -> dict[str, Any]:
+        try:
+            entry = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise self._odd(number, str(error)) from None
+        if not isinstance(entry, dict):
+            raise self._odd(number, "no table")
+        return entry
+
+    def _require_same_code(self, head: dict[str, Any]) -> None:
+        code = head.get("code")
+        if not isinstance(code, dict):
+            raise self._odd(1, "nothing on the code that computed")
+        for part, now in self.code.items():
+            if code.get(part) != now:
+                raise InputError(
+                    "resume", f"replicates of another {part}", "the code that began, or no resume", self.path
+                )
+
+    def _odd(self, number: int, found: str) -> InputError:
+        return InputError(f"line {number}", found, "the lines of an interrupted run, or no resume", self.path)
 
     @property
     def waiting(self) -> list[tuple[str, Mapping[str, Any]]]:
@@ -56,56 +92,43 @@ class Journal:
 
     def add(self, key: str, found: Row) -> None:
         """Write a replicate down."""
+        self._write({"case": json.loads(key), "found": found})
         self.done[key] = found
-        with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({"case": json.loads(key), "found": found}) + "\n")
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        with refused(self.path), self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(entry) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
 
     def close(self) -> None:
         """Remove the file: everything is where it belongs."""
-        self.path.unlink(missing_ok=True)
+        with refused(self.path):
+            self.path.unlink(missing_ok=True)
 
 
-def keep(rows: Sequence[Row], made: str, path: Path) -> None:
-    """Write the replicates, with what made them."""
+def table_of(rows: Sequence[Row], made: str) -> bytes:
+    """Return the replicates as a Parquet file, with what made them."""
     import pyarrow as pa
     from pyarrow import parquet
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = pa.table({key: [row.get(key) for row in rows] for key in columns})
-    parquet.write_table(table.replace_schema_metadata({"made": made}), path)
+    stream = io.BytesIO()
+    parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
+    return stream.getvalue()
 
 
 def kept(path: Path) -> tuple[list[Row], str]:
     """Return the replicates of an earlier run, without what a replicate does not have, and what made them."""
     from pyarrow import parquet
 
-    if not path.is_file():
+    if not path.exists():
         raise InputError("redraw", "no replicates", "a study that was run before", path)
-    table = parquet.read_table(path)
-    made = (table.schema.metadata or {}).get(b"made", b"").decode()
-    return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made
-
-
-def made_by(name: str, quick: bool, count: int) -> str:
-    """Say which command, commit and versions made the replicates."""
-    command = f"rpim-opt study {name}"
-    if quick:
-        command += " --quick"
-    packages = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
-    python = f"{platform.python_implementation()} {platform.python_version()}"
-    return f"Made by `{command}` from commit {_commit()}: {count} replicates, {python}, {packages}."
-
-
-def _commit() -> str:
+    require_file(path, LARGEST_DATA)
     try:
-        commit = _git("describe", "--always")
-        # results of other studies are no change of this one
-        changed = _git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!studies/results")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return f"{commit}-dirty" if changed else commit
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", "-C", str(studies_folder().parent), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        table = parquet.read_table(path)
+        made = (table.schema.metadata or {}).get(b"made", b"").decode()
+    except (OSError, ValueError) as error:
+        raise InputError("redraw", str(error), "the replicates of a study", path) from None
+    return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made

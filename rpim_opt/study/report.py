@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import write_json, write_text
+from rpim_opt.basics.files import json_text
+from rpim_opt.basics.writing import refused, write_files
 from rpim_opt.study.grid import find_study, load_study, studies_folder
 
 
@@ -59,22 +61,29 @@ class Report:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
 
-def write(folder: Path, question: str, report: Report, made: str) -> None:
-    """Write ``README.md`` with the figures, and ``metrics.json``."""
-    for title, figure in report.figures.items():
-        _draw(folder, title, figure)
+def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:
+    """Write ``README.md`` with the figures, ``metrics.json`` and the files of the replicates: all, or none."""
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
-    write_text(folder / "README.md", text + "\n")
-    write_json(folder / "metrics.json", dict(report.metrics))
+    files = dict(replicates)
+    for title, figure in report.figures.items():
+        files |= _drawn(title, figure)
+    files["README.md"] = (text + "\n").encode()
+    files["metrics.json"] = json_text(dict(report.metrics)).encode()
+    with refused(folder):
+        write_files({folder / name: content for name, content in files.items()})
 
 
-def _draw(folder: Path, title: str, figure: Any) -> None:
+def _drawn(title: str, figure: Any) -> dict[str, bytes]:
+    """Return a figure's files by their names."""
     from matplotlib import rc_context
 
+    vector = io.BytesIO()
+    pixels = io.BytesIO()
     with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
-        figure.savefig(folder / f"{title}.svg", metadata={"Date": None})
-    figure.savefig(folder / f"{title}.png")
+        figure.savefig(vector, format="svg", metadata={"Date": None})
+    figure.savefig(pixels, format="png")
+    return {f"{title}.svg": vector.getvalue(), f"{title}.png": pixels.getvalue()}
 
 
 def regressions(name: str, quick: bool, metrics: Mapping[str, float]) -> list[str]:

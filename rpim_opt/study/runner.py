@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError
+from rpim_opt.basics.writing import refused
 from rpim_opt.study.grid import find_study, load_study
-from rpim_opt.study.journal import Journal, keep, kept, made_by
+from rpim_opt.study.journal import Journal, kept, table_of
+from rpim_opt.study.provenance import code_of, made_by
 from rpim_opt.study.report import Report, write
 
 Found = tuple[str, dict[str, Any]]
@@ -59,21 +61,22 @@ def run_study(
     path = find_study(name)
     study = load_study(path)
     folder = out or path.parent / "results" / (f"{name}-quick" if quick else name)
-    folder.mkdir(parents=True, exist_ok=True)
+    with refused(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     replicates = folder / "replicates.parquet"
     if redraw:
         rows, made = kept(replicates)
         report = study.report(rows)
-        write(folder, study.QUESTION, report, made)
+        write(folder, study.QUESTION, report, made, {})
         return report, folder
     if hasattr(study, "prepare"):
         study.prepare(quick)
-    journal = Journal(folder / "replicates.jsonl", study.cases(quick), resume)
+    cases = study.cases(quick)
+    made = made_by(name, quick, len(cases))  # of the code that is here now, whatever becomes of it meanwhile
+    journal = Journal(folder / "replicates.jsonl", cases, code_of(name), resume)
     _fill(journal, partial(_one, path), workers, scheduler, progress)
     report = study.report(journal.rows)
-    made = made_by(name, quick, len(journal.rows))
-    keep(journal.rows, made, replicates)
-    write(folder, study.QUESTION, report, made)
+    write(folder, study.QUESTION, report, made, {replicates.name: table_of(journal.rows, made)})
     journal.close()
     return report, folder
 
@@ -109,7 +112,7 @@ def _on_cluster(run: Run, waiting: Waiting, scheduler: str) -> Iterator[Found]:
         raise InputError("scheduler", "no package distributed", "pip install 'rpim-opt[studies]'") from None
     try:
         client = Client(scheduler, timeout="10s")
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no address
         raise RpimError(f"Dask scheduler {scheduler}: cannot be reached: {error}.") from None
     with client:
         futures = [client.submit(run, key, case, pure=False) for key, case in waiting]
@@ -122,6 +125,8 @@ def _in_processes(run: Run, waiting: Waiting, workers: int) -> Iterator[Found]:
         from joblib import Parallel, delayed
     except ImportError:
         raise InputError("workers", "no package joblib", "pip install 'rpim-opt[studies]'") from None
+    if workers == 0:
+        raise InputError("workers", "0", "one or more, or -1 for all processors")
     tasks = (delayed(run)(key, case) for key, case in waiting)
     finished: Any = Parallel(n_jobs=workers, return_as="generator_unordered")(tasks)
     yield from finished

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import warnings
 from pathlib import Path
 
@@ -12,12 +13,13 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study import grid, journal, report
+from rpim_opt.study import grid, provenance, report
 from rpim_opt.study.runner import run_study
 from tests import SHARED
 from tests.test_cli import run
 
 TOY = """
+from pathlib import Path
 from rpim_opt.study import Metric, Report
 import numpy as np
 
@@ -33,7 +35,7 @@ def run(seed):
     if LOG:
         with open(LOG, "a") as stream:
             stream.write(f"{seed}\\n")
-    if STOP and seed == 3:
+    if STOP.exists() and seed == 3:
         raise KeyboardInterrupt
     return {"value": float(np.random.default_rng(seed).uniform())}
 
@@ -47,13 +49,19 @@ def report(rows):
 def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "studies"
     folder.mkdir()
-    for module in (grid, journal, report):
+    for module in (grid, provenance, report):
         monkeypatch.setattr(module, "studies_folder", lambda: folder)
 
     def write(stop: bool = False) -> Path:
         grid.load_study.cache_clear()
         log = str(folder / "log.txt")
-        (folder / "toy.py").write_text(TOY.replace("QUESTION", f"LOG, STOP = {log!r}, {stop}\nQUESTION", 1))
+        flag = folder / "stop"
+        flag.unlink(missing_ok=True)
+        if stop:
+            flag.touch()
+        (folder / "toy.py").write_text(
+            TOY.replace("QUESTION", f"LOG, STOP = {log!r}, Path({str(flag)!r})\nQUESTION", 1)
+        )
         return folder
 
     return write
@@ -99,9 +107,11 @@ def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
     journal = out / "replicates.jsonl"
-    assert len(journal.read_text().splitlines()) == 3
+    assert len(journal.read_text().splitlines()) == 1 + 3
     with journal.open("a") as stream:
         stream.write('{"case": {"seed": 5}, "fou')  # cut off while it was written
+    with pytest.raises(KeyboardInterrupt):
+        run_study("toy", out=out, resume=True)
     toy(stop=False)
     (folder / "log.txt").unlink()
     resumed, _ = run_study("toy", out=out, resume=True)
@@ -191,7 +201,7 @@ def report(rows):
 
 @pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (grid, journal, report):
+    for module in (grid, provenance, report):
         monkeypatch.setattr(module, "studies_folder", lambda: tmp_path)
     (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
     here, _ = run_study("monte_carlo", out=tmp_path / "here")
@@ -228,3 +238,143 @@ def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
     assert not (folder / "log.txt").exists()  # nothing was computed
     with pytest.raises(ro.InputError, match="no replicates"):
         run_study("toy", out=tmp_path / "empty", redraw=True)
+
+
+def interrupted(toy, out: Path) -> Path:
+    """Return the journal of a study that was stopped."""
+    toy(stop=True)
+    with pytest.raises(KeyboardInterrupt):
+        run_study("toy", out=out)
+    toy(stop=False)
+    return out / "replicates.jsonl"
+
+
+def test_what_was_computed_after_a_cut_line_is_not_lost_at_the_next_kill(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    with journal.open("a") as stream:
+        stream.write('{"case": {"seed": 3}, "fou')
+
+    def stop(done: int, every: int) -> None:
+        if done == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study("toy", out=tmp_path / "out", resume=True, progress=stop)
+    entries = [json.loads(line) for line in journal.read_text().splitlines()]
+    assert [entry["case"]["seed"] for entry in entries[1:]] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_journal_of_other_code_is_refused(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    before = journal.read_text()
+    path = provenance.studies_folder() / "toy.py"
+    path.write_text(path.read_text().replace(".uniform()", ".normal()"))
+    grid.load_study.cache_clear()
+    with pytest.raises(ro.InputError, match="replicates of another set of studies"):
+        run_study("toy", out=tmp_path / "out", resume=True)
+    assert journal.read_text() == before
+    run_study("toy", out=tmp_path / "out")  # anew
+
+
+ODD = {
+    "a number": "3\n",
+    "a list": "[1, 2]\n",
+    "no case": '{"found": {"value": 1.0}}\n',
+    "a case that is none": '{"case": 3, "found": {"value": 1.0}}\n',
+    "nothing found": '{"case": {"seed": 1}, "found": null}\n',
+    "no JSON": "never\n",
+    "too deep": "[" * 100_000 + "\n",
+    "too many digits": "1" * 5000 + "\n",
+    "no text": b"\xff\xfe\n",
+    "zero bytes": b"\0" * 40 + b"\n",
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("place", ["first", "last"])
+def test_odd_lines_of_a_journal_are_one_sentence(
+    toy, tmp_path: Path, monkeypatch, capsys, odd: str, place: str
+) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    line = ODD[odd]
+    if isinstance(line, str):
+        line = line.encode()
+    old = journal.read_bytes()
+    content = old + line
+    if place == "first":
+        content = line + old
+    journal.write_bytes(content)
+    assert run(monkeypatch, "study", "toy", "--resume", "--out", str(tmp_path / "out")) == 2
+    said = capsys.readouterr().err
+    assert f"line {1 if place == 'first' else 5}: found" in said
+    assert journal.read_bytes() == content
+
+
+def test_a_journal_cut_in_its_first_line_begins_anew(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    journal.write_bytes(journal.read_bytes()[:20])
+    found, _ = run_study("toy", out=tmp_path / "out", resume=True)
+    assert found.metrics == run_study("toy", out=tmp_path / "fresh")[0].metrics
+
+
+@pytest.mark.parametrize("kind", ["fifo", "folder"])
+def test_a_journal_that_is_no_file_is_refused(toy, tmp_path: Path, kind: str) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    journal.unlink()
+    if kind == "fifo":
+        os.mkfifo(journal)
+    else:
+        journal.mkdir()
+    with pytest.raises(ro.InputError, match="accepted: an ordinary file"):
+        run_study("toy", out=tmp_path / "out", resume=True)
+
+
+def test_a_study_writes_all_its_results_or_none(toy, tmp_path: Path, monkeypatch) -> None:
+    toy()
+    out = tmp_path / "out"
+    run_study("toy", quick=True, out=out)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert set(before) == {"README.md", "metrics.json", "replicates.parquet"}
+    real = os.fsync
+
+    def full(handle: int) -> None:
+        if not os.readlink(f"/proc/self/fd/{handle}").endswith(".jsonl"):
+            raise OSError(28, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ro.basics.RpimError, match="No space left"):
+        run_study("toy", out=out)
+    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "replicates.jsonl"}
+    assert after == before
+    monkeypatch.setattr(os, "fsync", real)
+    resumed, _ = run_study("toy", out=out, resume=True)  # nothing is computed again
+    assert "12 numbers" in resumed.text
+    assert sorted(path.name for path in out.iterdir()) == sorted(before)
+
+
+def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> None:
+    def git(*arguments: str) -> None:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
+        subprocess.run(command, check=True, capture_output=True)
+
+    (tmp_path / "studies").mkdir()
+    monkeypatch.setattr(provenance, "studies_folder", lambda: tmp_path / "studies")
+    git("init")
+    git("commit", "--allow-empty", "-m", "first")
+    assert "dirty" not in provenance.made_by("toy", False, 1)
+    (tmp_path / "notes.txt").write_text("nobody runs this")
+    (tmp_path / "studies" / "results").mkdir()
+    (tmp_path / "studies" / "results" / "README.md").write_text("of another study")
+    assert "dirty" not in provenance.made_by("toy", False, 1)
+    (tmp_path / "studies" / "toy.py").write_text("QUESTION = 1")
+    assert "-dirty" in provenance.made_by("toy", False, 1)
+
+
+def test_a_broken_table_of_replicates_is_one_sentence(toy, tmp_path: Path) -> None:
+    toy()
+    run_study("toy", quick=True, out=tmp_path / "out")
+    table = tmp_path / "out" / "replicates.parquet"
+    table.write_bytes(table.read_bytes()[:-7])
+    with pytest.raises(ro.InputError, match="accepted: the replicates of a study"):
+        run_study("toy", quick=True, out=tmp_path / "out", redraw=True)

@@ -1,0 +1,153 @@
+"""Files that go out: whole and on the disk, or as they were; what a kill left behind is cleaned up."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from rpim_opt.basics.exceptions import RpimError
+
+try:
+    import fcntl
+except ImportError:  # Windows: what a kill leaves there stays
+    fcntl = None
+ENDING = ".part"
+
+
+@contextmanager
+def refused(path: object) -> Iterator[None]:
+    """Turn what the system refuses while ``path`` is written into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RpimError(f"{path}: cannot be written: {error}.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text so that ``path`` holds either the whole new text or what it held before."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write bytes so that ``path`` holds either all of them or what it held before, also after a power failure.
+
+    A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A
+    device or pipe gets the bytes as they are.
+    """
+    write_files({path: data})
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write several files as `write_bytes` does: none is touched before the bytes of all are on the disk."""
+    with ExitStack() as stack:
+        made: dict[Path, Path] = {}
+        for path, data in contents.items():
+            if _is_stream(path):
+                path.write_bytes(data)
+                continue
+            place = Path(os.path.realpath(path))
+            if place.is_dir():
+                raise IsADirectoryError(21, "a folder is there", str(place))
+            place.parent.mkdir(parents=True, exist_ok=True)
+            folder = stack.enter_context(scratch_folder(place))
+            made[place] = folder / "file"
+            _write_through(made[place], data, place)
+        for place, file in made.items():
+            file.replace(place)
+        for folder in {place.parent for place in made}:
+            _settle(folder)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether something is there that cannot be replaced: a pipe, a device."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def _write_through(file: Path, data: bytes, place: Path) -> None:
+    """Write a new file and wait until it is on the disk; mode and owner are those of the file at ``place``."""
+    with file.open("xb") as stream:
+        _keep_mode(stream.fileno(), place)
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _keep_mode(handle: int, place: Path) -> None:
+    try:
+        known = place.stat()
+    except OSError:
+        return
+    if not os.access(place, os.W_OK):
+        raise PermissionError(13, "the file there is write-protected", str(place))
+    if hasattr(os, "fchown"):
+        with suppress(OSError):  # only the owner's superuser may give a file away
+            os.fchown(handle, known.st_uid, known.st_gid)
+        os.fchmod(handle, stat.S_IMODE(known.st_mode))
+
+
+def _settle(folder: Path) -> None:
+    """Wait until a folder's new names are on the disk."""
+    with suppress(OSError):  # some file systems do not know that
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def scratch_folder(place: Path) -> Iterator[Path]:
+    """Make a folder beside ``place`` for what will be moved there, and remove it in the end.
+
+    A kill leaves it, and the next one for the same place removes it: a lock tells which ones somebody still uses.
+    """
+    for left in place.parent.glob(f".{_literal(place.name)}.*{ENDING}"):
+        _remove_left(left)
+    with ExitStack() as stack:
+        folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
+        while not _lock(folder, stack):  # somebody took it for one that was left
+            folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        yield folder
+
+
+def _literal(name: str) -> str:
+    """Return a name as a pattern that it alone meets."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _lock(folder: Path, stack: ExitStack, unlockable: bool = True) -> bool:
+    """Lock a folder until the stack ends; return whether it is there and nobody else has it.
+
+    ``unlockable`` is the answer where locks are not to be had.
+    """
+    if fcntl is None:
+        return unlockable
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+    except OSError:
+        return False
+    stack.callback(os.close, handle)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return unlockable
+    return folder.exists() and folder.stat().st_ino == os.fstat(handle).st_ino
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove a folder that a killed process left."""
+    with ExitStack() as stack:
+        if _lock(folder, stack, unlockable=False):
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,150 @@
+"""A result file that was changed is refused: what follows from its data by computing it anew, the rest by a digest."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.store.content import digest
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("result") / "result.json"
+    instance = ro.load("paper_arm")
+    result = ro.calibrate(instance.problem, ro.bounded, ro.l_curve)
+    ro.store.save_result(result, path, instance.record)
+    return path.read_text()
+
+
+def leaves(content: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the place of every value."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from leaves(value, (*at, key))
+    elif isinstance(content, list):
+        for i, value in enumerate(content):
+            yield from leaves(value, (*at, i))
+    else:
+        yield at
+
+
+def changed(value: Any) -> Any:
+    """Return another value of the same kind, the nearest one of a number."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value + 1
+    if isinstance(value, float):
+        return float(np.nextafter(value, np.inf))
+    if isinstance(value, str):
+        return value + " "
+    return 1.0
+
+
+def put(content: Any, at: tuple[Any, ...], value: Any) -> Any:
+    edited = copy.deepcopy(content)
+    part = edited
+    for key in at[:-1]:
+        part = part[key]
+    part[at[-1]] = value
+    return edited
+
+
+def load(tmp_path: Path, content: Any) -> ro.calibration.Calibration:
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps(content))
+    return ro.load_result(path)
+
+
+def said(tmp_path: Path, content: Any) -> str:
+    with pytest.raises(ro.InputError) as error:
+        load(tmp_path, content)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_every_single_change_is_seen(tmp_path: Path, text: str) -> None:
+    content = json.loads(text)
+    places = list(leaves(content))
+    assert len(places) > 1000
+    drawn = np.random.default_rng(0).permutation(len(places))[:120]
+    for i in drawn:
+        at = places[i]
+        value = content
+        for key in at:
+            value = value[key]
+        assert said(tmp_path, put(content, at, changed(value))), at
+
+
+NAMED = {
+    "converged": (("converged",), False),
+    "message": (("message",), "Converged."),
+    "weight": (("weight",), 1e-3),
+    "a covariance": (("data", "identification", "blocks", 0, "covariance", 0, 0, 0), 1e-12),
+    "a nominal parameter": (("model", 4, "nominal"), 0.1070000001),
+    "whether a parameter is identified": (("model", 8, "identified"), False),
+    "a digest of an input file": (("record", "files", "identification.csv"), "0" * 64),
+    "why a row is left out": (("record", "excluded", "T8-7"), "bumped"),
+    "whether it is simulated": (("record", "simulated"), True),
+    "when it was made": (("record", "made"), "2020-01-01T00:00:00+00:00"),
+    "the certificate": (("certificate", "decrease"), 1e-15),
+    "a held parameter": (("held",), [{"name": "d5", "bound": 0.0, "multiplier": 0.0, "gain": 0.0}]),
+    "the nominal figures": (("nominal", "validation", "mean_mm"), 9.9),
+    "the validation's figures": (("validation", "mean_mm"), 0.001),
+    "the identification's figures": (("identification", "max_mm"), 0.001),
+    "the table of parameters": (("parameters", 0, "std"), 1e-6),
+    "a title": (("title",), "Another arm"),
+    "a version": (("record", "versions", "clarabel"), "9.9"),
+    "a figure of 400 digits": (("validation", "mean_mm"), 10**400),
+    "a note of one's own": (("note",), "hello"),
+    "the weight's curve": (("selection", "score", 3), 0.5),
+}
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_what_was_changed_by_hand_is_refused(tmp_path: Path, text: str, what: str) -> None:
+    at, value = NAMED[what]
+    assert "accepted" in said(tmp_path, put(json.loads(text), at, value))
+
+
+FOLLOWS = ["the nominal figures", "the validation's figures", "the identification's figures",
+           "the table of parameters", "weight", "whether a parameter is identified"]  # fmt: skip
+
+
+@pytest.mark.parametrize("what", FOLLOWS)
+def test_what_follows_from_the_data_is_refused_in_spite_of_a_new_digest(tmp_path: Path, text: str, what: str) -> None:
+    at, value = NAMED[what]
+    edited = put(json.loads(text), at, value)
+    message = said(tmp_path, edited | {"digest": digest(edited)})
+    assert "key digest" not in message
+
+
+def test_a_file_may_be_laid_out_anew(tmp_path: Path, text: str) -> None:
+    content = json.loads(text)
+    turned = {key: content[key] for key in reversed(content)}
+    assert np.array_equal(load(tmp_path, turned).x, content["x"])
+
+
+def test_a_file_without_a_digest_is_refused(tmp_path: Path, text: str) -> None:
+    content = json.loads(text)
+    del content["digest"]
+    assert "key digest: found nothing" in said(tmp_path, content)
+    assert "key digest" in said(tmp_path, content | {"digest": 3})
+
+
+def test_a_file_of_another_version_may_define_its_figures_differently(tmp_path: Path, text: str) -> None:
+    edited = put(json.loads(text), ("parameters", 0, "std"), 1.0)
+    edited["record"]["versions"]["rpim-opt"] = "0.0.1"
+    edited["digest"] = digest(edited)
+    assert np.array_equal(load(tmp_path, edited).x, edited["x"])
+    edited["rows"]["validation"][0]["identified_mm"] += 1e-3
+    edited["digest"] = digest(edited)
+    assert "rows.validation" in said(tmp_path, edited)  # but not its errors
