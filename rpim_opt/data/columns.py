@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, numbers, texts
-from rpim_opt.basics.units import spelled, split_unit, with_unit
+from rpim_opt.basics.units import LARGEST, SMALLEST, spelled, split_unit, with_unit
 from rpim_opt.data.models import Measurement
 from rpim_opt.robot.mdh import Robot
 
@@ -32,11 +32,12 @@ def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
     """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
     torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
-    plain = {**joints, **kind.columns, **torques}
+    sides = {f"approach{i}": "" for i in range(1, robot.dof + 1)}
+    plain = {**joints, **kind.columns, **torques, **sides, "payload": "mass"}
     for form, _ in kind.forms:
         plain |= form
     if kind.points == 2:
-        plain |= {f"to_{stem}": dimension for stem, dimension in {**joints, **torques}.items()}
+        plain |= {f"to_{stem}": dimension for stem, dimension in {**joints, **torques, **sides}.items()}
     known = {stem: [dimension] for stem, dimension in plain.items()}
     return known | _spread_columns(kind)
 
@@ -85,6 +86,7 @@ def _add(
     if (stem, dimension) in columns:
         raise InputError("the header", f"column '{stem}' in two units", "one of them")
     values = si * numbers(cells, label, name)
+    _require_size(values, si, name, label)
     if stem.startswith(SPREADS):
         _require_positive(values, si, name, label)
     columns[stem, dimension] = values
@@ -106,9 +108,17 @@ def _require_known(
 
 
 def _require_positive(values: Array, si: float, name: str, label: Sequence[str]) -> None:
-    if not (values > 0).all():
-        row = label[int(np.argmin(values > 0))]
-        raise InputError(f"row {row}, column {name}", f"{values.min() / si:g}", "an uncertainty greater than zero")
+    if not (values >= SMALLEST).all():
+        row = label[int(np.argmin(values >= SMALLEST))]
+        accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
+        raise InputError(f"row {row}, column {name}", f"{values.min() / si:g}", accepted)
+
+
+def _require_size(values: Array, si: float, name: str, label: Sequence[str]) -> None:
+    sane = np.abs(values) <= LARGEST
+    if not sane.all():
+        i = int(np.argmin(sane))
+        raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", f"a size of at most {LARGEST / si:g}")
 
 
 def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
@@ -116,9 +126,10 @@ def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
     joints = [f"q{i}" for i in range(1, robot.dof + 1)]
     torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
     required = [*joints, *values_form(columns, kind)[0]]
-    groups = [torques]
+    sides = [f"approach{i}" for i in range(1, robot.dof + 1)]
+    groups = [torques, sides]
     if kind.points == 2:
-        groups += [_second(joints), _second(torques)]
+        groups += [_second(joints), _second(torques), _second(sides)]
     for group in groups:
         if any((stem, "") in columns for stem in group):
             required += group

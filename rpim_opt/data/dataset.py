@@ -9,6 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import LARGEST
 from rpim_opt.data.models import Measurement, position
 
 
@@ -34,6 +35,10 @@ class Block:
         Which anchor, plane or sphere; ``""`` for the only one.
     torque
         (N, p, dof) joint torques of the controller's joints [Nm], or None.
+    payload
+        (N,) mass at the flange [kg], or None: that of the robot's `Gravity`.
+    approach
+        (N, p, dof) direction in which the controller's joints moved last, -1, 0 or +1, or None.
     """
 
     measurement: Measurement
@@ -44,12 +49,26 @@ class Block:
     markers: tuple[str, ...] = ("",)
     fixture: str = ""
     torque: Array | None = None
+    payload: Array | None = None
+    approach: Array | None = None
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
         covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
-        torque = None if self.torque is None else self.torque[index]
-        return replace(self, q=self.q[index], y=self.y[index], covariance=covariance, row=row, torque=torque)
+
+        def rows(values: Array | None) -> Array | None:
+            return None if values is None else values[index]
+
+        return replace(
+            self,
+            q=self.q[index],
+            y=self.y[index],
+            covariance=covariance,
+            row=row,
+            torque=rows(self.torque),
+            payload=rows(self.payload),
+            approach=rows(self.approach),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +241,9 @@ def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:
     if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
         accepted = f"finite numbers, {points} x dof joint and {columns} measured values a row"
         raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
+    largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
+    if largest > LARGEST:
+        raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
 
 
 def _covariance(sigma: float | Array, N: int, k: int) -> Array:
@@ -253,3 +275,15 @@ def _joined(data: Dataset, count: int) -> np.ndarray:
     joined = np.full(count, count)
     np.minimum.at(joined, data.configuration, first[stop])
     return joined[data.configuration]
+
+
+def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:
+    """Return the rows in groups of whole configurations, at least one each, and ``most`` rows unless one has more."""
+    order = np.argsort(data.configuration, kind="stable")
+    ends = np.concatenate([[0], np.flatnonzero(np.diff(data.configuration[order])) + 1, [len(order)]])
+    cuts = [0]
+    while cuts[-1] < len(order):
+        last_fitting = ends[np.searchsorted(ends, cuts[-1] + most, side="right") - 1]
+        next_one = ends[np.searchsorted(ends, cuts[-1], side="right")]
+        cuts.append(max(last_fitting, next_one))
+    return np.split(order, cuts[1:-1])

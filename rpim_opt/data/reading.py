@@ -30,8 +30,9 @@ def read_data(
     - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
-    - ``tau1_Nm``, ... (joint torques);
-    - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``.
+    - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
+      joint moved last, -1 or 1, 0 where it is not known);
+    - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``, ``to_approach1``.
 
     Parameters
     ----------
@@ -79,7 +80,9 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         y=y,
         covariance=covariances(columns, declared, kind, y, label),
         row=np.arange(N),
-        torque=_torques(columns, robot, kind, N),
+        torque=_of_joints("tau", columns, robot, kind, N),
+        payload=_payload(columns, label),
+        approach=_approach(columns, robot, kind, label),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     _require_two_points(whole, markers, label)
@@ -108,17 +111,38 @@ def _joint_values(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> 
     return np.stack(points, axis=1)
 
 
-def _torques(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array | None:
-    """Return the joint torques (N, p, dof); the second point's are the first one's unless it states its own."""
-    if ("tau1", "") not in columns:
+def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array | None:
+    """Return torques or directions (N, p, dof); the second point's are the first one's unless it states its own."""
+    if (f"{stem}1", "") not in columns:
         return None
-    torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
-    points = [_several(columns, torques, N)]
-    if kind.points == 2 and ("to_tau1", "") in columns:
-        torques = [f"to_{stem}" for stem in torques]
+    names = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
+    points = [_several(columns, names, N)]
+    if kind.points == 2 and (f"to_{stem}1", "") in columns:
+        names = [f"to_{name}" for name in names]
     if kind.points == 2:
-        points.append(_several(columns, torques, N))
+        points.append(_several(columns, names, N))
     return np.stack(points, axis=1)
+
+
+def _approach(columns: Numbers, robot: Robot, kind: Measurement, label: Sequence[str]) -> Array | None:
+    """Return from which side the joints came (N, p, dof), -1, 0 or +1."""
+    approach = _of_joints("approach", columns, robot, kind, len(label))
+    if approach is not None:
+        wrong = np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0)))
+        if len(wrong):
+            row, point, joint = wrong[0]
+            where = f"row {label[row]}, column approach{joint + 1}"
+            raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
+    return approach
+
+
+def _payload(columns: Numbers, label: Sequence[str]) -> Array | None:
+    """Return the mass at the flange (N,) [kg]."""
+    payload = columns.get(("payload", ""))
+    if payload is not None and not (payload >= 0).all():
+        row = int(np.argmin(payload))
+        raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
+    return payload
 
 
 def _measured(columns: Numbers, kind: Measurement, label: Sequence[str], N: int) -> Array:

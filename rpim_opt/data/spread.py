@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import quantities, with_unit
+from rpim_opt.basics.units import SMALLEST, quantities, with_unit
 from rpim_opt.data.columns import Numbers
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.tracker import LaserTracker
@@ -35,8 +35,10 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
     plain = {key: value for key, value in noise.items() if key != "tracker"}
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
     for (stem, _), value in quantities(plain, accepted, "table noise").items():
-        if not value > 0:
-            raise InputError(f"table noise, key {stem}", f"{value:g}", "a standard deviation > 0")
+        if not value >= SMALLEST:
+            raise InputError(
+                f"table noise, key {stem}", f"{value:g}", f"a standard deviation > 0, from {SMALLEST:g} on"
+            )
         declared[stem] = value
     return declared
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,13 +16,11 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.frames import fitted_frames
 from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
-from rpim_opt.problem.placing import locate
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.kinematics import FRAME
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.problem.readings import better_reading
+from rpim_opt.problem.source import Source
+from rpim_opt.problem.suspects import exchanged_rows, moved, moved_far, rows_without_values, shared_rows
 
-BETTER = 0.2
-"""Another reading of the data is reported when it leaves less than this part of the position error."""
 STANDS_OUT = 5.0
 """Rows further than this many robust standard deviations above the median residual are listed."""
 
@@ -177,18 +175,29 @@ class Inspection:
         return "\n".join(lines)
 
 
-def inspect(problem: CalibrationProblem) -> Inspection:
+def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> Inspection:
     """Look at a problem's data: ranges, coverage, repeated rows, likely mistakes, what can be identified.
 
-    Mistakes are units, signs and zeros of joints, and left-handed frames: another reading of the data that leaves less
-    than a fifth of the position error is named.
+    Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
+    left-handed frames, another robot, an instrument that moved: another reading of the data that leaves less than a
+    fifth of the position error is named, with what to write (`readings`, `suspects`).
 
+    Parameters
+    ----------
+    problem
+        In memory.
+    validation
+        The rows that were kept apart, of which none should be an identification row.
+
+    Examples
+    --------
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> wrong = replace(problem.data.blocks[0], q=problem.data.blocks[0].q * [1, 1, -1, 1, 1, 1])
-    >>> print(ro.problem.inspect(problem.on(replace(problem.data, blocks=(wrong,)))).warnings[-1])
-    the data fit 515 times better (error over extent) with joint 3 counted the other way.
+    >>> said = ro.problem.inspect(problem.on(replace(problem.data, blocks=(wrong,)))).warnings[-1]
+    >>> said.split(":")[-1]
+    ' write sign = -1 for joint 3 in robot.toml.'
     """
     if not problem.keeps_rows:
         raise InputError("inspect", "measurements in parts", "one of them: inspect(part) for part in problem.rows()")
@@ -211,7 +220,7 @@ def inspect(problem: CalibrationProblem) -> Inspection:
         standing_out=tuple(far),
         repeated=repeated,
         repeatability=repeatability,
-        warnings=(*_ranges(problem), *_copies(data), *_other_readings(problem)),
+        warnings=(*_ranges(problem), *_copies(data), *shared_rows(data, validation), *_mistakes(problem, fitted, x)),
         proposals=tuple(proposals),
         observability=observe(problem),
     )
@@ -295,69 +304,27 @@ def _ranges(problem: CalibrationProblem) -> Iterable[str]:
             yield f"{sizes}: metres given as millimetres?"
 
 
-def _other_readings(problem: CalibrationProblem) -> Iterable[str]:
-    """Try likely mistakes on positions: the reading that fits far better than what is written is named."""
-    seen = {b.measurement.name for b in problem.data.blocks}
-    if not seen & {"position", "pose"}:
+def _mistakes(problem: CalibrationProblem, fitted: Source, x: Array) -> Iterable[str]:
+    """Say what the data were mistaken for: another reading of all of them, or of some rows."""
+    yield from rows_without_values(problem)
+    better = better_reading(problem)
+    if better is not None:
+        yield better.sentence
         return
-    stated = _fitted(problem, problem.data)
-    if not np.isfinite(stated):
-        return
-    best, text = BETTER * stated, ""
-    for what, data in _readings(problem).items():
-        error = _fitted(problem, data)
-        if error < best:
-            best, text = error, what
-    if text:
-        yield f"the data fit {stated / best:.0f} times better (error over extent) with {text}."
+    yield from exchanged_rows(problem)
+    far = list(moved_far(problem))
+    yield from far
+    if not far:
+        whole, deviations = _whole(problem, fitted, x)
+        yield from moved(whole, deviations)
 
 
-def _readings(problem: CalibrationProblem) -> Mapping[str, Dataset]:
-    robot, data = problem.robot, problem.data
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
-
-    def joints(change: Array, offset: Array | float = 0.0) -> Dataset:
-        return replace(data, blocks=tuple(replace(b, q=b.q * change + offset) for b in data.blocks))
-
-    def measured(*factors: float) -> Dataset:
-        blocks = [replace(b, y=np.hstack([b.y[:, :3] * factors, b.y[:, 3:]])) for b in data.blocks if b.y.shape[1] >= 3]
-        return replace(data, blocks=tuple(blocks))
-
-    one, unit = np.ones(robot.dof), np.eye(robot.dof)
-    readings = {
-        "joint values read as degrees, not radians": joints(np.where(turning, np.pi / 180, 1)),
-        "joint values read as radians, not degrees": joints(np.where(turning, 180 / np.pi, 1)),
-        "measured lengths a thousand times larger": measured(1e3, 1e3, 1e3),
-        "measured lengths a thousand times smaller": measured(1e-3, 1e-3, 1e-3),
-        "the measured frame mirrored (left-handed)": measured(1, 1, -1),
-    }
-    for i in np.flatnonzero(turning):
-        readings[f"joint {i + 1} counted the other way"] = joints(one - 2 * unit[i])
-        for degrees in (90, -90, 180):
-            readings[f"joint {i + 1} shifted by {degrees} deg"] = joints(one, np.radians(degrees) * unit[i])
-    return readings
-
-
-def _fitted(problem: CalibrationProblem, data: Dataset) -> float:
-    """Root mean square error over the extent of the points, base and reflectors in closed form, robot nominal."""
-    blocks = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
-    if sum(len(b.row) for b in blocks) < 6:
-        return float("inf")
-    p = problem.parameters
-    index = {name: i for i, name in enumerate(p.names)}
-    prefix = {b.markers[0]: tool_prefix(b.markers[0]) for b in blocks}
-    tools = {m: [p.nominal[index[pre + c]] for c in FRAME] for m, pre in prefix.items()}
-    part = Dataset(tuple(blocks), data.label, data.configuration)
-    try:
-        base, places = locate(problem.robot, part, tools)
-    except InputError:
-        return float("inf")
-    nominal = p.nominal.copy()
-    nominal[[index[f"base_{c}"] for c in FRAME]] = base
-    for m, pre in prefix.items():
-        nominal[[index[pre + c] for c in FRAME]] = places[m]
-    moved = replace(p, nominal=nominal)
-    errors = CalibrationProblem(problem.robot, moved, part).errors(np.zeros(len(p.free)))
-    points = np.concatenate([b.y[:, :3] for b in blocks])
-    extent = np.linalg.norm(points.std(axis=0))
-    return float(np.sqrt(np.nanmean(errors**2)) / extent)
+def _whole(problem: CalibrationProblem, fitted: Source, x: Array) -> tuple[CalibrationProblem, Array]:
+    """Return the problem that identifies all again, with its frames where they were fitted."""
+    whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
+    names = whole.parameters.free.names
+    deviations = np.zeros(len(names))
+    for name, value in zip(fitted.parameters.free.names, x, strict=True):
+        if name in names:
+            deviations[names.index(name)] = value
+    return whole, deviations

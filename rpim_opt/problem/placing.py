@@ -196,7 +196,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         flange, marker = forward_kinematics(robot, block.q[:, 0]), block.markers[0]
         if block.measurement.name == "pose":
             try:
-                base, tool = hand_eye(flange, _transforms(block.y), places[marker][:3])
+                base, tool = hand_eye(flange, transforms(block.y), places[marker][:3])
             except InputError:
                 pass  # too few turns: positions and the stated tool have to do
             else:
@@ -217,7 +217,7 @@ def _spread(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
 
 
-def _transforms(y: Array) -> Array:
+def transforms(y: Array) -> Array:
     """Return the transforms (N, 4, 4) of measured poses (N, 7): x, y, z [m] and unit quaternion, w first."""
     T = np.tile(np.eye(4), (len(y), 1, 1))
     T[:, :3, :3] = Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_text
-from rpim_opt.basics.tables import Columns, csv_text, read_columns
-from rpim_opt.basics.units import split_unit
+from rpim_opt.basics.inputs import read_text
+from rpim_opt.basics.tables import Columns, csv_text
+from rpim_opt.basics.writing import scratch_folder, write_text
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position
-from rpim_opt.data.naming import Renamed, parse_units, rename
+from rpim_opt.data.models import Measurement
 from rpim_opt.data.reading import read_data
+from rpim_opt.data.spelling import parse_units
+from rpim_opt.data.understanding import Asked
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.library import ROBOT_FILES, find_robot, read_arm
+from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.plain import toml, write_robot
-from rpim_opt.store.named import pick
+from rpim_opt.store.drawing import Source, find_source
+from rpim_opt.store.raw import Understanding, understand_of
 from rpim_opt.store.template import problem_text
 
 NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5)}
@@ -30,11 +30,12 @@ NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5)}
 
 @dataclass(frozen=True)
 class Started:
-    """A folder that was made: its files with their rows, and a sentence for all that was recognised or guessed."""
+    """A folder that was made: its files with their rows, a sentence for all that was recognised or guessed."""
 
     folder: Path
     rows: Mapping[str, int]
     notes: tuple[str, ...]
+    understood: Understanding
 
     def __str__(self) -> str:
         """Return the files and the sentences."""
@@ -45,15 +46,17 @@ class Started:
 def new_problem(
     folder: str | Path,
     robot: str,
-    data: str | Path,
+    data: str | Path | Sequence[str | Path],
     *,
     measurement: str | None = None,
     units: str = "",
+    asked: Asked | None = None,
     validation: str | Path | None = None,
     hold_out: float | None = None,
     seed: int = 0,
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
+    understood: Callable[[Understanding], None] | None = None,
 ) -> Started:
     """Make a problem folder that `load` reads; the folder is whole or not there.
 
@@ -64,12 +67,13 @@ def new_problem(
     robot
         The name of a ready robot, or a file ``.urdf``, ``.toml``, ``.json`` or ``.csv``.
     data
-        Measurements, ``.csv``, ``.parquet`` or ``.xlsx``, with the columns of `read_data` or what `naming.rename`
-        recognises.
+        Measurements, in one or several text, Excel or Parquet files of whatever columns `understand_tables` recognises.
     measurement
         What was measured; by default poses where the table has orientations, else positions.
     units
         Units of columns whose name carries none, ``"deg,mm"``.
+    asked
+        What else is stated of the tables, and their units.
     validation
         A table of measurements to keep apart.
     hold_out
@@ -78,6 +82,8 @@ def new_problem(
         Of the draw.
     urdf_base, urdf_tip
         Links between which a URDF's robot is.
+    understood
+        Hears what was understood of the tables, before anything is computed.
 
     Raises
     ------
@@ -94,23 +100,26 @@ def new_problem(
     {'identification.csv': 7, 'validation.csv': 2}
     """
     folder = Path(folder)
-    data = Path(data)
-    given = parse_units(units)
     _require_new(folder, validation, hold_out)
-    source = _source(robot)
+    source = find_source(robot)
     arm = read_arm(source.file, urdf_base, urdf_tip)
-    kind, table = _recognised(data, measurement, arm, given)
+    asked = asked or Asked(units=parse_units(units))
+    paths = [data] if isinstance(data, str | Path) else data
+    found = understand_of(arm, paths, measurement, asked)
+    if understood is not None:
+        understood(found)
+    kind = found.kind
     noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
-    rows = _read(data, table, arm, noise, kind)
-    columns = _labelled(table.columns, rows)
-    notes = _named(data, table)
+    rows = _read(found.file, found.columns, arm, noise, kind)
+    columns = _labelled(found.columns, rows)
+    notes = found.sentences
     tables = {"identification.csv": columns}
     apart = '# validation = "validation.csv"   # a table that no choice may see; none was given'
     if validation is not None:
-        other = _recognised(Path(validation), kind.name, arm, given)[1]
-        _read(Path(validation), other, arm, noise, kind)
+        other = understand_of(arm, [validation], kind.name, found.asked)
+        _read(validation, other.columns, arm, noise, kind)
         tables["validation.csv"] = other.columns
-        notes += _named(Path(validation), other)
+        notes = (*notes, *other.sentences)
         apart = f'validation = "validation.csv"\n# from {Path(validation).name}; no choice sees it'
     elif hold_out is not None:
         held = _drawn(rows, hold_out, seed)
@@ -121,34 +130,17 @@ def new_problem(
         "robot": toml(source.stated),
         "drawing": source.drawing,
         "columns": "as you said" if measurement else f"guessed from the columns {', '.join(kind.columns)}",
-        "data": data.name,
+        "data": Path(found.file).name,
         "count": str(len(rows)),
         "validation": apart,
     }
     try:
         text, guessed = problem_text(arm, kind, rows, noise, said)
     except InputError as error:
-        raise error.within(data) from None
+        raise error.within(found.file) from None
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    return Started(folder, counts, (*notes, *guessed))
-
-
-class Source(NamedTuple):
-    """Where the robot comes from: its file, what the problem states of it, and in words."""
-
-    file: Path
-    stated: str
-    drawing: str
-
-
-def _source(robot: str) -> Source:
-    if not robot.endswith(ROBOT_FILES):
-        return Source(find_robot(robot), robot, "a ready robot")
-    file = Path(robot)
-    if not file.is_file():
-        raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
-    return Source(file, "robot.toml", f"modified DH table, from {file.name}")
+    return Started(folder, counts, (*notes, *guessed), found)
 
 
 def _require_new(folder: Path, validation: str | Path | None, hold_out: float | None) -> None:
@@ -161,8 +153,8 @@ def _require_new(folder: Path, validation: str | Path | None, hold_out: float | 
 def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Source, arm: Described) -> None:
     """Make the folder beside its place, and move it there when it is whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=folder.parent, prefix=f"{folder.name}.") as temporary:
-        made = Path(temporary) / folder.name
+    with scratch_folder(folder) as scratch:
+        made = scratch / folder.name
         write_text(made / "problem.toml", text)
         for name, each in tables.items():
             write_text(made / name, csv_text(each, zip(*each.values(), strict=True)))
@@ -173,46 +165,16 @@ def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Sourc
 
 def _write_robot(file: Path, arm: Described, target: Path) -> None:
     if file.suffix == ".toml":
-        write_text(target, file.read_text(encoding="utf-8"))  # with its comments
+        write_text(target, read_text(file))  # with its comments
     else:
         write_robot(arm.robot, target)
 
 
-def _recognised(
-    path: Path, measurement: str | None, arm: Described, units: Mapping[str, str]
-) -> tuple[Measurement, Renamed]:
-    """Return what a table measures, and the table under our names."""
+def _read(file: str | Path, columns: Columns, arm: Described, noise: Mapping[str, float], kind: Measurement) -> Dataset:
     try:
-        source = read_columns(path)
+        return read_data(columns, arm.robot, noise, kind)
     except InputError as error:
-        raise error.within(path) from None
-
-    def renamed(kind: Measurement) -> Renamed:
-        try:
-            return rename(source, arm.robot, kind, units, arm.names)
-        except InputError as error:
-            raise error.within(path) from None
-
-    if measurement is not None:
-        kind = pick(MEASUREMENTS, measurement, "measurement")
-        return kind, renamed(kind)
-    found = renamed(pose)
-    stems = {split_unit(name)[0] for name in found.columns}
-    if not stems & {"x", "y", "z"}:
-        accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
-        raise InputError("the header", f"no positions among {', '.join(source)}", accepted, path)
-    return (pose, found) if any(set(form) <= stems for form in _turns()) else (position, renamed(position))
-
-
-def _turns() -> list[Sequence[str]]:
-    return [tuple(pose.columns), *(tuple(form) for form, _ in pose.forms)]
-
-
-def _read(path: Path, table: Renamed, arm: Described, noise: Mapping[str, float], kind: Measurement) -> Dataset:
-    try:
-        return read_data(table.columns, arm.robot, noise, kind)
-    except InputError as error:
-        raise error.within(path) from None
+        raise error.within(file) from None
 
 
 def _labelled(columns: Columns, rows: Dataset) -> Columns:
@@ -231,12 +193,3 @@ def _drawn(rows: Dataset, share: float, seed: int) -> np.ndarray:
 
 def _taken(columns: Columns, rows: np.ndarray) -> Columns:
     return {name: [cells[i] for i in np.flatnonzero(rows).tolist()] for name, cells in columns.items()}
-
-
-def _named(path: Path, table: Renamed) -> list[str]:
-    notes = []
-    if table.was:
-        notes.append(f"{path.name}: " + ", ".join(f"{was} is {name}" for name, was in table.was.items()) + ".")
-    if table.left_out:
-        notes.append(f"{path.name}: left out {', '.join(table.left_out)}.")
-    return notes

@@ -19,12 +19,16 @@ from rpim_opt.robot.mdh import Robot
 
 
 class Targets(NamedTuple):
-    """Rows of a table: labels, joint values (N, dof), poses (N, 7) or positions (N, 3), torques (N, dof), or None."""
+    """Rows of a table: labels; joint values (N, dof), poses (N, 7) or positions (N, 3), torques, payloads, or None.
+
+    Torques are (N, dof), payloads (N,).
+    """
 
     label: tuple[str, ...]
     q: Array | None
     poses: Array | None
     torque: Array | None
+    payload: Array | None = None
 
 
 def read_targets(source: Any, robot: Robot) -> Targets:
@@ -32,7 +36,8 @@ def read_targets(source: Any, robot: Robot) -> Targets:
 
     Columns ``q1_deg``, ... are joint values; ``x_mm, y_mm, z_mm`` positions in the robot's base, with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses. A table has the former, the latter, or
-    both: joint values are then where to look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ...
+    both: joint values are then where to look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ...,
+    ``payload_kg``.
 
     Parameters
     ----------
@@ -87,7 +92,11 @@ def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
     block, *others = data.blocks
     if others:
         raise InputError("column marker", "several reflectors", "targets of one")
-    targets = Targets(data.label, data.q, block.y, None)
+    if block.approach is not None:
+        raise InputError(
+            "column approach1", "directions of approach", "none: joints are in the middle of their backlash"
+        )
+    targets = Targets(data.label, data.q, block.y, None, block.payload)
     if block.torque is not None:
         targets = targets._replace(torque=block.torque[:, 0])
     if not header.joints:

@@ -34,6 +34,7 @@ def random_problem(kind: str, seed: int, types: tuple[str, ...], N: int = 6, ide
     data = ro.Dataset.of(q, y, 1e-3, measurement=measurement)
     markers = ("A", "B")[: measurement.points]
     block = replace(data.blocks[0], markers=markers, fixture="F", torque=rng.uniform(-5, 5, q.shape))
+    block = replace(block, approach=rng.choice([-1.0, 0.0, 1.0], q.shape))
     data = ro.Dataset((block,), data.label, data.configuration)
     own = {of_fixture(n, "F"): (d, float(rng.normal())) for n, d in measurement.parameters.items()}
     tools = {m: 0.3 * rng.normal(size=6) for m in markers}
@@ -165,10 +166,10 @@ def test_positions_of_one_reflector_and_distances_of_another_in_one_calibration(
     instance = ro.load("mixed")
     kinds = {(block.measurement.name, block.markers) for block in instance.problem.data.blocks}
     assert kinds == {("position", ("A",)), ("cable", ("B",))}
-    result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    result = ro.calibrate(instance.problem, instance.formulation, ro.reml)
     assert result.converged
     alone = instance.problem.data.take(instance.problem.data.blocks[0].row)
-    without = ro.calibrate(instance.problem.on(alone), instance.formulation, instance.weight)
+    without = ro.calibrate(instance.problem.on(alone), instance.formulation, ro.reml)
     mean = [r.errors(instance.validation).mean() for r in (result, without)]
     assert mean[0] < mean[1]
 

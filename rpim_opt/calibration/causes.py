@@ -1,0 +1,139 @@
+"""Why a fit is bad: the mistakes that `inspect` knows are looked for when a calibration leaves too much."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.readings import better_reading
+from rpim_opt.problem.suspects import (
+    exchanged_rows,
+    moved,
+    moved_far,
+    rounded_joints,
+    rows_without_values,
+    shared_rows,
+)
+
+NOISY = 3.0
+"""Residuals beyond so many times what the instrument is stated to have are looked into."""
+HOPELESS = 20.0
+"""Beyond so many times something is said even if nothing explains them."""
+SCALES = 10.0
+"""A robot's parameter that deviates by more scales than this was not expected so."""
+LARGEST = {"length": 0.02, "angle": 0.05}
+"""A machined and assembled robot deviates by less than this [m, rad]."""
+
+NOTHING = (
+    "No mistake that was tried explains it: another drawing, or a robot that bends and repeats worse than the "
+    "instrument measures?"
+)
+
+
+def likely_causes(result: Outcome) -> list[str]:
+    """Return what a bad fit likely comes from, a sentence each with its figure; nothing where the fit is good.
+
+    A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise, or deviates by
+    many scales. Then the table is read in other ways (`better_reading`), and rows without value, exchanged rows,
+    rounded joints and a base that moved are looked for.
+
+    Parameters
+    ----------
+    result
+        A calibration; one of measurements in parts says nothing.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> ro.calibration.likely_causes(ro.calibrate(problem, ro.tikhonov, weight=1.0))
+    []
+    >>> block = problem.data.blocks[0]
+    >>> wrong = replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]])
+    >>> result = ro.calibrate(problem.on(replace(problem.data, blocks=(wrong,))), ro.tikhonov, weight=1.0)
+    >>> causes = ro.calibration.likely_causes(result)
+    >>> causes[1].partition(" with ")[2]
+    'joints 2 and 3 exchanged: exchange the names of the columns q2 and q3.'
+    """
+    if not result.problem.keeps_rows:
+        return []
+    problem = cast(CalibrationProblem, result.problem)
+    shared = list(shared_rows(problem.data, result.record.validation))
+    errors = problem.errors(result.x)
+    signs = _signs(result, problem, errors)
+    if not signs:
+        return shared
+    causes = _causes(problem, result.x, errors)
+    head = f"The fit is bad: {'; '.join(signs)}."
+    if causes or shared:
+        return [head, *(f"Likely: {text}" for text in [*causes, *shared])]
+    if noise_ratio(problem, errors) > HOPELESS:
+        return [
+            head,
+            "No mistake that was tried explains it: look at rpim-opt inspect, the robot's drawing, the units.",
+        ]
+    return []
+
+
+def _causes(problem: CalibrationProblem, x: Array, errors: Array) -> list[str]:
+    """Return what explains a bad fit: something of all rows, else of some."""
+    found = list(rows_without_values(problem))
+    better = better_reading(problem)
+    if better is not None:
+        return [*found, better.sentence]
+    found += exchanged_rows(problem)
+    far = list(moved_far(problem)) or list(moved(problem, x))
+    found += far
+    if not found:
+        found += rounded_joints(problem, _rms(errors))
+    return found
+
+
+def _signs(result: Outcome, problem: CalibrationProblem, errors: Array) -> list[str]:
+    """Return how a fit shows that it is bad."""
+    signs = []
+    ratio = noise_ratio(problem, errors)
+    if ratio > NOISY:
+        signs.append(f"its errors have an RMS of {1e3 * _rms(errors):.3g} mm, {ratio:.3g} times the stated noise")
+    if not result.converged:
+        signs.append("it did not converge")
+    signs += _large(result, problem)
+    return signs
+
+
+def noise_ratio(problem: CalibrationProblem, errors: Array) -> float:
+    """Return the RMS of errors (N,) [m] over that of the stated noise; 0 where no length was measured."""
+    squares = np.zeros(len(errors))
+    for block in problem.data.blocks:
+        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
+        squares[block.row] = np.einsum("nii->ni", block.covariance)[:, lengths].sum(axis=1)
+    of = np.isfinite(errors) & (squares > 0)
+    if not of.any():
+        return 0.0
+    return float(np.sqrt(np.mean(errors[of] ** 2) / np.mean(squares[of])))
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Return the robot's parameter that deviates most, where no drawing is as wrong as that."""
+    free = problem.parameters.free
+    frames = problem.parameters.of_frames[problem.parameters.identified]
+    worst = ""
+    most = 1.0
+    for i, (name, dimension) in enumerate(zip(free.names, free.dimensions, strict=True)):
+        if frames[i] or dimension not in LARGEST:
+            continue
+        share = abs(result.x[i]) / LARGEST[dimension]
+        if abs(result.z[i]) > SCALES and share > most:
+            most = share
+            unit = "mm" if dimension == "length" else "mrad"
+            worst = f"{name} deviates by {1e3 * result.x[i]:+.3g} {unit}"
+    return [worst] if worst else []

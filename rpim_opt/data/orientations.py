@@ -1,0 +1,143 @@
+"""Orientations whose columns are numbered: quaternions, matrices row by row, and rotation vectors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import Columns, numbers
+from rpim_opt.data.dialects import Reading
+
+ORDERS = ("wxyz", "xyzw")
+QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
+MATRIX = re.compile(r"(?:m|t|h|r|mat|matrix|tf|pose)[_ \[(]*([0-4])[_ ,\]\[]*([0-4])[\])]?")
+ENTRIES = re.compile(r"(?:m|t|h|mat|matrix|tf|pose)[_ \[]*(\d{1,2})\]?")
+ROUNDED = 1e-6
+"""The last row of a matrix is 0 0 0 1 within this."""
+Place = tuple[int, int]
+
+
+def numbered(read: dict[str, Reading], table: Columns, dof: int, order: str) -> dict[str, Reading]:
+    """Return readings in which quaternions and matrices have their names.
+
+    Parameters
+    ----------
+    read, table
+        What the columns hold as far as that is known, and the columns.
+    dof
+        How many joints there are: ``q0 ... q3`` are a quaternion where other columns are the joints.
+    order
+        In which order the components stand, ``"wxyz"`` or ``"xyzw"``.
+    """
+    if order not in ORDERS:
+        raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
+    names = quaternion_columns(read, dof)
+    for name, letter in zip(names, order, strict=False):
+        why = f"component {names.index(name) + 1} of a quaternion, order {order}"
+        read = {**read, name: read[name]._replace(stem=f"q{letter}", why=why)}
+    places = _matrix(read)
+    if places:
+        read = {**read, **_entries(read, places, table)}
+    return read
+
+
+def quaternion_columns(read: dict[str, Reading], dof: int) -> list[str]:
+    """Return the four columns of a quaternion whose components are numbered, in order; none where there is none."""
+    found: dict[str, dict[int, str]] = {}
+    for name in read:
+        match = QUATERNION.fullmatch(name.strip().lower())
+        if match:
+            found.setdefault(match[1], {})[int(match[2])] = name
+    for prefix, columns in found.items():
+        if sorted(columns) not in ([0, 1, 2, 3], [1, 2, 3, 4]):
+            continue
+        others = {each.stem for name, each in read.items() if name not in columns.values()}
+        counted = any(all(f"q{i + first}" in others for i in range(dof)) for first in (0, 1))
+        if prefix != "q" or counted:
+            return [columns[i] for i in sorted(columns)]
+    return []
+
+
+def _matrix(read: dict[str, Reading]) -> dict[str, Place]:
+    """Return the columns of a matrix with their row and column from 0; nothing where there is none."""
+    pairs: dict[str, Place] = {}
+    single: dict[str, int] = {}
+    for name in read:
+        plain = name.partition("[mm]")[0].strip().lower()
+        plain = re.sub(r"[_ ](mm|m)$", "", plain)
+        match = MATRIX.fullmatch(plain)
+        if match:
+            pairs[name] = (int(match[1]), int(match[2]))
+        elif ENTRIES.fullmatch(plain):
+            single[name] = int(ENTRIES.fullmatch(plain)[1])  # type: ignore[index]
+    if len(pairs) in (9, 12, 16) and len(set(pairs.values())) == len(pairs):
+        first = min(i for i, _ in pairs.values())
+        return {name: (i - first, j - first) for name, (i, j) in pairs.items()}
+    single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
+    ordered = sorted(single, key=lambda name: single[name])
+    if len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1:
+        return {name: divmod(k, 4) for k, name in enumerate(ordered)}
+    return {}
+
+
+def _entries(read: dict[str, Reading], places: dict[str, Place], table: Columns) -> dict[str, Reading]:
+    """Return the readings of a matrix: rotation, position, and its last row, which is checked."""
+    by_place = {place: name for name, place in places.items()}
+    transposed = False
+    why = "a matrix, row by row"
+    if len(places) == 16:
+        transposed = _is_transposed(by_place, table)
+        why = "a matrix, row by row: its last row is 0 0 0 1"
+        if transposed:
+            why = "a matrix, column by column: its last column is 0 0 0 1"
+    entries = {}
+    for name, (i, j) in places.items():
+        row, column = (j, i) if transposed else (i, j)
+        stem = "the last row of a matrix"
+        if row < 3:
+            stem = "xyz"[row] if column == 3 else f"r{row + 1}{column + 1}"
+        entries[name] = read[name]._replace(stem=stem, why=why)
+    return entries
+
+
+def _is_transposed(by_place: dict[Place, str], table: Columns) -> bool:
+    def is_last(places: Sequence[Place]) -> bool:
+        cells = [_numbers(table, by_place[place]) for place in places]
+        return bool(np.abs(np.stack(cells, axis=1) - [0, 0, 0, 1]).max() < ROUNDED)
+
+    if is_last([(3, j) for j in range(4)]):
+        return False
+    if is_last([(i, 3) for i in range(4)]):
+        return True
+    raise InputError("the matrices", "neither a last row nor a last column 0 0 0 1", "4 x 4 transforms")
+
+
+def _numbers(table: Columns, name: str) -> np.ndarray:
+    rows = [str(i) for i in range(1, len(table[name]) + 1)]
+    return numbers(table[name], rows, name)
+
+
+def from_vectors(table: Columns, names: Sequence[str], si: float) -> dict[str, list[str]]:
+    """Return the quaternions of rotation vectors, columns ``qw, qx, qy, qz``.
+
+    Parameters
+    ----------
+    table, names
+        The columns, and the three of the vectors.
+    si
+        Their unit [rad].
+
+    Examples
+    --------
+    >>> from math import pi
+    >>> from rpim_opt.data.orientations import from_vectors
+    >>> from_vectors({"rx": [pi], "ry": [0], "rz": [0]}, ["rx", "ry", "rz"], 1.0)["qx"]
+    ['1.0']
+    """
+    vectors = np.column_stack([_numbers(table, name) for name in names])
+    xyzw = Rotation.from_rotvec(si * vectors).as_quat()
+    return {f"q{letter}": [repr(float(v)) for v in xyzw[:, "xyzw".index(letter)]] for letter in "wxyz"}

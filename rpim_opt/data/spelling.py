@@ -1,0 +1,89 @@
+"""Units as headers of tables spell them, and those that are converted at the border."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.units import UNITS, split_unit
+
+SPELLED = {
+    "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "meter": "m", "metre": "m",
+    "meters": "m", "metres": "m", "millimeter": "mm", "millimetre": "mm", "millimeters": "mm", "millimetres": "mm",
+    "nm": "Nm", "n.m": "Nm", "n·m": "Nm", "µm": "um", "μm": "um", "micron": "um", "microns": "um", "inch": "in",
+    "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm",
+}  # fmt: skip
+"""Units as they are spelled in headers; their own names besides."""
+
+
+class Foreign(NamedTuple):
+    """A unit of ours, and how many of it a unit of others is."""
+
+    unit: str
+    size: float
+
+
+FOREIGN = {"in": Foreign("mm", 25.4), "cm": Foreign("mm", 10.0), "gon": Foreign("deg", 0.9)}
+"""Units that files of ours do not have: their numbers are converted."""
+
+
+def spelled(text: str) -> str:
+    """Return the name of a unit, or nothing where a text is none.
+
+    >>> from rpim_opt.data.spelling import spelled
+    >>> [spelled(text) for text in ("°", "MM", "inch", "mrad", "rpm")]
+    ['deg', 'mm', 'in', 'mrad', '']
+    """
+    for name in (text, SPELLED.get(text.lower(), ""), text.lower()):
+        if name in UNITS or name in FOREIGN:
+            return name
+    return ""
+
+
+def dimension_of(unit: str) -> str:
+    """Return the dimension of a unit."""
+    if unit in FOREIGN:
+        unit = FOREIGN[unit].unit
+    return UNITS[unit].dimension
+
+
+def parse_units(text: str) -> dict[str, str]:
+    """Return the units of ``"deg,mm"`` by dimension.
+
+    >>> from rpim_opt.data.spelling import parse_units
+    >>> parse_units("rad, m")
+    {'angle': 'rad', 'length': 'm'}
+    """
+    units: dict[str, str] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name = spelled(part)
+        if not name:
+            raise InputError("--units", f"'{part}'", choices(part, [*UNITS, *FOREIGN]))
+        dimension = dimension_of(name)
+        if dimension in units:
+            raise InputError("--units", f"{units[dimension]} and {part}", "one unit for each dimension")
+        units[dimension] = name
+    return units
+
+
+def split(name: str) -> tuple[str, str]:
+    """Return a column's name without its unit, and the unit, empty where there is none.
+
+    >>> from rpim_opt.data.spelling import split
+    >>> [split(name) for name in ("x_mm", "U(95) X [mm]", "J1 (°)", "z / µm", "y in inch", "position[0]")]
+    [('x', 'mm'), ('U(95) X', 'mm'), ('J1', 'deg'), ('z', 'um'), ('y', 'in'), ('position[0]', '')]
+    """
+    stem, unit = split_unit(name)
+    if unit:
+        return stem, name[len(stem) + 1 :]
+    for pattern in (
+        r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]",
+        r"(.+?)\s*/\s*(\S+)",
+        r"(.+?)\s+in\s+(\S+)",
+        r"(.+?)[\s_]+(\S+)",
+    ):
+        match = re.fullmatch(pattern, name)
+        if match and spelled(match[2]):
+            return match[1], spelled(match[2])
+    return stem, ""

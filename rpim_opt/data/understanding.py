@@ -1,0 +1,263 @@
+"""What a raw table says: every column with its meaning, its unit, and why it is taken so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.layouts import Layout, RawTable, missing_rows, read_raw
+from rpim_opt.basics.tables import Columns
+from rpim_opt.basics.text import listed
+from rpim_opt.basics.units import UNITS, split_unit
+from rpim_opt.data.dialects import Reading
+from rpim_opt.data.models import Measurement
+from rpim_opt.data.naming import Renamed, rename
+from rpim_opt.data.orientations import from_vectors, quaternion_columns
+from rpim_opt.data.spelling import split
+from rpim_opt.robot.mdh import Robot
+
+_OF = {"x": "x", "y": "y", "z": "z", "rx": "roll", "ry": "pitch", "rz": "yaw", "distance": "distance"}
+NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
+         "to_marker": "reflector of the second point"}  # fmt: skip
+
+
+class Meant(NamedTuple):
+    """A column: its name in the file, what it means, our name, the unit, and why."""
+
+    column: str
+    meaning: str
+    name: str
+    unit: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a user states of raw tables.
+
+    Parameters
+    ----------
+    layout
+        How the cells are written.
+    units
+        Of columns whose name carries none, by dimension.
+    quaternion
+        Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
+    rotation
+        ``"vector"`` where rx, ry, rz are a rotation vector (Universal Robots), else roll, pitch, yaw.
+    key
+        The column by which several files are joined; ``"row"`` for the number of the row.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> asked = ro.data.Asked(units={"angle": "rad", "length": "m"}, quaternion="xyzw")
+    >>> asked.key
+    ''
+    """
+
+    layout: Layout = field(default_factory=Layout)
+    units: Mapping[str, str] | None = None
+    quaternion: str = ""
+    rotation: str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Understood:
+    """A raw table with our names.
+
+    Parameters
+    ----------
+    file
+        Its name.
+    columns
+        Cells by our names.
+    raw
+        The columns as the file has them, of the same rows.
+    meant
+        What every column means.
+    notes
+        How the file was read and what was left out, a sentence each.
+    numbered
+        Whether a quaternion's components are numbered, whose order a check has to find.
+    """
+
+    file: str
+    columns: Columns
+    raw: Columns
+    meant: tuple[Meant, ...]
+    notes: tuple[str, ...]
+    numbered: bool = False
+
+    @property
+    def stems(self) -> set[str]:
+        """The names of the columns without units."""
+        return {split_unit(name)[0] for name in self.columns}
+
+
+def understand(
+    path: Path, robot: Robot, kind: Measurement, asked: Asked | None = None, joints: Sequence[str] = ()
+) -> Understood:
+    r"""Return what a raw table says of a robot and a kind of measurement.
+
+    Rows without any measured value, or without any joint value, are left out, and said so.
+
+    Parameters
+    ----------
+    path
+        A text, Excel or Parquet file.
+    robot, kind
+        Decide which columns there may be.
+    asked
+        What the user states.
+    joints
+        What the robot's file calls its joints.
+
+    Raises
+    ------
+    InputError
+        For a table that cannot be read, and names that may mean two things.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from rpim_opt.data.models import position
+    >>> from rpim_opt.data.understanding import understand
+    >>> from rpim_opt.robot import Robot
+    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> text = "Point;J1 [deg];J2 [deg];X [mm];Y [mm];Z [mm]\nP1;1,5;2;401;0,5;0\nP2;3;4;-;-;-\n"
+    >>> _ = Path("raw.csv").write_text(text)
+    >>> found = understand(Path("raw.csv"), arm, position)
+    >>> found.columns["q1_deg"], found.meant[1].meaning, found.notes[-1]
+    (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
+    """
+    asked = asked or Asked()
+    raw = read_raw(path, asked.layout)
+    try:
+        raw, vectors = _turned(raw, asked)
+        found = rename(
+            raw.columns, robot, kind, asked.units or {}, joints, raw.heads, quaternion=asked.quaternion or "wxyz"
+        )
+    except InputError as error:
+        raise error.within(path) from None
+    columns, kept, notes = _with_values(found.columns, robot, kind)
+    columns, more = _labelled(columns)
+    known = {name: Reading(split_unit(new)[0]) for new, name in _origins(found).items()}
+    plain = {name: known.get(name, Reading("")) for name in raw.columns}
+    return Understood(
+        path.name,
+        columns,
+        {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
+        _meant(raw, found, vectors),
+        (*raw.notes, *notes, *more),
+        not asked.quaternion and bool(quaternion_columns(plain, robot.dof)),
+    )
+
+
+def _origins(found: Renamed) -> dict[str, str]:
+    """Return the files' names of our columns."""
+    return {name: found.was.get(name, name) for name in found.columns}
+
+
+def _turned(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
+    """Return the table with quaternions for rotation vectors, and the columns that these were."""
+    if not asked.rotation:
+        return raw, ()
+    if asked.rotation != "vector":
+        raise InputError("--rotation", f"'{asked.rotation}'", "vector, where rx, ry, rz are a rotation vector")
+    stems = {split(name)[0].strip().lower(): name for name in raw.columns}
+    names = [stems[stem] for stem in ("rx", "ry", "rz") if stem in stems]
+    if len(names) < 3:
+        raise InputError("the header", "no columns rx, ry, rz", "three of a rotation vector, or no --rotation")
+    unit = split(names[0])[1] or (asked.units or {}).get("angle", "")
+    if not unit:
+        raise InputError("the header", f"columns without a unit ({', '.join(names)})", "--units with it, such as rad")
+    others = {name: cells for name, cells in raw.columns.items() if name not in names}
+    turns = from_vectors(raw.columns, names, UNITS[unit].si)
+    return replace(raw, columns={**others, **turns}), tuple(names)
+
+
+def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Columns, list[int], list[str]]:
+    """Return the columns without rows that have no values, the rows that are left, and what was left out."""
+    stems = {name: split_unit(name)[0] for name in columns}
+    joints = {f"q{i}" for i in range(1, robot.dof + 1)}
+    measured = {*kind.columns, *(stem for form, _ in kind.forms for stem in form)}
+    out: set[int] = set()
+    notes = []
+    for what, of in (("measured", measured), ("joint", joints)):
+        rows = missing_rows(columns, [name for name, stem in stems.items() if stem in of])
+        if rows:
+            labels = columns.get("label", [str(i + 1) for i in range(max(rows) + 1)])
+            notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
+        out |= set(rows)
+    count = len(next(iter(columns.values()), ()))
+    kept = [i for i in range(count) if i not in out]
+    if columns and not kept:
+        raise InputError("the table", "no row with values", "at least one")
+    if not out:
+        return columns, kept, notes
+    return {name: [cells[i] for i in kept] for name, cells in columns.items()}, kept, notes
+
+
+def _labelled(columns: Columns) -> tuple[Columns, list[str]]:
+    """Return the columns with unique labels, of point and reflector where a point is there with several."""
+    labels = [str(cell).strip() for cell in columns.get("label", ())]
+    if not labels or (len(set(labels)) == len(labels) and all(labels)):
+        return columns, []
+    if "marker" in columns:
+        both = [f"{label}/{marker}" for label, marker in zip(labels, columns["marker"], strict=True)]
+        if len(set(both)) == len(both):
+            return {"configuration": labels, **columns, "label": both}, ["labels are those of point and reflector."]
+    again = next((label for label in labels if labels.count(label) > 1), "")
+    others = {name: cells for name, cells in columns.items() if name != "label"}
+    return others, [f"labels are not unique ('{again}'): rows are numbered."]
+
+
+def _meant(raw: RawTable, found: Renamed, vectors: Sequence[str]) -> tuple[Meant, ...]:
+    """Return what every column of the file means."""
+    new = {was: name for name, was in _origins(found).items()}
+    meant = [Meant(name, "rotation vector", "qw, qx, qy, qz", "", "--rotation vector") for name in vectors]
+    for name in raw.columns:
+        if name not in new:
+            meant.append(Meant(name, "left out", "", "", found.left_why[name]))
+        elif not (vectors and name in ("qw", "qx", "qy", "qz")):
+            of, unit_why = found.why[new[name]]
+            why = of if not unit_why else f"{of}; unit {unit_why}"
+            stem, unit = split_unit(new[name])
+            shown = new[name].removeprefix(f"{stem}_") if unit else ""
+            meant.append(Meant(name, meaning(stem), new[name], shown, why))
+    return tuple(meant)
+
+
+def meaning(stem: str) -> str:
+    """Return what a column of ours is, in words.
+
+    >>> from rpim_opt.data.understanding import meaning
+    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
+    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
+    """
+    if stem in NAMES:
+        return NAMES[stem]
+    if stem.startswith("to_"):
+        return f"second point: {meaning(stem.removeprefix('to_'))}"
+    for prefix, word in (("q", "joint"), ("tau", "torque of joint")):
+        if stem.removeprefix(prefix).isdigit():
+            return f"{word} {stem.removeprefix(prefix)}"
+    for prefix, word in (("u95", "U95"), ("sigma", "standard deviation"), ("cov", "covariance")):
+        if stem.startswith(prefix):
+            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
+    if stem in ("qw", "qx", "qy", "qz"):
+        return f"quaternion {stem[1]}"
+    if len(stem) == 3 and stem.startswith("r") and stem[1:].isdigit():
+        return f"rotation matrix {stem[1]},{stem[2]}"
+    return f"measured {_OF.get(stem, stem)}"
+
+
+def meant_rows(tables: Sequence[Understood]) -> list[dict[str, Any]]:
+    """Return what all columns mean, as a document."""
+    return [{"file": table.file, **each._asdict()} for table in tables for each in table.meant]

@@ -1,0 +1,307 @@
+"""Other readings of a table: what people get wrong, which of it would fit far better, and what to write then."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.problem.misfit import Points, misfit, misfits, points_of
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.library import READY, robots
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.plain import read_mdh
+
+BETTER = 0.2
+"""Another reading of the data is reported when it leaves less than this part of the position error."""
+FURTHER = 0.7
+"""A second mistake is looked for behind a reading that leaves less than this part."""
+WRONG = 0.02
+"""Points that are off by more than this part of their extent fit no drawing of their robot."""
+FEW = 60
+"""Rows of a first try; what comes near the best is tried on more."""
+NEAR = 2.0
+SAME = 1.05
+"""Readings that leave within this factor the same cannot be told apart."""
+BEAM = 8
+"""First mistakes behind which a second one is looked for."""
+
+
+class Reading(NamedTuple):
+    """Another reading: what was mistaken, what to write, and the points as they are then."""
+
+    what: str
+    remedy: str
+    change: Callable[[Points], Points]
+
+
+class Better(NamedTuple):
+    """The best other reading: what and the remedies in words, the errors [m] of both, and the relative ones' ratio."""
+
+    what: str
+    remedy: str
+    stated: float
+    left: float
+    ratio: float
+
+    @property
+    def sentence(self) -> str:
+        """Say it with the figures."""
+        figures = f"{1e3 * self.left:.3g} mm instead of {1e3 * self.stated:.3g} mm"
+        return f"the data fit {self.ratio:.0f} times better, {figures}, with {self.what}: {self.remedy}."
+
+
+def joint_readings(robot: Robot) -> Iterator[Reading]:
+    """Yield readings with other joint values: units, signs, zeros, orders, couplings."""
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    n = robot.dof
+    eye = np.eye(n)
+
+    def of(what: str, remedy: str, M: Array, shift: Array | float = 0.0) -> Reading:
+        return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T + shift))
+
+    degrees = np.diag(np.where(turning, np.pi / 180, 1))
+    yield of("joint values read as degrees, not radians", "name the columns q1_deg, ... (--units deg)", degrees)
+    radians = np.diag(np.where(turning, 180 / np.pi, 1))
+    yield of("joint values read as radians, not degrees", "name the columns q1_rad, ... (--units rad)", radians)
+    for i in np.flatnonzero(turning):
+        flipped = eye - 2 * np.outer(eye[i], eye[i])
+        yield of(f"joint {i + 1} counted the other way", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
+        for angle in (90, -90, 180):
+            remedy = f"add {angle} deg to theta_deg of joint {i + 1} in robot.toml"
+            yield of(f"joint {i + 1} shifted by {angle} deg", remedy, eye, np.radians(angle) * eye[i])
+    for i, j in combinations(range(n), 2):
+        if turning[i] == turning[j]:
+            order = list(range(n))
+            order[i], order[j] = order[j], order[i]
+            remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
+            yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, eye[order])
+    yield from _couplings(robot, of)
+
+
+def _couplings(robot: Robot, of: Callable[..., Reading]) -> Iterator[Reading]:
+    """Yield readings in which a joint's value counts from another joint."""
+    n = robot.dof
+    turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
+    for i, j in permutations(turning, 2):
+        for sign in (1, -1):
+            M = np.eye(n)
+            M[i, j] = sign
+            rows = ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in M)
+            word = "plus" if sign > 0 else "minus"
+            what = f"joint {i + 1} coupled to joint {j + 1} (q{i + 1} {word} q{j + 1})"
+            yield of(what, f"write coupling = [{rows}] in robot.toml", M)
+
+
+def measured_readings() -> Iterator[Reading]:
+    """Yield readings with other measured values: units, handedness, transforms the other way."""
+
+    def scaled(what: str, remedy: str, factors: list[float]) -> Reading:
+        return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
+
+    yield scaled("measured lengths a thousand times larger", "name the columns x_m, y_m, z_m", [1e3] * 3)
+    yield scaled("measured lengths a thousand times smaller", "name the columns x_mm, y_mm, z_mm", [1e-3] * 3)
+    yield scaled("measured lengths in inches, not mm", "name the columns X [in], ... and use rpim-opt new", [25.4] * 3)
+    remedy = "change the sign of one coordinate, or exchange two"
+    yield Reading("the measured frame mirrored (left-handed)", remedy, _mirrored)
+
+
+def _mirrored(points: Points) -> Points:
+    mirror = np.diag([1.0, 1.0, -1.0])
+    turns = points.turns
+    if turns is not None:
+        turns = mirror @ turns @ mirror
+    return replace(points, y=points.y * np.diag(mirror), turns=turns)
+
+
+def pose_readings() -> Iterator[Reading]:
+    """Yield readings with other orientations."""
+    yield Reading(
+        "orientations the other way round (of the instrument in the tool)",
+        "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
+        lambda points: replace(points, turns=None if points.turns is None else np.swapaxes(points.turns, 1, 2)),
+    )
+
+    def inverted(points: Points) -> Points:
+        if points.turns is None:
+            return points
+        back = np.swapaxes(points.turns, 1, 2)
+        return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
+
+    yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", inverted)
+
+
+def row_readings(count: int) -> Iterator[Reading]:
+    """Yield readings with joint values of other rows: shifted, reversed, in the order of texts."""
+
+    def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Reading:
+        return Reading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
+
+    rows = np.arange(count)
+    for k in (1, 2, 3):
+        if count - k >= 6:
+            said = f"{k} row{'s' * (k > 1)}"
+            down = f"move the measured values {said} up, against the joint values"
+            yield of(f"measured values {said} too low in the table", down, rows[:-k], rows[k:])
+            up = f"move the measured values {said} down, against the joint values"
+            yield of(f"measured values {said} too high in the table", up, rows[k:], rows[:-k])
+    yield of("the rows of joint values in the reverse order", "turn one of the two parts over", rows[::-1], rows)
+    by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
+    remedy = "join by a column that both have (rpim-opt new --data --data --key)"
+    yield of("measured values sorted as texts (1, 10, 11, 2)", remedy, by_text, rows)
+    back = np.argsort(by_text)
+    yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, back, rows)
+
+
+def better_reading(problem: CalibrationProblem) -> Better | None:
+    """Return the reading that fits far better than what is written, or None.
+
+    Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
+    right, all orders of up to six joints, and the ready robots.
+
+    Parameters
+    ----------
+    problem
+        Its robot as the drawing says; base and reflectors are fitted anew for every reading.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.readings import better_reading
+    >>> problem = ro.load("position").problem
+    >>> better_reading(problem)
+    >>> block = problem.data.blocks[0]
+    >>> wrong = problem.on(replace(problem.data, blocks=(replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]]),)))
+    >>> better_reading(wrong)[:2]
+    ('joints 2 and 3 exchanged', 'exchange the names of the columns q2 and q3')
+    """
+    points = points_of(problem)
+    if points is None:
+        return None
+    stated = misfit(problem.robot, points)
+    if not np.isfinite(stated):
+        return None
+    found = _searched(problem.robot, points, stated)
+    if found is None and stated > WRONG:
+        found = _reordered(problem.robot, points, stated) or _other_robot(problem.robot, points, stated)
+    return found
+
+
+def _all(robot: Robot, points: Points) -> list[Reading]:
+    readings = [*joint_readings(robot), *measured_readings(), *row_readings(len(points.row))]
+    if points.turns is not None:
+        readings += pose_readings()
+    return readings
+
+
+def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
+    """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
+    chain: list[Reading] = []
+    current = points
+    best = stated
+    for _ in range(3):
+        each, size = _best(robot, current, _all(robot, current))
+        if each is None or not size < FURTHER * best:
+            break
+        chain.append(each)
+        current = each.change(current)
+        best = size
+        if best < BETTER * stated and best < WRONG:
+            return _compared(chain, points, stated, current, best)
+    if stated > WRONG:
+        pair = _pair(robot, points)
+        if pair is not None and pair[1] < min(best, BETTER * stated):
+            chain, best = pair
+            current = chain[1].change(chain[0].change(points))
+    if not chain or not best < BETTER * stated:
+        return None
+    return _compared(chain, points, stated, current, best)
+
+
+def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:
+    """Return the best two mistakes together, the first of them one of those that help most, or of all signs."""
+    readings = _all(robot, points)
+    size = _tried(robot, points, readings)
+    firsts = [readings[i] for i in np.argsort(size)[:BEAM]]
+    found: list[tuple[list[Reading], float]] = []
+    for first in firsts:
+        changed = first.change(points)
+        second, left = _best(robot, changed, [each for each in _all(robot, changed) if each.what != first.what])
+        if second is not None:
+            found.append(([first, second], left))
+    return min(found, key=lambda each: each[1], default=None)
+
+
+def _compared(chain: list[Reading], points: Points, stated: float, changed: Points, left: float) -> Better:
+    what = " and ".join(each.what for each in chain)
+    remedy = "; ".join(each.remedy for each in chain)
+    return Better(what, remedy, stated * points.extent, left * changed.extent, stated / max(left, 1e-300))
+
+
+def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Reading | None, float]:
+    """Return the reading that fits best, and how badly it does; few rows choose whom more rows compare."""
+    size = _tried(robot, points, readings)
+    least = float(size.min(initial=np.inf))
+    if not np.isfinite(least):
+        return None, float("inf")
+    near = [i for i in np.argsort(size) if size[i] <= NEAR * least][:8]
+    whole = misfits(robot, [readings[i].change(points) for i in near])
+    k = int(np.argmin(whole))
+    same = [readings[i] for i, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
+    return _either(readings[near[k]], same), float(whole[k])
+
+
+def _either(best: Reading, same: list[Reading]) -> Reading:
+    """Return a reading that names all that fit as well: some are one and the same, but for base and reflector."""
+    others = [each for each in same if each is not best][:2]
+    what = ", or ".join(each.what for each in (best, *others))
+    remedy = ", or ".join(each.remedy for each in (best, *others))
+    return best._replace(what=what, remedy=remedy)
+
+
+def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
+    """Return how badly readings fit, from few rows."""
+    changed = [each.change(points) for each in readings]
+    few = [
+        each.take(np.linspace(0, len(each.row) - 1, min(FEW, len(each.row))).round().astype(int)) for each in changed
+    ]
+    return misfits(robot, few)
+
+
+def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
+    """Return the best order of up to six turning joints."""
+    if robot.dof > 6 or len(set(robot.joint_types)) > 1:
+        return None
+    readings = [
+        Reading(
+            f"joints in the order {', '.join(f'q{i + 1}' for i in order)}",
+            "name the columns in that order",
+            lambda points, order=order: replace(points, q=points.q[:, list(order)]),
+        )
+        for order in permutations(range(robot.dof))
+    ]
+    each, size = _best(robot, points, readings)
+    if each is None or not size < BETTER * stated:
+        return None
+    return _compared([each], points, stated, each.change(points), size)
+
+
+def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
+    """Return the ready robot with as many joints that fits far better."""
+    best = stated
+    name = ""
+    for each in robots():
+        other = read_mdh(READY / f"{each}.toml")
+        if other.joint_types == robot.joint_types:
+            size = misfit(other, points)
+            if size < best:
+                best, name = size, each
+    if not best < BETTER * stated:
+        return None
+    other = Reading(f"the ready robot {name}", f'write robot = "{name}"', lambda points: points)
+    return _compared([other], points, stated, points, best)

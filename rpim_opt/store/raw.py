@@ -1,0 +1,240 @@
+"""Raw tables of a robot, understood: what every column means, before anything is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import Columns
+from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position
+from rpim_opt.data.orientations import ORDERS
+from rpim_opt.data.reading import read_data
+from rpim_opt.data.several import together
+from rpim_opt.data.understanding import Asked, Understood, meant_rows, understand
+from rpim_opt.problem.orientation import pose_misfit
+from rpim_opt.robot.chain import Described
+from rpim_opt.robot.library import read_arm
+from rpim_opt.store.drawing import find_source
+from rpim_opt.store.named import pick
+
+CLEARLY = 3.0
+"""The right order of a quaternion leaves so many times less than the other one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Understanding:
+    r"""What raw tables say.
+
+    Parameters
+    ----------
+    kind
+        What was measured.
+    columns
+        One table with our names, texts and numbers as the files have them.
+    tables
+        What was understood of every file.
+    notes
+        How the tables were put together and what was checked, a sentence each.
+    asked
+        What was stated of them.
+    file
+        The file, or the first of them.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> rows = ["Point;" + ";".join(f"J{i} [deg]" for i in range(1, 7)) + ";X [mm];Y [mm];Z [mm]"]
+    >>> rows += [f"P{k};{k},5;-90;10;20;30;40;{k}00,125;200;300" for k in range(1, 4)]
+    >>> _ = Path("raw.csv").write_text("\n".join(rows))
+    >>> found = ro.store.understand_tables("ur5e", ["raw.csv"])
+    >>> print(str(found).splitlines()[2])
+    Point      label of the row   label         a usual name
+    >>> found.columns["x_mm"], found.kind.name
+    (['100.125', '200.125', '300.125'], 'position')
+    """
+
+    kind: Measurement
+    columns: Columns
+    tables: tuple[Understood, ...]
+    notes: tuple[str, ...]
+    asked: Asked
+    file: str
+
+    def __str__(self) -> str:
+        """Return what every column means as a table, and the sentences."""
+        parts = []
+        for each in self.tables:
+            rows = [[m.column, m.meaning, m.name, m.unit, m.why] for m in each.meant]
+            text = _table(["column", "meaning", "name here", "unit", "why"], rows)
+            if len(self.tables) > 1:
+                text = f"{each.file}\n{text}"
+            parts.append("\n".join([text, *(f"{each.file}: {note}" for note in each.notes)]))
+        count = len(next(iter(self.columns.values())))
+        return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{count} rows, measurement {self.kind.name}."])
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The same in sentences, without what stands as it was.
+
+        >>> from rpim_opt.store.named import find
+        >>> import rpim_opt as ro
+        >>> arm = find("paper_arm")
+        >>> ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"]).sentences
+        ()
+        """
+        said = []
+        for each in self.tables:
+            said += [f"{each.file}: {note}" for note in each.notes]
+            renamed = [f"{m.column} is {m.name}" for m in each.meant if m.name and m.name != m.column]
+            out = [m.column for m in each.meant if m.meaning == "left out"]
+            if renamed:
+                said.append(f"{each.file}: {', '.join(renamed)}.")
+            if out:
+                said.append(f"{each.file}: left out {', '.join(out)}.")
+        return (*said, *self.notes)
+
+    def content(self) -> dict[str, Any]:
+        """Return the same as a document.
+
+        >>> from rpim_opt.store.named import find
+        >>> import rpim_opt as ro
+        >>> arm = find("paper_arm")
+        >>> found = ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"])
+        >>> found.content()["columns"][1]["meaning"], found.content()["rows"]
+        ('joint 1', 9)
+        """
+        said = [f"{each.file}: {note}" for each in self.tables for note in each.notes]
+        count = len(next(iter(self.columns.values())))
+        return {"columns": meant_rows(self.tables), "measurement": self.kind.name, "rows": count,
+                "notes": [*said, *self.notes]}  # fmt: skip
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of text, all columns aligned left."""
+    width = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = [header, ["-" * w for w in width], *rows]
+    return "\n".join("   ".join(cell.ljust(w) for cell, w in zip(line, width, strict=True)).rstrip() for line in lines)
+
+
+def understand_tables(
+    robot: str,
+    data: Sequence[str | Path],
+    measurement: str | None = None,
+    asked: Asked | None = None,
+    urdf_base: str | None = None,
+    urdf_tip: str | None = None,
+) -> Understanding:
+    r"""Return what raw tables of a robot say: every column's meaning, unit, and why.
+
+    Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
+    measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
+
+    Parameters
+    ----------
+    robot
+        The name of a ready robot, or a file.
+    data
+        Text, Excel or Parquet files.
+    measurement
+        What was measured; by default poses where the tables have orientations, else positions.
+    asked
+        What is stated of the tables.
+    urdf_base, urdf_tip
+        Links between which a URDF's robot is.
+
+    Raises
+    ------
+    InputError
+        For what cannot be read, or may mean two things.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> _ = Path("joints.csv").write_text("Point,A1,A2,A3,A4,A5,A6\nP1,0,-90,10,20,30,40\nP2,5,-80,0,0,10,0\n")
+    >>> _ = Path("points.csv").write_text("Point ID;X [m];Y [m];Z [m]\nP2;0,125;0,2;1,5\nP1;0,5;0,25;1,75\n")
+    >>> asked = ro.data.Asked(units={"angle": "deg"})
+    >>> found = ro.store.understand_tables("ur5e", ["joints.csv", "points.csv"], asked=asked)
+    >>> found.columns["q1_deg"], found.columns["x_m"]
+    (['5', '0'], ['0.125', '0.5'])
+    >>> found.notes
+    ('joined by label: 2 rows of 2 with joints and 2 measured.',)
+    """
+    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip)
+    return understand_of(arm, data, measurement, asked)
+
+
+def understand_of(
+    arm: Described, data: Sequence[str | Path], measurement: str | None = None, asked: Asked | None = None
+) -> Understanding:
+    """Return what raw tables of an arm say, as `understand_tables` does."""
+    asked = asked or Asked()
+    paths = [Path(each) for each in data]
+    kind = pose
+    if measurement is not None:
+        kind = pick(MEASUREMENTS, measurement, "measurement")
+    tables = _understood(paths, arm, kind, asked)
+    if measurement is None:
+        kind = _kind(tables, paths)
+        if kind is not pose:
+            tables = _understood(paths, arm, kind, asked)
+    if kind is pose and any(each.numbered for each in tables):
+        return _ordered(paths, arm, kind, asked, tables)
+    return _whole(paths, arm, kind, asked, tables)
+
+
+def _understood(paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:
+    return tuple(understand(path, arm.robot, kind, asked, arm.names) for path in paths)
+
+
+def _whole(
+    paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked, tables: Sequence[Understood]
+) -> Understanding:
+    try:
+        whole = together(tables, arm.robot, kind, asked.key)
+    except InputError as error:
+        raise error.within(paths[0] if len(paths) == 1 else None) from None
+    return Understanding(kind, whole.columns, tuple(tables), whole.notes, asked, str(paths[0]))
+
+
+def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
+    """Return poses where the tables have orientations, else positions."""
+    stems = {stem for each in tables for stem in each.stems}
+    if not stems & {"x", "y", "z"}:
+        names = ", ".join(name for each in tables for name in each.raw)
+        accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
+        raise InputError("the header", f"no positions among {names}", accepted, paths[0])
+    forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
+    return pose if any(form <= stems for form in forms) else position
+
+
+def _ordered(
+    paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked, tables: Sequence[Understood]
+) -> Understanding:
+    """Return the tables with a quaternion in the order that fits the nominal robot, and say both figures."""
+    found = {order: _whole(paths, arm, kind, replace(asked, quaternion=order), _understood(
+        paths, arm, kind, replace(asked, quaternion=order))) for order in ORDERS}  # fmt: skip
+    misfit = {order: _misfit(each, arm) for order, each in found.items()}
+    best, other = sorted(ORDERS, key=lambda order: misfit[order])
+    if not misfit[other] > CLEARLY * misfit[best]:
+        figures = ", ".join(f"{order} {np.degrees(misfit[order]):.2f} deg" for order in ORDERS)
+        raise InputError(
+            "the order of the quaternion", f"no clear one ({figures})", "--quaternion wxyz or xyzw", paths[0]
+        )
+    note = (
+        f"the quaternion's order is {best}: on the nominal robot it leaves {np.degrees(misfit[best]):.2f} deg, "
+        f"{other} {np.degrees(misfit[other]):.1f} deg."
+    )
+    return replace(found[best], notes=(*found[best].notes, note))
+
+
+def _misfit(found: Understanding, arm: Described) -> float:
+    """Return how badly poses fit the nominal robot [rad]."""
+    data = read_data(found.columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, found.kind)
+    return pose_misfit(arm.robot, data)

@@ -1,0 +1,183 @@
+"""What people get wrong in tables of measurements, done to simulated ones of real robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+import rpim_opt as ro
+from rpim_opt.robot.library import READY
+from rpim_opt.robot.plain import read_mdh
+
+NOISE = 5e-5
+COUNT = 40
+
+
+def simulated_arm(name: str, seed: int = 1, count: int = COUNT, markers: int = 1) -> ro.CalibrationProblem:
+    """Return measurements of a ready robot with deviations of 0.5 mm and 0.5 mrad, far from the instrument."""
+    robot = read_mdh(READY / f"{name}.toml")
+    rng = np.random.default_rng(seed)
+    low, high = np.clip(robot.limits, -2.5, 2.5).T
+    q = rng.uniform(low, high, (count, robot.dof))
+    names = [""] if markers == 1 else list("ABC"[:markers])
+    places = [[0.06, -0.03, 0.09], [-0.08, 0.02, 0.05], [0.01, 0.09, 0.02]]
+    tools = {m: [*place, 0.0, 0.0, 0.0] for m, place in zip(names, places, strict=False)}
+    base = (1.8, -0.7, 0.35, 0.1, -0.2, 1.1)
+    parameters = ro.robot.model_parameters(robot, base, tools)
+    reflectors = [f"tool_{m}_[xyz]" if m else "tool_[xyz]" for m in names]
+    parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "base_*", *reflectors])
+    parameters = parameters.scaled({"length_mm": 0.5, "angle_mrad": 0.5, "base_mm": 10, "base_mrad": 10, "tool_mm": 1})
+    blocks = []
+    for k, marker in enumerate(names):
+        block = ro.Dataset.of(q, np.zeros((count, 3)), NOISE).blocks[0]
+        blocks.append(replace(block, markers=(marker,), row=np.arange(count) + k * count))
+    label = tuple(f"P{i + 1}{m}" for m in names for i in range(count))
+    data = ro.Dataset(tuple(blocks), label, np.tile(np.arange(count), len(names)))
+    problem = ro.CalibrationProblem(robot, parameters, data)
+    truth = rng.normal(size=len(parameters.free)) * parameters.free.scale
+    y = problem.modelled(truth)
+    noisy = [replace(b, y=each + NOISE * rng.normal(size=each.shape)) for b, each in zip(blocks, y, strict=True)]
+    return problem.on(replace(data, blocks=tuple(noisy)))
+
+
+Change = Callable[[ro.CalibrationProblem], ro.CalibrationProblem]
+
+
+def joints(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        blocks = tuple(replace(b, q=change(b.q.copy())) for b in problem.data.blocks)
+        return problem.on(replace(problem.data, blocks=blocks))
+
+    return changed
+
+
+def values(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        blocks = tuple(replace(b, y=change(b.y.copy())) for b in problem.data.blocks)
+        return problem.on(replace(problem.data, blocks=blocks))
+
+    return changed
+
+
+def exchanged(i: int, j: int) -> Change:
+    def change(q: np.ndarray) -> np.ndarray:
+        q[..., [i, j]] = q[..., [j, i]]
+        return q
+
+    return joints(change)
+
+
+def flipped(*which: int) -> Change:
+    def change(q: np.ndarray) -> np.ndarray:
+        q[..., list(which)] *= -1
+        return q
+
+    return joints(change)
+
+
+def shifted(i: int, degrees: float) -> Change:
+    def change(q: np.ndarray) -> np.ndarray:
+        q[..., i] += np.radians(degrees)
+        return q
+
+    return joints(change)
+
+
+def coupled(i: int, j: int, factor: float) -> Change:
+    def change(q: np.ndarray) -> np.ndarray:
+        q[..., i] += factor * q[..., j]
+        return q
+
+    return joints(change)
+
+
+def rounded(degrees: float) -> Change:
+    step = np.radians(degrees)
+    return joints(lambda q: (q / step).round() * step)
+
+
+def rows_set(rows: list[int], value: float) -> Change:
+    def change(y: np.ndarray) -> np.ndarray:
+        y[rows] = value
+        return y
+
+    return values(change)
+
+
+def rows_exchanged(i: int, j: int) -> Change:
+    def change(y: np.ndarray) -> np.ndarray:
+        y[[i, j]] = y[[j, i]]
+        return y
+
+    return values(change)
+
+
+def moved_by(far: float, turn: float = 0.0) -> Change:
+    """Move the instrument after two thirds of the rows, by metres and radians about z."""
+
+    def change(y: np.ndarray) -> np.ndarray:
+        R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        y[2 * COUNT // 3 :] = y[2 * COUNT // 3 :] @ R.T + [far, -far / 2, 0]
+        return y
+
+    return values(change)
+
+
+def other_robot(name: str) -> Change:
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        other = simulated_arm(name)
+        return problem.on(other.data)
+
+    return changed
+
+
+def both(*changes: Change) -> Change:
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        for each in changes:
+            problem = each(problem)
+        return problem
+
+    return changed
+
+
+BY_TEXT = sorted(range(COUNT), key=lambda i: str(i + 1))
+MISTAKES: dict[str, tuple[Change, str]] = {
+    "joints 2 and 3 exchanged": (exchanged(1, 2), "joints 2 and 3 exchanged"),
+    "joints 4 and 6 exchanged": (exchanged(3, 5), "joints 4 and 6 exchanged"),
+    "joints 1 and 2 exchanged": (exchanged(0, 1), "joints 1 and 2 exchanged"),
+    "joint 2 reversed": (flipped(1), "joint 2 counted the other way"),
+    "joint 3 reversed": (flipped(2), "joint 3 counted the other way"),
+    "joint 5 reversed": (flipped(4), "joint 5 counted the other way"),
+    "joint 6 reversed": (flipped(5), "joint 6 counted the other way"),
+    "joints 3 and 5 reversed": (flipped(2, 4), "joint 3 counted the other way"),
+    "joint 2 from 90 degrees": (shifted(1, 90), "joint 2 shifted by -90 deg"),
+    "joint 3 from -90 degrees": (shifted(2, -90), "joint 3 shifted by 90 deg"),
+    "joint 5 from 180 degrees": (shifted(4, 180), "joint 5 shifted by 180 deg"),
+    "joint 2 from 90 degrees and joint 3 reversed": (both(shifted(1, 90), flipped(2)), "joint 3 counted the other way"),
+    "joint 3 coupled to 2": (coupled(2, 1, 1.0), "joint 3 coupled to joint 2 (q3 minus q2)"),
+    "joint 3 coupled to 2 the other way": (coupled(2, 1, -1.0), "joint 3 coupled to joint 2 (q3 plus q2)"),
+    "joint 5 coupled to 4": (coupled(4, 3, 1.0), "joint 5 coupled to joint 4"),
+    "degrees as radians": (joints(np.degrees), "degrees, not radians"),
+    "radians as degrees": (joints(np.radians), "radians, not degrees"),
+    "metres as millimetres": (values(lambda y: y / 1e3), "a thousand times larger"),
+    "millimetres as metres": (values(lambda y: 1e3 * y), "a thousand times smaller"),
+    "inches as millimetres": (values(lambda y: y / 25.4), "in inches"),
+    "left-handed": (values(lambda y: y * [1, -1, 1]), "mirrored"),
+    "x and y exchanged": (values(lambda y: y[:, [1, 0, 2]]), "mirrored"),
+    "values a row too low": (values(lambda y: np.roll(y, 1, axis=0)), "1 row too low"),
+    "values a row too high": (values(lambda y: np.roll(y, -1, axis=0)), "1 row too high"),
+    "values two rows too low": (values(lambda y: np.roll(y, 2, axis=0)), "2 rows too low"),
+    "values from the last to the first": (values(lambda y: y[::-1]), "reverse order"),
+    "values sorted as texts": (values(lambda y: y[BY_TEXT]), "sorted as texts"),
+    "a row of zeros": (rows_set([7], 0.0), "rows P8 have 0 for every"),
+    "three rows of zeros": (rows_set([7, 8, 20], 0.0), "rows P8, P9, P21 have 0 for every"),
+    "two rows exchanged": (rows_exchanged(4, 21), "P5 and P22"),
+    "tracker moved by 300 mm": (moved_by(0.3, 0.2), "from row P2"),
+    "tracker moved by 1 mm": (moved_by(1e-3), "from row P2"),
+    "joints rounded to 0.1 degrees": (rounded(0.1), "(0.1 deg): rounding alone"),
+    "joints rounded to a degree": (rounded(1.0), "(1 deg): rounding alone"),
+}
+ROBOTS = ("ur5e", "irb120", "iiwa7")
+OTHER = {"ur5e": "ur10e", "irb120": "irb140", "iiwa7": "fr3"}

@@ -1,0 +1,132 @@
+"""A calibration of wrong data says what is wrong, and one of good data says nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.calibration import likely_causes
+from rpim_opt.problem import inspect
+from tests.calibration.mistakes import (
+    COUNT,
+    MISTAKES,
+    OTHER,
+    ROBOTS,
+    Change,
+    exchanged,
+    other_robot,
+    simulated_arm,
+    values,
+)
+from tests.test_cli import run
+
+CALIBRATED = {"weight": ro.reml}
+QUICK = {
+    "ur5e": ["joints 4 and 6 exchanged", "joint 6 reversed", "three rows of zeros", "tracker moved by 1 mm"],
+    "irb120": ["joint 3 coupled to 2", "values a row too low", "two rows exchanged", "joints rounded to 0.1 degrees"],
+    "iiwa7": ["joint 2 from 90 degrees and joint 3 reversed", "left-handed", "tracker moved by 300 mm"],
+}
+
+
+def said(robot: str, change: Change) -> list[str]:
+    problem = change(simulated_arm(robot))
+    return likely_causes(ro.calibrate(problem, ro.tikhonov, **CALIBRATED))
+
+
+@pytest.mark.parametrize(("robot", "mistake"), [(robot, each) for robot, some in QUICK.items() for each in some])
+def test_a_mistake_is_named(robot: str, mistake: str) -> None:
+    change, expected = MISTAKES[mistake]
+    causes = said(robot, change)
+    assert causes[0].startswith("The fit is bad: ")
+    assert any(expected in text for text in causes[1:]), causes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("mistake", [*MISTAKES, "another robot"])
+def test_every_mistake_is_named_on_three_robots(robot: str, mistake: str) -> None:
+    change, expected = MISTAKES.get(mistake) or (other_robot(OTHER[robot]), f"the ready robot {OTHER[robot]}")
+    causes = said(robot, change)
+    assert any(expected in text for text in causes[1:]), causes
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", [2, 3])
+def test_good_data_are_not_accused(robot: str, seed: int) -> None:
+    """Also where the instrument is worse than stated by less than what is looked into, and few rows are there."""
+    problem = simulated_arm(robot, seed)
+    assert likely_causes(ro.calibrate(problem, ro.tikhonov, **CALIBRATED)) == []
+    assert not [text for text in inspect(problem).warnings if "hardly" not in text]
+
+
+def test_a_robot_that_bends_is_no_mistake() -> None:
+    """Errors that no reading explains are said to be unexplained; a change point is not seen in them."""
+    problem = simulated_arm("ur5e")
+    rng = np.random.default_rng(4)
+    noisy = values(lambda y: y + 2e-3 * rng.normal(size=y.shape))(problem)
+    causes = likely_causes(ro.calibrate(noisy, ro.tikhonov, **CALIBRATED))
+    assert len(causes) == 2
+    assert causes[1].startswith("No mistake that was tried explains it")
+
+
+def test_validation_rows_that_are_identification_rows_are_named() -> None:
+    problem = simulated_arm("irb120")
+    result = ro.calibrate(problem, ro.tikhonov, **CALIBRATED)
+    copies = problem.data.take([3, 9])
+    own = problem.on(simulated_arm("irb120", seed=9, count=10).data).data
+    for validation, count in ((copies, 2), (own, 0)):
+        causes = likely_causes(replace(result, record=replace(result.record, validation=validation)))
+        assert len(causes) == (count > 0)
+    found = inspect(problem, copies).warnings
+    assert any(
+        "2 of 2 rows of the validation set are identification rows as well: P4 (P4), P10 (P10)" in t for t in found
+    )
+    assert not inspect(problem, own).warnings
+
+
+def test_rows_of_another_reflector_are_named() -> None:
+    problem = simulated_arm("ur5e", markers=2)
+    first, second = problem.data.blocks
+    a, b = first.y.copy(), second.y.copy()
+    for i in (5, 11, 30):
+        a[i], b[i] = second.y[i], first.y[i]
+    wrong = problem.on(replace(problem.data, blocks=(replace(first, y=a), replace(second, y=b))))
+    for texts in (inspect(wrong).warnings, likely_causes(ro.calibrate(wrong, ro.tikhonov, **CALIBRATED))):
+        (text,) = [text for text in texts if "fit another reflector" in text]
+        assert all(f"P{i + 1}{m}" in text for i in (5, 11, 30) for m in "AB"), text
+    assert not inspect(problem).warnings
+
+
+def test_the_change_point_is_where_the_instrument_moved() -> None:
+    change, _ = MISTAKES["tracker moved by 1 mm"]
+    for robot in ROBOTS:
+        (text,) = [text for text in said(robot, change) if "from row" in text]
+        row = int(text.partition("from row P")[2].split()[0])
+        assert abs(row - (2 * COUNT // 3 + 1)) <= 1
+        assert "1.1" in text  # 1 mm along x and half of it along y
+
+
+def test_inspection_names_the_same(monkeypatch, capsys, tmp_path) -> None:
+    problem = exchanged(1, 2)(simulated_arm("ur5e"))
+    (text,) = inspect(problem).warnings
+    assert "joints 2 and 3 exchanged: exchange the names of the columns q2 and q3" in text
+    assert "mm instead of" in text
+
+
+def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
+    """From a table with two columns exchanged: both commands name them."""
+    problem = exchanged(1, 2)(simulated_arm("ur5e"))
+    (block,) = problem.data.blocks
+    header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
+    rows = [
+        ",".join([label, *(f"{v:.6f}" for v in np.degrees(q)), *(f"{v:.7f}" for v in y)])
+        for label, q, y in zip(problem.data.label, block.q[:, 0], block.y, strict=True)
+    ]
+    (tmp_path / "raw.csv").write_text("\n".join([header, *rows]))
+    assert run(monkeypatch, "new", str(tmp_path / "cell"), "--robot", "ur5e", "--data", str(tmp_path / "raw.csv")) == 0
+    for command in ("inspect", "calibrate"):
+        run(monkeypatch, command, str(tmp_path / "cell"))
+        assert "joints 2 and 3 exchanged" in capsys.readouterr().out

@@ -1,0 +1,244 @@
+"""Files as instruments and people write them become the clean table's problem, and what was understood is said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.robot.plain import write_robot
+from tests.simulate import ARM
+from tests.store.raw_files import HEAD, LABELS, POINTS, RAW, ROWS, WXYZ, P, Q, T, beside, cells, text
+from tests.test_cli import run
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("arm") / "robot.toml"
+    write_robot(ARM, path)
+    return path
+
+
+def options(stated: dict[str, str]) -> list[str]:
+    return [part for key, value in stated.items() for part in (f"--{key}", value)]
+
+
+def new(monkeypatch: pytest.MonkeyPatch, arm: Path, folder: Path, files: Path | list[Path], *more: str) -> int:
+    paths = files if isinstance(files, list) else [files]
+    data = [part for path in paths for part in ("--data", str(path))]
+    return run(monkeypatch, "new", str(folder), "--robot", str(arm), *data, *more)
+
+
+@pytest.mark.parametrize("shape", RAW)
+def test_a_raw_file_becomes_the_clean_tables_problem(monkeypatch, capsys, tmp_path, arm, shape) -> None:
+    write, stated, kind = RAW[shape]
+    assert new(monkeypatch, arm, tmp_path / "cell", write(tmp_path), *options(stated)) == 0, capsys.readouterr().err
+    data = ro.load(tmp_path / "cell").problem.data
+    assert len(data) == len(Q)
+    order = list(range(len(Q)))
+    if data.label[0].startswith("P"):  # a joined table has the order of the measured values
+        order = [LABELS.index(label) for label in data.label]
+    (block,) = data.blocks
+    assert block.measurement.name == kind
+    assert np.abs(np.degrees(block.q[:, 0]) - Q[order]).max() < 1e-9
+    assert np.abs(1e3 * block.y[:, :3] - P[order]).max() < 1e-6
+    if kind == "pose":
+        turned = Rotation.from_quat(block.y[:, [4, 5, 6, 3]]).as_matrix()
+        assert np.abs(turned - T[order][:, :3, :3]).max() < 1e-9
+
+
+def test_a_dry_run_says_every_column_and_writes_nothing(monkeypatch, capsys, tmp_path, arm) -> None:
+    write, stated, _ = RAW["SpatialAnalyzer"]
+    path = write(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, *options(stated), "--dry-run") == 0
+    said = capsys.readouterr().out
+    lines = {line.split("   ")[0].strip(): line for line in said.splitlines()}
+    assert "U95 of x" in lines["U(95) X [mm]"]
+    assert "u95_x_mm" in lines["U(95) X [mm]"]
+    assert "coverage factor 2" in lines["U(95) X [mm]"]
+    assert "joint 1" in lines["J1 [deg]"]
+    assert "left out" in lines["RMS"]
+    assert said.splitlines()[-1] == "12 rows, measurement position."
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run", "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert [each["name"] for each in content["columns"][:2]] == ["label", "q1_deg"]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_commanded_joints_serve_where_none_were_measured_and_it_is_said(monkeypatch, capsys, tmp_path, arm) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_text(text([["Point", *(f"Commanded {name}" for name in HEAD[1:7]), *HEAD[7:]]], ROWS))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run") == 0
+    assert "commanded, as no measured value is there" in capsys.readouterr().out
+    path.write_text(text([[*HEAD[:7], *(f"Commanded {name}" for name in HEAD[7:])]], ROWS))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run") == 2
+    assert "no positions among" in capsys.readouterr().err
+
+
+def test_what_was_understood_is_said_before_the_folder_is_made(monkeypatch, capsys, tmp_path, arm) -> None:
+    """Also where the values then turn out to be unusable: the table is what explains it."""
+    bad = [[*row] for row in ROWS]
+    bad[3][8] = "x"
+    path = tmp_path / "raw.csv"
+    path.write_text(text([HEAD], bad))
+    assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
+    said = capsys.readouterr()
+    assert "measured y" in said.out
+    assert "row P4, column y_mm: found 'x'" in said.err
+    assert not (tmp_path / "cell").exists()
+
+
+def test_uncertainties_of_the_instrument_are_those_of_the_rows(monkeypatch, tmp_path, arm) -> None:
+    for shape, sigma in (("SpatialAnalyzer", [6e-6, 6.5e-6, 7e-6]), ("Leica", [12e-6, 13e-6, 14e-6])):
+        write, stated, _ = RAW[shape]
+        assert new(monkeypatch, arm, tmp_path / shape, write(tmp_path), *options(stated)) == 0
+        (block,) = ro.load(tmp_path / shape).problem.data.blocks
+        assert np.allclose(np.sqrt(np.einsum("nii->ni", block.covariance)), sigma, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "right", "wrong"), [("first", "wxyz", "xyzw"), ("last", "xyzw", "wxyz")])
+def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_path, arm, shape, right, wrong) -> None:
+    write, stated, _ = RAW[f"quaternion Q0 to Q3, w {shape}"]
+    path = write(tmp_path)
+    assert new(monkeypatch, arm, tmp_path / "cell", path, *options(stated), "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert f"the quaternion's order is {right}: on the nominal robot it leaves 0.00 deg, {wrong} " in said
+    assert f"order {right}" in said
+    # a stated order is not checked here: it is the user's word
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--quaternion", wrong, "--dry-run") == 0
+    assert "the quaternion's order is" not in capsys.readouterr().out
+
+
+U = ["Point", *HEAD[1:7], "X", "Y", "Z"]
+REFUSED = {
+    "no header": (text([], ROWS), [], ["line 1", "no header above 'P1", "--columns with 10 names"]),
+    "too few names": (text([], ROWS), ["--columns", "label,q1_deg"], ["10 cells", "2 cells as in --columns"]),
+    "no unit": (text([U], ROWS), [], ["columns without a unit (X, Y, Z)", "--units"]),
+    "thousands or decimals": (
+        text([HEAD], [["P1", *["1,234"] * 9], ["P2", *["2,345"] * 9]], ";"), [], ["'1,234'", "--decimal"]
+    ),
+    "two decimal marks": (
+        text([HEAD], [["P1", *["1,5"] * 6, *["1.5"] * 3]] * 2, ";"), [], ["'1,5' and '1.5'", "one decimal mark"]
+    ),
+    "another mark than stated": (text([HEAD], ROWS, ";"), ["--decimal", ","], ["a number '", "--decimal"]),
+    "decimal commas between commas": (text([HEAD], ROWS, comma=True), [], ["19 cells", "need quotes"]),
+    "not the encoding": (text([["Größe", *HEAD[1:]]], ROWS), ["--encoding", "ascii"], ["the text", "--encoding"]),
+    "no such separator": (text([HEAD], ROWS), ["--separator", "colon"], ["--separator", "semicolon"]),
+    "a sheet of a text": (text([HEAD], ROWS), ["--sheet", "2"], ["--sheet", "an Excel workbook"]),
+    "names twice": (text([[*HEAD[:9], "X [mm]"]], ROWS), [], ["columns 'X [mm]' and 'X [mm] #10' for x_mm"]),
+    "no such order": (
+        text([[*HEAD, "Q0", "Q1", "Q2", "Q3"]], beside(ROWS, cells(WXYZ))), ["--quaternion", "abcd"], ["'abcd'", "xyzw"]
+    ),
+    "a quaternion of no order": (
+        text([[*HEAD, "Q0", "Q1", "Q2", "Q3"]], beside(ROWS, [["0.5"] * 4] * 12)), [], ["no clear one", "--quaternion"]
+    ),
+    "no matrices": (
+        text([[*HEAD[:7], *(f"m{i}{j}" for i in range(4) for j in range(4))]],
+             beside([row[:7] for row in ROWS], [["0.5"] * 16] * 12)),
+        ["--units", "mm"], ["neither a last row nor a last column 0 0 0 1"],
+    ),
+    "a rotation vector without a unit": (
+        text([[*HEAD, "rx", "ry", "rz"]], beside(ROWS, POINTS)), ["--rotation", "vector"], ["(rx, ry, rz)", "--units"]
+    ),
+    "nothing but text": ("a,b,c\nd,e,f\n", [], ["a header and no rows"]),
+    "bytes": ("a\x00b,1,2\n", [], ["bytes that are zero"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm, case) -> None:
+    content, stated, expected = REFUSED[case]
+    path = tmp_path / "raw.csv"
+    path.write_text(content, encoding="utf-8")
+    assert new(monkeypatch, arm, tmp_path / "cell", path, *stated) == 2
+    said = capsys.readouterr().err.strip()
+    assert "\n" not in said
+    for part in expected:
+        assert part in said, said
+    assert not (tmp_path / "cell").exists()
+
+
+def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> None:
+    joints = tmp_path / "first.csv"
+    points = tmp_path / "second.csv"
+    joints.write_text(text([HEAD[:7]], [row[:7] for row in ROWS]))
+    points.write_text(text([HEAD[7:]], POINTS))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
+    assert "no column in both first.csv and second.csv" in capsys.readouterr().err
+    points.write_text(text([["Point", *HEAD[7:]]], [[f"Q{i}", *row] for i, row in enumerate(POINTS)]))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
+    assert "none that first.csv and second.csv share, accepted: --key with a column" in capsys.readouterr().err
+    points.write_text(text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)]))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "joined by label: 11 rows of 12 with joints and 12 measured" in said
+    assert "without a partner, left out: P12, P0." in said
+
+
+def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm) -> None:
+    joints = tmp_path / "first.csv"
+    points = tmp_path / "second.csv"
+    joints.write_text(text([HEAD[:7]], [row[:7] for row in ROWS]))
+    several = [[row[0], marker, *row[7:]] for row in ROWS for marker in ("A", "B")]
+    points.write_text(text([["Point", "SMR", *HEAD[7:]]], several))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 0
+    data = ro.load(tmp_path / "cell").problem.data
+    assert len(data) == 24
+    assert len(np.unique(data.configuration)) == 12
+    assert {block.markers for block in data.blocks} == {("A",), ("B",)}
+
+
+def test_rows_that_were_left_out_are_named(monkeypatch, capsys, tmp_path, arm) -> None:
+    for shape, expected in (
+        ("beam lost", "rows without measured values are left out: lost."),
+        ("footer and means", "sums others up: left out 'Mean'."),
+        ("footer and means", "is no row of the table: left out 'End of export'."),
+        ("header again on every page", "the header stands there again in line 7: left out."),
+        ("preamble", "3 lines above the header are left out ('Export of cell 7' ...)."),
+        ("Latin-1 with degrees", "read as cp1252: not UTF-8."),
+        ("semicolon and decimal comma", "decimal commas: no comma can part thousands."),
+    ):
+        write, stated, _ = RAW[shape]
+        assert new(monkeypatch, arm, tmp_path / "cell", write(tmp_path), *options(stated), "--dry-run") == 0
+        assert expected in capsys.readouterr().out, shape
+
+
+def test_more_than_forty_shapes() -> None:
+    assert len(RAW) >= 40
+
+
+@pytest.mark.parametrize(
+    "shape", ["semicolon and decimal comma", "SpatialAnalyzer", "merged header", "UTF-16", "Excel"]
+)
+def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_path, arm, shape) -> None:
+    """Also by the commands that take tables later: validate and compensate."""
+    clean = tmp_path / "clean.csv"
+    clean.write_text(text([HEAD], ROWS))
+    assert new(monkeypatch, arm, tmp_path / "cell", clean) == 0
+    out = tmp_path / "out"
+    run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--select", "1", "--out", str(out))
+    write = RAW[shape][0]
+    raw = str(write(tmp_path))
+    documents = []
+    for path in (str(clean), raw):
+        capsys.readouterr()
+        assert run(monkeypatch, "validate", str(out), path, "--units", "deg,mm", "--json") == 0
+        documents.append(json.loads(capsys.readouterr().out)["identified"])
+        assert run(monkeypatch, "compensate", str(out), path, "--units", "deg,mm", "--json") in (0, 1)
+    assert documents[0] == pytest.approx(documents[1])
+
+
+def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatch, capsys, tmp_path, arm) -> None:
+    path = tmp_path / "wide.csv"
+    for mark in (",", ";", "\t"):
+        path.write_text("\n".join([mark.join(f"c{i}" for i in range(100_000)), mark.join(["1.5"] * 100_000)]))
+        start = perf_counter()
+        assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
+        assert perf_counter() - start < 2.0
+        assert "a row of 100000 cells, accepted: at most 1000 columns" in capsys.readouterr().err
