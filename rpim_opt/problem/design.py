@@ -14,6 +14,7 @@ from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import RANK_TOLERANCE
+from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 
@@ -214,10 +215,9 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
         y[:, list(kind.columns).index("qw")] = 1.0
     covariance = np.broadcast_to(np.median(block.covariance, axis=0), block.covariance.shape[1:])
     data = Dataset.of(q, y, covariance, measurement=kind)
-    torque = None if block.torque is None else np.zeros((len(q), 1, q.shape[1]))
-    data = replace(
-        data, blocks=tuple(replace(b, markers=block.markers, fixture=block.fixture, torque=torque) for b in data.blocks)
-    )
+    torque = None if block.torque is None else np.zeros(q.shape)
+    data = bearing(data, problem.data, torque)
+    data = replace(data, blocks=(replace(data.blocks[0], markers=block.markers, fixture=block.fixture),))
     there, scale = problem.on(data), problem.parameters.free.scale
     x = np.zeros(len(scale))
     rows = there.linearize(x).A if whitened else there.jacobian(x) * scale

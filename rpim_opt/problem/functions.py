@@ -12,8 +12,10 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import MEASUREMENTS, Measurement, of_fixture
+from rpim_opt.problem.loads import Loads
 from rpim_opt.robot.kinematics import FRAME, chain, frame
 from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.terms import Posture
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian`` and ``modelled`` of one row; inputs are deviations, nominal values and the row."""
@@ -31,6 +33,7 @@ class Structure(NamedTuple):
     """What decides the functions of a block's rows besides the measurement.
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
+    ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see.
     """
 
     joint_types: tuple[str, ...]
@@ -39,7 +42,7 @@ class Structure(NamedTuple):
     absent: bytes
     markers: tuple[str, ...]
     fixture: str
-    torques: bool
+    loads: Loads
 
 
 class Row(NamedTuple):
@@ -116,8 +119,11 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     zero = np.frombuffer(of.absent, dtype=bool)
     x = ca.SX.sym("x", len(free))
     nominal = ca.SX.sym("nominal", len(of.names))
+    loads = of.loads
     q = ca.SX.sym("q", dof * points)
-    tau = ca.SX.sym("tau", dof * points if of.torques else 0)
+    tau = ca.SX.sym("tau", dof * points if loads.torques else 0)
+    payload = ca.SX.sym("payload", 1 if loads.payload else 0)
+    approach = ca.SX.sym("approach", dof * points if loads.approach else 0)
     y = ca.SX.sym("y", len(measurement.columns))
     start = {name: ca.SX(0) if zero[i] else nominal[i] for i, name in enumerate(of.names)}
     deviation = dict.fromkeys(of.names, ca.SX(0))
@@ -129,10 +135,13 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     def value(name: str) -> ca.SX:
         return start[name] + deviation[name] if name in start else ca.SX(0)
 
-    def reflector(point: int, marker: str) -> ca.SX:
+    def posture(point: int) -> Posture:
         at = slice(point * dof, (point + 1) * dof)
-        torque = ca.vertsplit(tau[at]) if of.torques else (0,) * dof
-        flange = chain(of.joint_types, ca.vertsplit(q[at]), torque, value)
+        joints = ca.vertsplit(q[at])
+        return loads.posture(of.joint_types, joints, start.__getitem__, tau, payload, approach, point)
+
+    def reflector(point: int, marker: str) -> ca.SX:
+        flange = chain(of.joint_types, posture(point), value)
         return place("base_") @ flange @ place(tool_prefix(marker))
 
     own = {name: place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
@@ -146,4 +155,4 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     if residual.numel() != len(measurement.components):
         found = f"{residual.numel()} components of the residual"
         raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
-    return Row(x, nominal, ca.vertcat(q, tau, y), residual, modelled)
+    return Row(x, nominal, ca.vertcat(q, tau, payload, approach, y), residual, modelled)

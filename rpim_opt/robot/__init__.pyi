@@ -1,5 +1,12 @@
 from .chain import Described as Described
 from .chain import without_beta as without_beta
+from .deflection import gravity_torques as gravity_torques
+from .deflection import moment_slopes as moment_slopes
+from .family import bend_names as bend_names
+from .family import bending_joints as bending_joints
+from .family import families as families
+from .family import family_scales as family_scales
+from .gravity import Gravity as Gravity
 from .kinematics import forward_kinematics as forward_kinematics
 from .library import robots as robots
 from .mdh import Robot as Robot

@@ -14,19 +14,15 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.terms import Posture, Symbol, motion
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
 
 FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
 
-JOINT_EXTRAS = {"ratio": "ratio", "ecc_cos": "angle", "ecc_sin": "angle", "compliance": "compliance"}
-"""Parameters of a joint beyond its MDH row, with their dimensions; all are zero in a nominal robot."""
-
 CHUNK = 256
 """Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
-
-Symbol = Any  # ca.SX or a number: CasADi ships no types
 
 
 def rotation_x(angle: Symbol) -> ca.SX:
@@ -111,25 +107,7 @@ def frame_numbers(T: Array) -> Array:
     return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
-def motion(kind: str, i: int, q: Symbol, torque: Symbol, value: Callable[[str], Symbol]) -> Symbol:
-    """Return by how much joint i has moved [rad or m].
-
-    ``value("ratio2")`` gives the parameters::
-
-        (1 + ratio) q + ecc_cos cos q + ecc_sin sin q + compliance torque        revolute
-        (1 + ratio) q                                                            prismatic
-
-    for the model's joint value q [rad or m] and the joint's torque [Nm].
-    """
-    moved = (1 + value(f"ratio{i}")) * q
-    if kind == "revolute":
-        moved += value(f"ecc_cos{i}") * ca.cos(q) + value(f"ecc_sin{i}") * ca.sin(q) + value(f"compliance{i}") * torque
-    return moved
-
-
-def transforms(
-    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
-) -> list[ca.SX]:
+def transforms(joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol]) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
 
     ``value("alpha2")`` gives the parameters; joints move by `motion`.
@@ -138,7 +116,7 @@ def transforms(
     after = []
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
-        moved = motion(kind, i, q[i - 1], torque[i - 1], value)
+        moved = motion(kind, i, posture, value)
         T = T @ (
             link(alpha, a, theta + moved, d, beta) if kind == "revolute" else link(alpha, a, theta, d + moved, beta)
         )
@@ -146,11 +124,9 @@ def transforms(
     return after
 
 
-def chain(
-    joint_types: Sequence[str], q: Sequence[Symbol], torque: Sequence[Symbol], value: Callable[[str], Symbol]
-) -> ca.SX:
+def chain(joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol]) -> ca.SX:
     """Return the transform from the robot's base to its flange; arguments as for `transforms`."""
-    return transforms(joint_types, q, torque, value)[-1]
+    return transforms(joint_types, posture, value)[-1]
 
 
 @lru_cache(maxsize=32)
@@ -160,7 +136,7 @@ def _flange(joint_types: tuple[str, ...]) -> ca.Function:
     table, q = ca.SX.sym("mdh", dof * len(MDH)), ca.SX.sym("q", dof)
     names = [f"{column}{i}" for i in range(1, dof + 1) for column in MDH]
     value = dict(zip(names, ca.vertsplit(table), strict=True))
-    T = chain(joint_types, ca.vertsplit(q), (0,) * dof, lambda name: value.get(name, ca.SX(0)))
+    T = chain(joint_types, Posture(ca.vertsplit(q)), lambda name: value.get(name, 0.0))
     return ca.Function("flange", [table, q], [T])
 
 

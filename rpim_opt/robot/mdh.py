@@ -13,10 +13,15 @@ from pydantic import Field, model_validator
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import Angle, Length, Misfit, Table, read_toml, validate
-from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.basics.units import LARGEST, UNITS, accepted_units
+from rpim_opt.robot.gravity import Gravity
+from rpim_opt.robot.mounting import Mounting, PayloadTable, of_links, stated_gravity
 
 MDH = ("alpha", "a", "theta", "d", "beta")
 """Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
+
+FARTHEST = 1e15
+"""Size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +50,14 @@ class Robot:
         (dof, 2) lower and upper joint values of the controller [rad or m]; infinite where unknown.
     source
         Where the table comes from.
+    gravity
+        Where gravity points in the robot's base, and the masses that it pulls at.
 
     Raises
     ------
     InputError
-        For shapes that do not fit, numbers that are not finite, a singular joint map, limits that are not in order.
+        For shapes that do not fit, numbers that are not finite, a singular joint map, limits that are not in order,
+        masses that are not one a joint.
 
     Examples
     --------
@@ -67,15 +75,20 @@ class Robot:
     joint_map: Array = field(default_factory=lambda: np.empty((0, 0)))
     limits: Array = field(default_factory=lambda: np.empty((0, 0)))
     source: str = ""
+    gravity: Gravity = field(default_factory=Gravity)
 
     def __post_init__(self) -> None:
         mdh = _frozen(self.mdh)
         if mdh.ndim != 2 or mdh.shape[1] != 5 or not len(mdh) or not np.isfinite(mdh).all():
             raise InputError("mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)", self.name)
+        if np.abs(mdh).max() > FARTHEST:
+            raise InputError("mdh", f"{np.abs(mdh).max():g}", f"sizes of at most {FARTHEST:g} m or rad", self.name)
         object.__setattr__(self, "mdh", mdh)
         object.__setattr__(self, "joint_types", self._types())
         object.__setattr__(self, "joint_map", self._map())
         object.__setattr__(self, "limits", self._limits())
+        if len(self.gravity.masses) not in (0, self.dof):
+            raise InputError("gravity", f"{len(self.gravity.masses)} masses", f"{self.dof}, one a joint", self.name)
 
     def _types(self) -> tuple[str, ...]:
         types = tuple(self.joint_types) or ("revolute",) * self.dof
@@ -86,7 +99,8 @@ class Robot:
     def _map(self) -> Array:
         n = self.dof
         joint_map = _frozen(self.joint_map if np.size(self.joint_map) else np.eye(n))
-        if joint_map.shape != (n, n) or not abs(np.linalg.det(joint_map)) > 1e-9:
+        sane = joint_map.shape == (n, n) and (np.abs(joint_map) <= LARGEST).all()
+        if not sane or not abs(np.linalg.det(joint_map)) > 1e-9:
             raise InputError("joint_map", f"{joint_map.tolist()}", f"an invertible {n} x {n} matrix", self.name)
         return joint_map
 
@@ -123,6 +137,10 @@ class _JointTable(Table):
     type: Literal["revolute", "prismatic"] = "revolute"
     sign: Literal[1, -1] = 1
     limits: Annotated[list[float] | None, "angle", "length"] = None
+    mass: Annotated[float | None, "mass"] = None
+    centre_x: Length = 0.0
+    centre_y: Length = 0.0
+    centre_z: Length = 0.0
 
     @model_validator(mode="before")
     @classmethod
@@ -141,6 +159,8 @@ class _RobotTable(Table):
     source: str = ""
     joint: list[_JointTable] = Field(min_length=1)
     coupling: list[list[Annotated[float, Field(strict=False)]]] | None = None
+    mounting: Mounting | None = None
+    payload: PayloadTable | None = None
 
 
 def read_robot(path: str | Path) -> Robot:
@@ -172,7 +192,14 @@ def robot_of(content: dict[str, Any], path: Path) -> Robot:
         joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ _coupling(table, path),
         limits=_stated_limits(table, path),
         source=table.source,
+        gravity=_gravity(table, path),
     )
+
+
+def _gravity(table: _RobotTable, path: Path) -> Gravity:
+    gravity = stated_gravity(Gravity(), table.mounting, table.payload, path)
+    centres = [(joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint]
+    return of_links(gravity, [joint.mass for joint in table.joint], centres, path)
 
 
 def _coupling(table: _RobotTable, path: Path) -> Array:

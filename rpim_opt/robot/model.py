@@ -7,24 +7,24 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.robot.kinematics import FRAME_DIMENSION, JOINT_EXTRAS
+from rpim_opt.robot.family import bend_names
+from rpim_opt.robot.kinematics import FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, tool_prefix
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS
 
-Entry = tuple[str, str, float]
-"""Name, dimension and nominal value [SI]."""
+Entry = tuple[str, str, float, float]
+"""Name, dimension, nominal value and usual size of its deviation [SI]."""
 DEFAULT_SCALE = {
     ("length", "length"): 1e-3,
     ("angle", "angle"): 1e-3,
-    ("ratio", "ratio"): 1e-3,
-    ("compliance", "compliance"): 1e-5,
     ("tool", "length"): 10e-3,
     ("tool", "angle"): 10e-3,
     ("base", "length"): 100e-3,
     ("base", "angle"): 100e-3,
 }
-"""Expected size of deviations by (group, dimension), in SI, where a problem states none."""
+"""Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
 
 
 def model_parameters(
@@ -64,10 +64,8 @@ def model_parameters(
     for marker, tool in tools.items():
         entries += _of_frame(tool_prefix(marker), tool)
     if own is not None:
-        entries += [(name, dimension, value) for name, (dimension, value) in own.items()]
-    names, dimensions, nominal = zip(*entries, strict=True)
-    # own dimensions of a measurement have no usual size: their unit's
-    scale = [DEFAULT_SCALE.get((group_of(name, dimension), dimension), 1.0) for name, dimension, _ in entries]
+        entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
+    names, dimensions, nominal, scale = zip(*entries, strict=True)
     return Parameters(
         names,
         dimensions,
@@ -79,19 +77,27 @@ def model_parameters(
     )
 
 
+def _usual(name: str, dimension: str) -> float:
+    # own dimensions of a measurement have no usual size: their unit's
+    return DEFAULT_SCALE.get((group_of(name, dimension), dimension), 1.0)
+
+
 def _of_joints(robot: Robot) -> Iterator[Entry]:
     """Yield the table's parameters row by row, then what the joints have besides, zero on the drawing."""
     for i, row in enumerate(robot.mdh, start=1):
         for column, value in zip(MDH, row, strict=True):
-            yield f"{column}{i}", MDH_DIMENSION[column], value
+            name = f"{column}{i}"
+            dimension = MDH_DIMENSION[column]
+            yield name, dimension, value, _usual(name, dimension)
     for i, kind in enumerate(robot.joint_types, start=1):
-        extras = {"ratio": "ratio"}
-        if kind == "revolute":
-            extras = JOINT_EXTRAS
-        for extra, dimension in extras.items():
-            yield f"{extra}{i}", dimension, 0.0
+        for term in JOINT_TERMS:
+            if kind in term.joints:
+                yield term.parameter(i), term.dimension, 0.0, term.scale
+    for name in bend_names(robot):
+        yield name, "angle", 0.0, BEND_SCALE
 
 
 def _of_frame(prefix: str, place: Sequence[float] | Array) -> Iterator[Entry]:
     for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
-        yield prefix + axis, dimension, value
+        name = prefix + axis
+        yield name, dimension, value, _usual(name, dimension)

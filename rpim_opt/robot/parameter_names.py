@@ -5,17 +5,38 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from rpim_opt.basics.exceptions import choices
-from rpim_opt.robot.kinematics import JOINT_EXTRAS
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.robot.mdh import MDH
+from rpim_opt.robot.terms import JOINT_TERMS, JointTerm, terms_of
 
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
-_ON_THE_ROBOT = re.compile(rf"({'|'.join((*MDH, *JOINT_EXTRAS))})\d+")
+_TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
+_TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})(\d+)|(bend)(\d+)_\d+[xyz]")
 
 
 def of_joint(name: str) -> bool:
     """Return whether a parameter is the robot's own, and not of a frame."""
-    return _ON_THE_ROBOT.fullmatch(name) is not None
+    return _TABLE.fullmatch(name) is not None or of_term(name)
+
+
+def of_term(name: str) -> bool:
+    """Return whether a parameter is one of a joint's terms, and not of the table or of a frame."""
+    return _TERM.fullmatch(name) is not None
+
+
+def term_of(name: str, dof: int) -> tuple[JointTerm, int]:
+    """Return the term of a parameter, and the joint (from 1) whose parameter it is.
+
+    Raises
+    ------
+    InputError
+        For a parameter that no term of an arm with so many joints has.
+    """
+    for i in range(1, dof + 1):
+        for term in terms_of(dof):
+            if term.parameter(i) == name:
+                return term, i
+    raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
 
 
 def group_of(name: str, dimension: str) -> str:
@@ -46,13 +67,18 @@ def known_patterns(names: Sequence[str], pattern: str) -> str:
     """List the known names, runs of a joint parameter shortened: ``alpha1..6``."""
     runs: dict[str, list[int]] = {}
     others = []
+    bends = [name for name in names if of_term(name) and name.startswith("bend")]
     for name in names:
-        match = re.fullmatch(r"([a-z_]*[a-z])(\d+)", name)
+        match = re.fullmatch(r"(.*[a-z])(\d+)", name)
+        if name in bends:
+            continue
         if match:
             runs.setdefault(match[1], []).append(int(match[2]))
         else:
             others.append(name)
     known = [f"{stem}{min(n)}..{max(n)}" for stem, n in runs.items()]
+    if bends:
+        known.append(f"bend* ({len(bends)} first moments, {bends[0]} .. {bends[-1]})")
     # of what `choices` says of all the names only the guess: the list itself is shorter in runs
     _, guess, close = choices(pattern, names).partition(" (did")
     return "names or patterns of " + ", ".join(known + others) + guess + close

@@ -46,7 +46,7 @@ class Parameters:
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
     >>> len(parameters), len(parameters.free), parameters.dimension_of("tool_x")
-    (66, 34, 'length')
+    (114, 34, 'length')
     >>> parameters.take(np.array([0, 5])).names
     ('alpha1', 'alpha2')
     >>> [name for name, places in zip(parameters.names, parameters.of_frames) if places][:4]
@@ -179,8 +179,9 @@ class Parameters:
         Parameters
         ----------
         table
-            Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, or a pattern or a
-            parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a pattern, a pattern before a group.
+            Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, ``joint_offset_mrad`` for
+            every theta, or a pattern or a parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a
+            pattern, a pattern before a group.
         file
             What an error names as the place of the table.
 

@@ -9,15 +9,23 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_json, write_text
+from rpim_opt.basics.files import write_json
+from rpim_opt.basics.inputs import read_bytes
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import UNITS, display
+from rpim_opt.basics.writing import write_text
 from rpim_opt.robot.chain import without_beta
 from rpim_opt.robot.mdh import MDH, Robot, read_robot, robot_of
-from rpim_opt.robot.original import read_bytes
+from rpim_opt.robot.mounting import centre_keys, mounting_keys, payload_keys
 from rpim_opt.robot.parameter_names import MDH_DIMENSION
 
 LIMITS = ("lower", "upper")
+WITHOUT_COLUMN = {
+    "coupling": "a coupling of joints",
+    "mounting": "a mounting other than on the floor",
+    "payload": "a payload",
+}
+"""What a table with a row a joint has no place for."""
 
 
 def read_mdh(path: str | Path) -> Robot:
@@ -25,7 +33,8 @@ def read_mdh(path: str | Path) -> Robot:
 
     JSON has the keys of ``robot.toml`` (README, "Your own robot"). CSV has a row a joint and the keys of a
     ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
-    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints); an empty cell is left out.
+    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
+    cell is left out.
 
     Raises
     ------
@@ -59,7 +68,8 @@ def write_robot(robot: Robot, path: str | Path) -> None:
     Raises
     ------
     InputError
-        For another ending, one of two limits infinite, or a coupling of joints in CSV, which has no place for it.
+        For another ending, one of two limits infinite, or in CSV, which has no place for them, a coupling of joints,
+        a mounting other than on the floor, a payload.
 
     Examples
     --------
@@ -171,10 +181,14 @@ def _content(robot: Robot) -> dict[str, Any]:
         content["source"] = robot.source
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
+    content |= mounting_keys(robot.gravity)
     joints = [_keys(robot, i) for i in range(robot.dof)]
     for joint, sign in zip(joints, signs, strict=True):
         if plain and sign < 0:
             joint["sign"] = -1
+    carried = payload_keys(robot.gravity)
+    if carried:
+        content["payload"] = carried
     return content | {"joint": joints}
 
 
@@ -190,6 +204,9 @@ def _keys(robot: Robot, i: int) -> dict[str, Any]:
     if np.isfinite(robot.limits[i]).any():
         unit, pair = exact(robot.joint_dimensions[i], robot.limits[i])
         joint[f"limits_{unit}"] = pair
+    if robot.gravity.masses:
+        joint["mass_kg"] = robot.gravity.masses[i]
+        joint |= centre_keys(robot.gravity.centres[i], "centre_")
     return joint
 
 
@@ -211,7 +228,10 @@ def _write_json(robot: Robot, path: Path) -> None:
 def _write_toml(robot: Robot, path: Path) -> None:
     content = _content(robot)
     joints = content.pop("joint")
+    carried = content.pop("payload", None)
     blocks = [[f"{key} = {toml(value)}" for key, value in content.items()]]
+    if carried:
+        blocks.append(["[payload]", *(f"{key} = {toml(value)}" for key, value in carried.items())])
     blocks += [["[[joint]]", *(f"{key} = {toml(value)}" for key, value in joint.items())] for joint in joints]
     write_text(path, "\n\n".join("\n".join(block) for block in blocks) + "\n")
 
@@ -223,8 +243,9 @@ def toml(value: Any) -> str:
 
 def _write_csv(robot: Robot, path: Path) -> None:
     content = _content(robot)
-    if "coupling" in content:
-        raise InputError("robot", "a coupling of joints", "a name ending in .toml or .json", path)
+    for key, what in WITHOUT_COLUMN.items():
+        if key in content:
+            raise InputError("robot", what, "a name ending in .toml or .json", path)
     rows = [_cells(joint) for joint in content["joint"]]
     header = [f"{column}_{display(MDH_DIMENSION[column])[0]}" for column in MDH]
     header += sorted({key for row in rows for key in row} - set(header))

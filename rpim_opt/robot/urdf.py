@@ -11,11 +11,13 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_bytes
+from rpim_opt.basics.writing import write_bytes
 from rpim_opt.robot.chain import Chain, Described, corrected, describe, require_same_arm
+from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.original import spliced
+from rpim_opt.robot.urdf_masses import carried_masses, on_frames
 from rpim_opt.robot.urdf_tree import Joint, Urdf, read_tree
 
 
@@ -25,7 +27,8 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
     `chain.describe` states the conventions. Fixed joints are part of base, links and tool; limits are carried over
     (continuous joints, and limits that are left out or equal, have none). Angles are roll, pitch, yaw, R = Rz Ry Rx,
-    and an axis that is left out is x (wiki.ros.org/urdf/XML/joint).
+    and an axis that is left out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of link ``base``, wherever
+    the first axis points, and pulls at the masses that the file states.
 
     Parameters
     ----------
@@ -50,13 +53,15 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     """
     urdf = read_tree(Path(path))
     every, joints, chain = _chain(urdf, base, tip)
-    table, T_base, T_tool, _ = describe(chain)
+    table, T_base, T_tool, G = describe(chain)
+    masses, centres = carried_masses(urdf, every)
     robot = Robot(
         name=urdf.name,
         mdh=table,
         joint_types=tuple(joint.kind for joint in joints),
         limits=np.array([joint.limits for joint in joints]),
         source=f"{urdf.path.name}, {every[0].parent} to {every[-1].child}",
+        gravity=Gravity(masses=masses, centres=on_frames(centres, table, G)).mounted("floor", T_base[:3, :3]),
     )
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
 

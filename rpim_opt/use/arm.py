@@ -10,15 +10,17 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.models import Measurement
-from rpim_opt.robot.kinematics import FRAME, call_rows, frame, motion, transforms
+from rpim_opt.problem.loads import Loads
+from rpim_opt.robot.kinematics import FRAME, call_rows, frame, transforms
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.terms import motion
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
     """A robot with all its parameters known: poses, errors and Jacobians of rows.
 
-    ``function`` maps model joint values, torques and target, side by side, to the pose, its error and J'.
+    ``function`` maps model joint values, loads (`Loads`) and target, side by side, to the pose, its error and J'.
     """
 
     function: ca.Function
@@ -26,34 +28,43 @@ class Arm:
 
     @classmethod
     def of(
-        cls, robot: Robot, values: Mapping[str, float], prefix: str, before: Array, kind: Measurement, torques: bool
+        cls,
+        robot: Robot,
+        values: Mapping[str, float],
+        stated: Mapping[str, float],
+        prefix: str,
+        before: Array,
+        kind: Measurement,
+        loads: Loads,
     ) -> Arm:
-        """Build the function, once for all rows: parameters are numbers in it, so that zeros cost nothing."""
+        """Build the function, once for all rows: parameters are numbers in it, so that zeros cost nothing.
+
+        ``values`` are the parameters' by name, ``stated`` their nominal ones, by which gravity acts.
+        """
         n = robot.dof
         q = ca.SX.sym("q", n)
-        tau = ca.SX.sym("tau", n if torques else 0)
+        tau = ca.SX.sym("tau", n if loads.torques else 0)
+        payload = ca.SX.sym("payload", 1 if loads.payload else 0)
         y = ca.SX.sym("y", len(kind.columns))
 
         def value(name: str) -> float:
             return values.get(name, 0.0)
 
-        joints = ca.vertsplit(q)
-        torque = ca.vertsplit(tau) if torques else (0.0,) * n
-        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, joints, torque, value)]
+        posture = loads.posture(robot.joint_types, ca.vertsplit(q), stated.__getitem__, tau, payload, ca.SX())
+        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value)]
         T = after[-1] @ frame([value(prefix + c) for c in FRAME])
-        columns = []
-        for i, (moves, joint) in enumerate(zip(robot.joint_types, after, strict=True), start=1):
-            twist = _twist(moves, joint, T, value(f"beta{i}"))
-            moved = motion(moves, i, joints[i - 1], torque[i - 1], value)
-            columns.append(twist * ca.jacobian(moved, joints[i - 1]))
-        J = ca.horzcat(*columns)[: len(kind.components), :]
+        joints = list(enumerate(robot.joint_types, start=1))
+        twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
+        moved = ca.vertcat(*(motion(moves, i, posture, value) for i, moves in joints))
+        # gravity bends a joint by the values of all of them
+        J = (ca.horzcat(*twists) @ ca.jacobian(moved, q))[: len(kind.components), :]
         modelled = kind.model(T)
         outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
-        return cls(ca.Function("arm", [ca.vertcat(q, tau, y)], outputs), robot.joint_map)
+        return cls(ca.Function("arm", [ca.vertcat(q, tau, payload, y)], outputs), robot.joint_map)
 
-    def at(self, q: Array, tau: Array, y: Array) -> tuple[Array, Array, Array]:
+    def at(self, q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
-        modelled, error, J = call_rows(self.function, [], np.hstack([q @ self.joint_map.T, tau, y]))
+        modelled, error, J = call_rows(self.function, [], np.hstack([q @ self.joint_map.T, load, y]))
         return modelled[:, 0], error[:, 0], J @ self.joint_map
 
 

@@ -11,12 +11,15 @@ from scipy.spatial.distance import cdist
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.calibration.intervals import position_noise, scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.problem.design import random_candidates
+from rpim_opt.problem.loads import Loads, bearing, loads_on, require_same_torques
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
@@ -34,24 +37,34 @@ TRIALS = 12
 
 
 class Spread(NamedTuple):
-    """What the calibration knows of positions: deviations of the parameters and their covariance, or None."""
+    """What the calibration knows of positions: deviations of the parameters and their covariance, or None.
+
+    ``noise`` is the covariance (3, 3) [m^2] of a reading, and ``level`` the noise's variance over it.
+    """
 
     problem: CalibrationProblem
     x: Array
     covariance: Array | None
     marker: str
+    noise: Array
+    level: float
 
-    def at(self, q: Array, torque: Array | None) -> Array:
-        """Return sqrt(tr J C J') at commands, (N,) [m]."""
+    def at(self, q: Array, torque: Array | None, payload: Array | None) -> Array:
+        """Return the standard uncertainty of the position that is reached at commands, (N,) [m].
+
+        sqrt(tr (J C J' + R)), R the robot's own scatter.
+        """
         if self.covariance is None:
             return np.full(len(q), np.inf)
-        data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
-        loads = None if torque is None else torque[:, None]
-        data = replace(data, blocks=tuple(replace(b, markers=(self.marker,), torque=loads) for b in data.blocks))
-        J = self.problem.on(data).jacobian(self.x)
+        data = Dataset.of(q, np.zeros((len(q), 3)), self.noise, measurement=position)
+        data = bearing(data, self.problem.data, torque, payload)
+        data = replace(data, blocks=(replace(data.blocks[0], markers=(self.marker,)),))
+        problem = self.problem.on(data)
+        J = problem.jacobian(self.x)
         known = np.isfinite(np.diag(self.covariance))
         C = np.where(np.outer(known, known), self.covariance, 0.0)
         variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
+        variance += np.trace(scattered(problem, self.level).robot[0], axis1=1, axis2=2)
         unseen = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
         return np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
@@ -116,6 +129,7 @@ class Cell(NamedTuple):
     nominal: Arm
     real: Arm
     spread: Spread
+    loads: Loads
 
     @classmethod
     def of(
@@ -126,9 +140,10 @@ class Cell(NamedTuple):
         marker: str,
         base: bool,
         torques: bool,
+        gravity: Gravity,
     ) -> Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
-        robot = result.problem.robot
+        robot = replace(result.problem.robot, gravity=gravity)
         known = Known.of(result)
         reflector = _reflector(known.parameters, tool, marker)
         prefix = tool_prefix(reflector)
@@ -140,32 +155,38 @@ class Cell(NamedTuple):
         if base:
             moved = np.linalg.inv(_base(stated)) @ _base(found)
         free = known.x[known.parameters.identified]
-        problem = CalibrationProblem(robot, known.parameters, result.problem.data)
+        scatter = result.problem.scatter
+        if tool is not None and scatter is not None:
+            scatter = replace(scatter, at=known.parameters.values(known.x))
+        problem = CalibrationProblem(robot, known.parameters, result.problem.data, scatter=scatter)
+        require_same_torques(problem.parameters, problem.data, torques)
+        loads = loads_on(robot, problem.parameters, problem.data, torques)
         return cls(
             robot,
             kind,
-            nominal=Arm.of(robot, stated, prefix, np.eye(4), kind, torques),
-            real=Arm.of(robot, found, prefix, moved, kind, torques),
-            spread=Spread(problem, free, known.covariance, reflector),
+            nominal=Arm.of(robot, stated, stated, prefix, np.eye(4), kind, loads),
+            real=Arm.of(robot, found, stated, prefix, moved, kind, loads),
+            spread=Spread(
+                problem, free, known.covariance, reflector, position_noise(result.problem), result.noise_level
+            ),
+            loads=loads,
         )
 
     def compensated(
-        self, q: Array | None, poses: Array | None, torque: Array | None, largest: float
+        self, q: Array | None, poses: Array | None, torque: Array | None, payload: Array | None, largest: float
     ) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
         N = len(np.asarray(q if poses is None else poses))
-        tau = np.empty((N, 0))
-        if torque is not None:
-            tau = torque @ np.linalg.inv(self.robot.joint_map)  # of the model's joints
-        nominal, target, missed = self._believed(q, poses, tau)
-        _, before, J = self.real.at(nominal, tau, target)
+        load = self._load(N, torque, payload)
+        nominal, target, missed = self._believed(q, poses, load)
+        _, before, J = self.real.at(nominal, load, target)
         W = attainable(J)
         unit = ranges(self.robot, J.shape[1])
         reached = self._reached(missed, W)
         due = np.where(reached[:, None], before - missed, 0.0)
         P = pinned(W @ J * unit, times(W, due), largest)
         low, high = self._around(nominal, largest)
-        found, left, held = nearest(self.real, tau, target, nominal, low, high, unit, W, P)
+        found, left, held = nearest(self.real, load, target, nominal, low, high, unit, W, P)
         lowest, highest = self.robot.limits.T
         at_limit = (held & ((found <= lowest) | (found >= highest))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
@@ -178,17 +199,27 @@ class Cell(NamedTuple):
             "orientation_before": turn_before,
             "position_error": place,
             "orientation_error": turn,
-            "std": self.spread.at(found, torque),
+            "std": self.spread.at(found, torque, payload),
             "status": np.select(list(cases.values()), list(cases), "near singular"),
         }
 
-    def _believed(self, q: Array | None, poses: Array | None, tau: Array) -> tuple[Array, Array, Array]:
+    def _load(self, N: int, torque: Array | None, payload: Array | None) -> Array:
+        """Return what the joints of the model bear, as `Arm.at` takes it, (N, l)."""
+        parts = [np.empty((N, 0))]
+        if torque is not None:
+            parts.append(torque @ np.linalg.inv(self.robot.joint_map))
+        if self.loads.payload:
+            carried = self.robot.gravity.payload if payload is None else payload
+            parts.append(np.broadcast_to(carried, N)[:, None])
+        return np.hstack(parts)
+
+    def _believed(self, q: Array | None, poses: Array | None, load: Array) -> tuple[Array, Array, Array]:
         """Return the controller's commands (N, dof), the targets (N, c), and by how much it misses them (N, k)."""
         if poses is not None:
-            commands = self._commands(poses, q, tau)
-            return commands, poses, self.nominal.at(commands, tau, poses)[1]
+            commands = self._commands(poses, q, load)
+            return commands, poses, self.nominal.at(commands, load, poses)[1]
         commands = np.asarray(q)
-        believed, error, _ = self.nominal.at(commands, tau, np.zeros((len(commands), len(self.kind.columns))))
+        believed, error, _ = self.nominal.at(commands, load, np.zeros((len(commands), len(self.kind.columns))))
         return commands, believed, np.zeros_like(error)
 
     def _around(self, commands: Array, largest: float) -> tuple[Array, Array]:
@@ -197,35 +228,35 @@ class Cell(NamedTuple):
         inside = np.clip(commands, lowest, highest)
         return np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
 
-    def _commands(self, poses: Array, q: Array | None, tau: Array) -> Array:
+    def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
-        starts = self._starts(poses, tau.shape[1]) if q is None else q[:, None]
-        found, left, _ = self._nearest(poses, tau, starts[:, 0])
+        starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]
+        found, left, _ = self._nearest(poses, load, starts[:, 0])
         for k in range(1, starts.shape[1]):
             again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
             if not len(again):
                 break
-            other, error, _ = self._nearest(poses[again], tau[again], starts[again, k])
+            other, error, _ = self._nearest(poses[again], load[again], starts[again, k])
             better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
             found[again[better]] = other[better]
             left[again[better]] = error[better]
         if poses.shape[1] == 3 or self.robot.dof >= 6:
             return found
-        return self._nearest(poses, tau, found, attainable(self.nominal.at(found, tau, poses)[2]))[0]
+        return self._nearest(poses, load, found, attainable(self.nominal.at(found, load, poses)[2]))[0]
 
     def _nearest(
-        self, poses: Array, tau: Array, start: Array, W: Array | None = None
+        self, poses: Array, load: Array, start: Array, W: Array | None = None
     ) -> tuple[Array, Array, np.ndarray]:
         low, high = self.robot.limits.T
-        return nearest(self.nominal, tau, poses, start, low, high, np.ones(self.robot.dof), W)
+        return nearest(self.nominal, load, poses, start, low, high, np.ones(self.robot.dof), W)
 
-    def _starts(self, poses: Array, torques: int) -> Array:
+    def _starts(self, poses: Array, loads: int) -> Array:
         """Return the nearest of many configurations within limits, or a turn, for every pose, (N, TRIALS, dof)."""
         low, high = self.robot.limits.T
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
-        seen = self.nominal.at(bank, np.zeros((BANK, torques)), np.zeros((BANK, poses.shape[1])))[0]
+        seen = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
         distance = cdist(poses[:, :3], seen[:, :3], "sqeuclidean")
         if poses.shape[1] == 7:
             distance += 8 * (1 - np.abs(poses[:, 3:] @ seen[:, 3:].T))  # the angle's square, nearly

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.units import display, joint_columns
+from rpim_opt.calibration.ranges import Outside
 from rpim_opt.robot.mdh import Robot
 
 
@@ -39,6 +40,8 @@ class Compensation:
         For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
         prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
         ``"near singular"`` (the correction would be too large, and was damped).
+    outside
+        Corrected commands beyond the joint ranges that the calibration measured.
 
     Examples
     --------
@@ -49,7 +52,7 @@ class Compensation:
     >>> np.degrees(found.q - found.nominal).round(2), found.status
     (array([[ 0.08,  0.86, -2.02,  1.21, -0.09, -0.04]]), ('ok',))
     >>> sorted(found.content())
-    ['corrected', 'largest_corrections', 'nominal', 'rows']
+    ['corrected', 'largest_corrections', 'nominal', 'outside', 'rows']
     >>> print(found.csv().splitlines()[0])
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
     """
@@ -64,13 +67,14 @@ class Compensation:
     orientation_error: Array
     std: Array
     status: tuple[str, ...]
+    outside: Outside = field(default_factory=Outside)
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
         rows = [
             ("position [mm], nominal command", self.position_before),
             ("position [mm], corrected command", self.position_error),
-            ("position [mm], uncertainty of the model", self.std),
+            ("position [mm], uncertainty of what is reached", self.std),
             ("orientation [mrad], nominal command", self.orientation_before),
             ("orientation [mrad], corrected command", self.orientation_error),
         ]
@@ -85,7 +89,7 @@ class Compensation:
             if found:
                 named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in found])
                 lines.append(f"{status.capitalize()}: {named}.")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.outside.sentences()])
 
     def _changes(self) -> list[tuple[str, float]]:
         """Return the unit and the largest correction of every joint."""
@@ -105,6 +109,7 @@ class Compensation:
             "nominal": _errors(self.position_before, self.orientation_before),
             "corrected": _errors(self.position_error, self.orientation_error),
             "largest_corrections": dict(zip(joints, (value for _, value in self._changes()), strict=True)),
+            "outside": [self.label[i] for i in self.outside.rows],
             "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
         }
 

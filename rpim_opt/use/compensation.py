@@ -12,9 +12,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_text
 from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import pose, position
 from rpim_opt.use.cell import Cell
 from rpim_opt.use.compensated import Compensation
@@ -35,6 +36,8 @@ def compensate(
     marker: str = "",
     base: bool = False,
     torque: Array | None = None,
+    payload: float | Array | None = None,
+    payload_centre: Sequence[float] | Array | None = None,
     largest: float = 0.2,
     label: Sequence[str] = (),
 ) -> Compensation:
@@ -77,7 +80,13 @@ def compensate(
     base
         Whether to compensate the base.
     torque
-        (N, dof) joint torques [Nm]: required, and zero if need be, where compliances were identified.
+        (N, dof) joint torques [Nm]: required, and zero if need be, where compliances were identified from measured
+        ones.
+    payload
+        Mass at the flange [kg], one or (N,), where compliances were identified without measured torques; by default
+        the one that the problem states. Joints are in the middle of their backlash.
+    payload_centre
+        (3,) where that mass is in the flange frame [m]; by default where the problem states it.
     largest
         Largest correction of a joint [rad or m].
     label
@@ -106,18 +115,41 @@ def compensate(
     if not largest > 0:
         raise InputError("largest", f"{largest}", "a correction greater than zero")
     turned = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
-    cell = Cell.of(result, pose if turned else position, tool, marker, base, torque is not None)
+    kind = pose if turned else position
+    gravity = robot.gravity
+    if payload_centre is not None:
+        gravity = gravity.carrying(gravity.payload, list(payload_centre))
+    cell = Cell.of(result, kind, tool, marker, base, torque is not None, gravity)
+    carried = _carried(cell, payload, payload_centre, len(targets.label))
 
     def part(start: int) -> dict[str, Array]:
         def rows(values: Array | None) -> Array | None:
             return None if values is None else values[start : start + BLOCK]
 
-        return cell.compensated(rows(targets.q), rows(targets.poses), rows(targets.torque), largest)
+        bears = (rows(targets.torque), rows(carried))
+        return cell.compensated(rows(targets.q), rows(targets.poses), *bears, largest)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(part, range(0, len(targets.label), BLOCK)))
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return Compensation(robot, targets.label, **{**whole, "status": tuple(whole["status"].tolist())})
+    whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    whole["status"] = tuple(whole["status"].tolist())
+    commands = Dataset.of(whole["q"], np.zeros((len(targets.label), 3)), 1.0)
+    return Compensation(robot, targets.label, **whole, outside=result.outside(commands))
+
+
+def _carried(cell: Cell, payload: float | Array | None, centre: object, N: int) -> Array | None:
+    """Return the payload of every row (N,) [kg], if there is one; refuse one that has no effect."""
+    if payload is None and centre is None:
+        return None
+    if not cell.loads.payload:
+        accepted = "a calibration that identified compliances, from the torques of gravity"
+        raise InputError("payload", "a payload that bends nothing", accepted)
+    if payload is None:
+        payload = cell.robot.gravity.payload
+    values = np.asarray(payload, dtype=float)
+    if values.shape not in ((), (N,)) or not (values >= 0).all() or not np.isfinite(values).all():
+        raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
+    return np.broadcast_to(values, N)
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
@@ -146,6 +178,7 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     (18, {'ok'})
     """
     read = read_targets(targets, result.problem.robot)
-    found = compensate(result, read.q, read.poses, torque=read.torque, label=read.label, **options)
+    stated = {"torque": read.torque, "payload": read.payload, "label": read.label}
+    found = compensate(result, read.q, read.poses, **(stated | options))
     write_text(Path(out), found.csv())
     return found

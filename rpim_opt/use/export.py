@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from shutil import copyfile
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import refused
+from rpim_opt.basics.writing import refused, write_files
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.parameter_names import reflectors
@@ -64,7 +62,7 @@ def export_urdf(
     >>> data = ro.Dataset.of(np.zeros((1, 1)), np.zeros((1, 3)), 1e-4)
     >>> empty = ro.CalibrationProblem(arm.robot, parameters, data)
     >>> longer = empty.on(ro.Dataset.of(data.q, empty.modelled(np.array([0.001]))[0], 1e-4))
-    >>> ro.use.export_urdf(ro.calibrate(longer), "arm.urdf", "identified.urdf")
+    >>> ro.use.export_urdf(ro.calibrate(longer, weight=0.0), "arm.urdf", "identified.urdf")
     []
     >>> (ro.read_urdf("identified.urdf").robot.mdh - arm.robot.mdh)[0, 3].round(6)  # [m]
     np.float64(0.001)
@@ -124,10 +122,9 @@ def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | Non
     """
     _require_different([target for target, _ in writers])
     notes: list[str] = []
-    with ExitStack() as stack:
-        scratch = Path(stack.enter_context(TemporaryDirectory()))
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
         made: dict[Path, Path] = {}
-        beside: dict[Path, Path] = {}
         for number, (target, write) in enumerate(writers):
             made[target] = path = scratch / str(number) / target.name
             path.parent.mkdir()
@@ -136,14 +133,8 @@ def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | Non
             except InputError as error:
                 file = target if error.file == path else error.file
                 raise InputError(error.where, error.found, error.accepted, file) from None
-        for target, path in made.items():  # all of them first, so that nothing but their renaming is left to be done
-            with refused(target):
-                target.parent.mkdir(parents=True, exist_ok=True)
-                folder = stack.enter_context(TemporaryDirectory(dir=target.parent, prefix=f"{target.name}."))
-                beside[target] = copyfile(path, Path(folder) / target.name)
-        for target, path in beside.items():
-            with refused(target):
-                path.replace(target)
+        with refused(", ".join(str(target) for target in made)):
+            write_files({target: path.read_bytes() for target, path in made.items()})
     return notes
 
 

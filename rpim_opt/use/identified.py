@@ -7,8 +7,11 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.kinematics import FRAME, JOINT_EXTRAS
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.parameter_names import of_term, tool_prefix
+
+SHOWN = 6
+"""Parameters that are named before the rest is counted."""
 
 
 def identified(result: Calibration, marker: str = "") -> Described:
@@ -24,8 +27,8 @@ def identified(result: Calibration, marker: str = "") -> Described:
     Raises
     ------
     InputError
-        Naming the identified parameters that no description of a robot holds: ratios, eccentricities, compliances;
-        for a marker that is not known.
+        Naming the identified parameters that no description of a robot holds: ratios, harmonics, backlash, and what
+        gravity does (compliances, bends); for a marker that is not known.
 
     Examples
     --------
@@ -38,9 +41,13 @@ def identified(result: Calibration, marker: str = "") -> Described:
     values = p.nominal.copy()
     values[p.identified] = p.free.values(result.x)
     of = dict(zip(p.names, values, strict=True))
-    extras = [name for name, value in of.items() if value and name.rstrip("0123456789") in JOINT_EXTRAS]
+    extras = [name for name, value in of.items() if value and of_term(name)]
     if extras:
-        raise InputError("the calibration", ", ".join(extras), "MDH parameters, base and tool: files hold nothing else")
+        found = ", ".join(extras[:SHOWN])
+        if len(extras) > SHOWN:
+            found += f" and {len(extras) - SHOWN} more"
+        accepted = "MDH parameters, base and tool: files hold nothing else; `compensate` corrects commands for them"
+        raise InputError("the calibration", found, accepted)
     prefix = tool_prefix(marker)
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")

@@ -33,12 +33,12 @@ class Sum(NamedTuple):
 class Aim(NamedTuple):
     """Rows and what they aim at: |W error|^2 + D' P D, with q = start + unit D, low <= q <= high.
 
-    Torques of the model's joints (N, n), targets y (N, c), start, low and high (N, n), units (n,), W (N, k, k) or
+    What the joints bear (N, l), targets y (N, c), start, low and high (N, n), units (n,), W (N, k, k) or
     None where all errors count alike, P (N, n, n).
     """
 
     arm: Arm
-    tau: Array
+    load: Array
     y: Array
     start: Array
     low: Array
@@ -53,7 +53,7 @@ class Aim(NamedTuple):
 
     def at(self, rows: np.ndarray, D: Array) -> Sum:
         """Return what is minimized in some rows after steps D."""
-        _, error, J = self.arm.at(self.q(rows, D), self.tau[rows], self.y[rows])
+        _, error, J = self.arm.at(self.q(rows, D), self.load[rows], self.y[rows])
         counted = error
         A = J * self.unit
         if self.W is not None:
@@ -69,7 +69,7 @@ class Aim(NamedTuple):
 
 def nearest(
     arm: Arm,
-    tau: Array,
+    load: Array,
     y: Array,
     start: Array,
     low: Array,
@@ -93,7 +93,7 @@ def nearest(
         W = None  # the same projection for all rows is the identity: see `attainable`
     low = np.broadcast_to(low, start.shape)
     high = np.broadcast_to(high, start.shape)
-    aim = Aim(arm, tau, y, start, low, high, unit, W, P)
+    aim = Aim(arm, load, y, start, low, high, unit, W, P)
     to_low = (low - start) / unit
     to_high = (high - start) / unit
     D = np.clip(0.0, to_low, to_high)

@@ -36,6 +36,8 @@ def test_what_is_periodic_is_exactly_what_a_turn_leaves_alone(kind: str) -> None
         turn = np.zeros(len(free))
         turn[i] = 2 * np.pi
         same = np.abs(problem.modelled(x + turn)[0] - here).max() < 1e-12
+        if name.startswith("backlash"):
+            continue  # approached from -1, 0 or +1 times a turn, the joint is where it was: by chance, not as an angle
         if free.periodic[i]:
             assert same, name
         # a turn may leave a value alone that does not depend on the parameter; then its column is zero

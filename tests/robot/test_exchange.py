@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
+from rpim_opt.basics.inputs import LARGEST_TEXT
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.original import LARGEST
 from tests.simulate import ARM, simulated
 
 EXACT = 1e-11
@@ -265,7 +265,7 @@ HOSTILE = {
         PLAIN.replace('<origin xyz="0.5 0 0"/>', '<mimic joint="j1" multiplier="-1"/>'),
         "joint 'j2', mimic: found motion that follows joint 'j1'",
     ),
-    "too large": (b" " * (LARGEST + 1), "bytes"),
+    "too large": (b" " * (LARGEST_TEXT + 1), "bytes"),
 }  # fmt: skip
 
 

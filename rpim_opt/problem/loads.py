@@ -1,0 +1,165 @@
+"""What joints bear in a row: measured torques, a payload, directions of approach; and whether gravity is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.robot.deflection import Statics
+from rpim_opt.robot.gravity import Gravity
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import of_term
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Posture, Symbol
+
+
+class Loads(NamedTuple):
+    """What the rows of a block state of their joints, which decides the functions that evaluate them.
+
+    ``gravity`` is None where no parameter asks for it; ``weighs`` tells that its torques stand for measured ones.
+    """
+
+    torques: bool = False
+    payload: bool = False
+    approach: bool = False
+    gravity: Gravity | None = None
+    weighs: bool = False
+
+    def posture(
+        self,
+        joint_types: Sequence[str],
+        q: Sequence[Symbol],
+        nominal: Callable[[str], Symbol],
+        tau: ca.SX,
+        payload: ca.SX,
+        approach: ca.SX,
+        point: int = 0,
+    ) -> Posture:
+        """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
+        at = slice(point * len(q), (point + 1) * len(q))
+        torque = None
+        if self.torques:
+            torque = ca.vertsplit(tau[at])
+        elif not self.weighs:
+            torque = [0.0] * len(q)
+        weight = None
+        if self.gravity is not None:
+            weight = Statics(joint_types, q, nominal, self.gravity, payload if self.payload else None)
+        directions = None
+        if self.approach:
+            directions = ca.vertsplit(approach[at])
+        return Posture(q, torque, directions, weight)
+
+
+class Needs(NamedTuple):
+    """What the parameters that are identified, or not zero, need to know of a row."""
+
+    torques: bool
+    moments: bool
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> Needs:
+        """Return what a table of parameters needs."""
+        used = parameters.identified | (parameters.nominal != 0)
+        terms = [parameters.names[i] for i in np.flatnonzero(used) if of_term(parameters.names[i])]
+        return cls(
+            torques=any(name.startswith("compliance") for name in terms),
+            moments=any(name.startswith("bend") for name in terms),
+        )
+
+
+def measured_torques(data: Dataset) -> bool:
+    """Return whether data state torques: then those of gravity stand for none of them."""
+    return any(block.torque is not None for block in data.blocks)
+
+
+def loads_of(robot: Robot, needs: Needs, data: Dataset, block: Block) -> Loads:
+    """Return what the rows of a block of some data state, and what they need of gravity."""
+    weighs = needs.torques and not measured_torques(data)
+    return Loads(
+        torques=block.torque is not None,
+        payload=block.payload is not None,
+        approach=block.approach is not None,
+        gravity=robot.gravity if weighs or needs.moments else None,
+        weighs=weighs,
+    )
+
+
+def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:
+    """Return what commands state that are to be compensated: torques, or a payload where those of gravity count."""
+    needs = Needs.of(parameters)
+    weighs = needs.torques and not measured_torques(data)
+    gravity = robot.gravity if weighs or needs.moments else None
+    return Loads(torques=torques, payload=weighs, gravity=gravity, weighs=weighs)
+
+
+def columns(robot: Robot, block: Block, part: slice) -> list[Array]:
+    """Return what some rows state of their joints, side by side, about the joints of the model."""
+    N = len(block.y[part])
+    found = []
+    if block.torque is not None:  # virtual work: tau_model = M^-T tau
+        found.append((block.torque[part] @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
+    if block.payload is not None:
+        found.append(block.payload[part].reshape(N, 1))
+    if block.approach is not None:
+        found.append(np.sign(block.approach[part] @ robot.joint_map.T).reshape(N, -1))
+    return found
+
+
+def require_loads(parameters: Parameters, data: Dataset) -> None:
+    """Refuse to identify backlash from data that do not state from which side joints came."""
+    free = [parameters.names[i] for i in np.flatnonzero(parameters.identified)]
+    backlash = [name for name in free if name.startswith("backlash") and of_term(name)]
+    if backlash and all(block.approach is None for block in data.blocks):
+        found = f"'{backlash[0]}' without directions of approach"
+        raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
+
+
+def require_same_torques(parameters: Parameters, data: Dataset, measured: bool) -> None:
+    """Refuse torques of another kind than those of a problem's data, ``measured`` or not, where compliances need them.
+
+    Without measured torques a compliance multiplies those of gravity, on masses that may be a guess.
+    """
+    if not Needs.of(parameters).torques or measured_torques(data) == measured:
+        return
+    where = "compliances"
+    if measured:
+        accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"
+        raise InputError(where, "joint torques", accepted)
+    raise InputError(where, "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
+
+
+def bearing(data: Dataset, like: Dataset, torque: Array | None = None, payload: float | Array | None = None) -> Dataset:
+    """Return rows of one point in one block with what their joints bear.
+
+    Directions of approach are not known, 0, where the data of a problem ``like`` these state them: the joints are in
+    the middle of their backlash.
+
+    Parameters
+    ----------
+    data
+        The rows.
+    like
+        Data of the problem whose rows these are to be.
+    torque
+        (N, dof) joint torques [Nm].
+    payload
+        Mass at the flange [kg], one or (N,).
+    """
+    (block,) = data.blocks
+    if torque is not None:
+        torque = np.reshape(np.asarray(torque, dtype=float), (len(data), 1, -1))
+    if payload is not None:
+        payload = np.broadcast_to(np.asarray(payload, dtype=float), (len(data),))
+    approach = None
+    if any(each.approach is not None for each in like.blocks):
+        approach = np.zeros(block.q.shape)
+    block = replace(block, torque=torque, payload=payload, approach=approach)
+    return replace(data, blocks=(block,))

@@ -1,0 +1,166 @@
+"""What joints bear in a row: gravity without torque columns, payloads, sides; and which data go with which."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.data.models import MEASUREMENTS
+from tests.data.test_measurement import random_problem
+from tests.robot.test_gravity import random_robot
+from tests.simulate import ARM, simulated
+
+TERMS = ("compliance?", "bend*", "backlash?", "theta?")
+
+
+@pytest.mark.parametrize("kind", MEASUREMENTS)
+def test_jacobians_under_gravity_are_differences_of_residuals(kind: str) -> None:
+    types = ("revolute", "prismatic", "revolute", "revolute")
+    problem, rng = random_problem(kind, 3, types, identify=TERMS)
+    block = replace(problem.data.blocks[0], torque=None, payload=rng.uniform(0, 3, 6))
+    data = replace(problem.data, blocks=(block,))
+    robot = replace(problem.robot, gravity=random_robot(3, types).gravity)
+    problem = ro.CalibrationProblem(robot, problem.parameters, data)
+    free = problem.parameters.free
+    # sizes at which the differences neither round nor bend: 50 Nm move a joint as far as 1e-5 / 50
+    h = np.where(np.array(free.dimensions) == "compliance", 1e-7, 1e-5)
+    x = 5e3 * h * rng.normal(size=len(free))
+    J = problem.jacobian(x)
+    gravity = [i for i, name in enumerate(free.names) if name.startswith(("compliance", "bend"))]
+    assert np.abs(J[:, gravity]).max() > 0.1
+    for i in gravity:
+        step = h[i] * (np.arange(len(free)) == i)
+        difference = (problem.residual(x - step) - problem.residual(x + step)) / (2 * h[i])
+        assert np.abs(J[:, i] - difference).max() < 1e-6 * (1 + np.abs(J[:, i]).max()), free.names[i]
+
+
+def test_compliance_is_identified_without_torques() -> None:
+    """Truth comes back to 1e-8 without noise, with the payload of every row known and none measured."""
+    problem, _ = simulated(("theta[2-6]", "a?", "compliance[2345]", "ecc2_cos3"), configurations=30)
+    rng = np.random.default_rng(0)
+    block = replace(problem.data.blocks[0], payload=rng.choice([0.0, 2.5], 30))
+    problem = problem.on(replace(problem.data, blocks=(block,)))
+    truth = rng.normal(size=len(problem.parameters.free)) * problem.parameters.free.scale
+    block = replace(block, y=problem.modelled(truth)[0])
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(block,))), ro.tikhonov, 1e-14)
+    assert np.abs((result.x - truth) / problem.parameters.free.scale).max() < 1e-8
+
+
+def test_measured_torques_go_before_those_of_gravity() -> None:
+    problem, _ = simulated(("compliance?",), configurations=5)
+    x = np.full(6, 1e-5)
+    q = problem.data.q
+    block = problem.data.blocks[0]
+    zero = replace(problem.data, blocks=(replace(block, torque=np.zeros((5, 1, 6))),))
+    still = ro.CalibrationProblem(ARM, problem.parameters, zero)
+    assert np.abs(still.modelled(x)[0] - still.modelled(0 * x)[0]).max() == 0
+    moved = ro.CalibrationProblem(ARM, problem.parameters, problem.data).modelled(x)[0]
+    assert np.abs(moved - still.modelled(x)[0]).max() > 1e-4
+    stated = ro.robot.gravity_torques(ARM, q)[:, None]
+    given = ro.CalibrationProblem(ARM, problem.parameters, replace(zero, blocks=(replace(block, torque=stated),)))
+    assert np.abs(given.modelled(x)[0] - moved).max() < 1e-14
+
+
+def test_rows_without_torques_among_rows_with_them_bear_none() -> None:
+    problem, _ = simulated(("compliance?",), configurations=4)
+    block = problem.data.blocks[0]
+    first = replace(block.take(np.arange(2), np.arange(2)), torque=np.full((2, 1, 6), 5.0))
+    second = block.take(np.arange(2, 4), np.arange(2, 4))
+    mixed = ro.CalibrationProblem(ARM, problem.parameters, replace(problem.data, blocks=(first, second)))
+    x = np.full(6, 1e-4)
+    with_torques, without = mixed.modelled(x)
+    assert np.abs(without - mixed.modelled(0 * x)[1]).max() == 0
+    assert np.abs(with_torques - mixed.modelled(0 * x)[0]).max() > 1e-5
+
+
+def test_a_compliance_keeps_to_its_kind_of_torques() -> None:
+    problem, _ = simulated(("compliance?",), configurations=4)
+    block = replace(problem.data.blocks[0], torque=np.zeros((4, 1, 6)))
+    loaded = replace(problem.data, blocks=(block,))
+    measured = ro.CalibrationProblem(ARM, problem.parameters, loaded)
+    with pytest.raises(ro.InputError, match="without joint torques"):
+        measured.on(problem.data)
+    with pytest.raises(ro.InputError, match="found joint torques, accepted: none"):
+        problem.on(loaded)
+    # whom compliances do not concern, torques do not
+    geometry = problem.with_parameters(problem.parameters.identify(["a?"]))
+    assert geometry.on(loaded).on(problem.data).data is problem.data
+
+
+def test_a_nominal_compliance_bends_a_robot_too() -> None:
+    problem, _ = simulated(("a?",), configurations=4)
+    names = problem.parameters.names
+    nominal = problem.parameters.nominal.copy()
+    nominal[names.index("compliance2")] = 1e-5
+    bent = problem.with_parameters(replace(problem.parameters, nominal=nominal))
+    q = problem.data.q.copy()
+    q[:, 1] += 1e-5 * ro.robot.gravity_torques(ARM, q)[:, 1]
+    there = problem.on(ro.Dataset.of(q, np.zeros((4, 3)), 1.0))
+    assert np.abs(bent.modelled(np.zeros(6))[0] - there.modelled(np.zeros(6))[0]).max() < 1e-14
+
+
+def test_what_no_parameter_asks_for_is_not_evaluated() -> None:
+    problem, _ = simulated(("a?", "ecc2_*"), configurations=4)
+    assert problem._loads(problem.data.blocks[0]).gravity is None
+    for pattern in ("compliance3", "bend3_4x"):
+        asking = problem.with_parameters(problem.parameters.identify([pattern]))
+        assert asking._loads(problem.data.blocks[0]).gravity is ARM.gravity
+
+
+def test_backlash_needs_directions_of_approach() -> None:
+    problem, _ = simulated(("a?",), configurations=4)
+    with pytest.raises(ro.InputError, match="'backlash1' without directions of approach, accepted: columns approach1"):
+        problem.with_parameters(problem.parameters.identify(["backlash?"]))
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+TABLE = {"label": ["a", "b"], "q1_deg": [0, 10], "q2_deg": [5, 6], "x_mm": [1, 2], "y_mm": [3, 4], "z_mm": [5, 6]}
+TWO = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+
+
+def read(**columns: list) -> ro.Dataset:
+    return ro.read_data({**TABLE, **columns}, TWO, {"position_mm": 0.1})
+
+
+def test_tables_state_payloads_and_sides() -> None:
+    block = read(payload_kg=[0, 2.5], approach1=[-1, 1], approach2=[0, 1]).blocks[0]
+    assert block.payload is not None
+    assert block.approach is not None
+    assert block.payload.tolist() == [0.0, 2.5]
+    assert block.approach[:, 0].tolist() == [[-1, 0], [1, 1]]
+    second = read(payload_kg=[0, 2.5], approach1=[-1, 1], approach2=[0, 1]).take([1]).blocks[0]
+    assert second.payload is not None
+    assert second.payload.tolist() == [2.5]
+    plain = read().blocks[0]
+    assert plain.payload is None
+    assert plain.approach is None
+
+
+@pytest.mark.parametrize(
+    ("columns", "match"),
+    [
+        ({"payload_kg": [0, -1]}, "row b, column payload_kg: found -1"),
+        ({"payload": [0, 1]}, "payload_kg"),
+        ({"approach1": [1, 1]}, "no column for 'approach2'"),
+        ({"approach1": [1, 1], "approach2": [1, 0.5]}, "row b, column approach2: found 0.5, accepted: -1, 0"),
+    ],
+)
+def test_what_a_table_cannot_mean_is_refused(columns: dict, match: str) -> None:
+    with pytest.raises(ro.InputError, match=match):
+        read(**columns)
+
+
+def test_a_distances_second_point_may_come_from_another_side() -> None:
+    table = {k: v for k, v in TABLE.items() if k[0] not in "xyz"}
+    table |= {"to_q1_deg": [1, 2], "to_q2_deg": [3, 4], "distance_mm": [5, 6]}
+    sides = {"approach1": [1, 1], "approach2": [1, 1]}
+    other = {"to_approach1": [-1, 0], "to_approach2": [-1, -1]}
+    for columns, second in (({}, [[1, 1], [1, 1]]), (other, [[-1, -1], [0, -1]])):
+        data = ro.read_data({**table, **sides, **columns}, TWO, {"distance_mm": 0.1}, MEASUREMENTS["distance"])
+        approach = data.blocks[0].approach
+        assert approach is not None
+        assert approach[:, 1].tolist() == second

@@ -1,0 +1,353 @@
+"""Gravity from a table to corrected commands: without torques, with another payload, in files, hung the wrong way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.calibration.sag import bends_upwards, said_of_bending
+from rpim_opt.data.models import position
+from rpim_opt.store.content import digest
+from rpim_opt.store.simulation import write_simulation
+from rpim_opt.use.cell import Cell
+from tests.simulate import ARM
+
+SIGMA = 2e-5
+GEOMETRY = ("alpha[2-6]", "a[2-6]", "theta[2-6]", "d[2-6]")
+FAMILY = ("compliance[2345]",)
+TRUE = {"compliance2": 6e-6, "compliance3": 9e-6, "compliance4": 2e-5, "compliance5": 3e-5}
+"""Of 120 Nm: joint 2 gives way by 0.7 mrad, which is 0.5 mm at the flange."""
+TOOL = (0.03, -0.02, 0.06, 0.0, 0.0, 0.0)
+
+
+def arm(mounting: str = "floor", payload: float = 1.0, centre: tuple = (0.0, 0.02, 0.1)) -> ro.robot.Robot:
+    return replace(ARM, gravity=ro.robot.Gravity(payload=payload, payload_centre=centre).mounted(mounting))
+
+
+def table(robot: ro.robot.Robot, identify: tuple[str, ...] = GEOMETRY + FAMILY) -> ro.robot.Parameters:
+    parameters = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(identify)
+    scale = parameters.scale.copy()
+    for i, name in enumerate(parameters.names):
+        if name.startswith("compliance"):
+            scale[i] = 1e-5
+    return replace(parameters, scale=scale)
+
+
+def truth(parameters: ro.robot.Parameters, seed: int = 0) -> np.ndarray:
+    free = parameters.free
+    x = 0.5 * np.random.default_rng(seed).normal(size=len(free)) * free.scale
+    return np.array([TRUE.get(name, value) for name, value in zip(free.names, x, strict=True)])
+
+
+def data_at(q: np.ndarray, payload: float | np.ndarray | None = None) -> ro.Dataset:
+    data = ro.Dataset.of(q, np.zeros((len(q), 3)), SIGMA)
+    if payload is None:
+        return data
+    carried = np.broadcast_to(np.asarray(payload, dtype=float), (len(q),))
+    return replace(data, blocks=(replace(data.blocks[0], payload=carried),))
+
+
+def calibrated(robot: ro.robot.Robot, believed: ro.robot.Robot | None = None, seed: int = 0, configurations: int = 40):
+    """A calibration of an arm that bends, as the believed robot's; and the true problem with its deviations."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-2.0, 2.0, (configurations, 6))
+    parameters = table(robot)
+    x = truth(parameters)
+    real = ro.CalibrationProblem(robot, parameters, data_at(q))
+    y = real.modelled(x)[0] + SIGMA * rng.normal(size=(configurations, 3))
+    problem = ro.CalibrationProblem(believed or robot, parameters, ro.Dataset.of(q, y, SIGMA))
+    return ro.calibrate(problem, ro.tikhonov, 1.0), real, x
+
+
+def rms(e: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(e**2, axis=1))))
+
+
+@pytest.mark.parametrize("mounting", ["floor", "ceiling", "wall"])
+def test_what_bends_is_predicted_without_torques_wherever_the_robot_hangs(mounting: str) -> None:
+    result, real, x = calibrated(arm(mounting))
+    q = np.random.default_rng(9).uniform(-2.0, 2.0, (200, 6))
+    expected = real.on(data_at(q)).modelled(x)[0]
+    assert rms(result.predict(q).position - expected) < SIGMA * np.sqrt(3)
+    assert np.abs(result.forward(q)[:, :3, 3] - result.predict(q).position).max() < 1e-15
+    stiff = result.problem.parameters.identify(GEOMETRY)
+    geometry = ro.calibrate(result.problem.with_parameters(stiff), ro.tikhonov, 1.0)
+    assert rms(geometry.predict(q).position - expected) > 5 * SIGMA
+
+
+def test_a_payload_that_was_not_there_is_predicted() -> None:
+    result, real, x = calibrated(arm())
+    q = np.random.default_rng(9).uniform(-2.0, 2.0, (100, 6))
+    payloads = np.linspace(0, 2.5, 100)
+    expected = real.on(data_at(q, payloads)).modelled(x)[0]
+    assert rms(result.predict(q, payload=payloads).position - expected) < 1.5 * SIGMA * np.sqrt(3)
+    assert (
+        np.abs(result.forward(q, payload=payloads)[:, :3, 3] - result.predict(q, payload=payloads).position).max()
+        < 1e-15
+    )
+    assert rms(result.predict(q).position - result.predict(q, payload=5.0).position) > 3 * SIGMA
+    stated = result.predict(q, payload=1.0).position
+    assert np.abs(result.predict(q).position - stated).max() == 0
+    assert result.measured_positions(data_at(q, payloads)).shape == (100, 3)
+
+
+@pytest.mark.parametrize("payload", [None, 0.0, 2.5])
+def test_compensation_closes_the_loop_to_the_noise(payload: float | None) -> None:
+    result, real, x = calibrated(arm())
+    q = np.random.default_rng(9).uniform(-1.5, 1.5, (60, 6))
+    nominal = (ro.robot.forward_kinematics(ARM, q) @ np.array([*TOOL[:3], 1.0]))[:, :3]
+    found = ro.use.compensate(result, q, orientation=False, payload=payload)
+    ok = np.array(found.status) == "ok"
+    assert ok.mean() > 0.9
+    assert found.position_error[ok].max() < 1e-7
+    reached = real.on(data_at(found.q, payload)).modelled(x)[0]
+    assert rms((reached - nominal)[ok]) < 1.5 * SIGMA * np.sqrt(3)
+    # and what was believed is what the calibration predicts at the corrected commands
+    predicted = result.predict(found.q, payload=payload).position
+    assert np.abs(predicted - nominal)[ok].max() < 1e-7
+    other = ro.use.compensate(result, q, orientation=False, payload=5.0)
+    assert rms((real.on(data_at(other.q, payload)).modelled(x)[0] - nominal)[ok]) > 3 * SIGMA
+
+
+def test_the_jacobian_of_commands_knows_that_every_joint_bends_the_others() -> None:
+    result, *_ = calibrated(arm())
+    cell = Cell.of(result, position, None, "", False, False, result.problem.robot.gravity)
+    q = np.random.default_rng(9).uniform(-1.5, 1.5, (5, 6))
+    load = np.full((5, 1), 2.5)
+    J = cell.real.at(q, load, np.zeros((5, 3)))[2]
+    h = 1e-5
+    for i, step in enumerate(h * np.eye(6)):
+        ahead, behind = (cell.real.at(q + s * step, load, np.zeros((5, 3)))[0] for s in (1, -1))
+        # of 1e-3 that gravity makes of it, differences keep 1e-10
+        assert np.abs(J[:, :, i] - (ahead - behind) / (2 * h)).max() < 1e-9
+
+
+def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:
+    result, *_ = calibrated(arm())
+    q = np.random.default_rng(9).uniform(-1.5, 1.5, (20, 6))
+    payloads = np.linspace(0, 2.5, 20)
+    together = ro.use.compensate(result, q, orientation=False, payload=payloads)
+    for i in (0, 7, 19):
+        alone = ro.use.compensate(result, q[[i]], orientation=False, payload=payloads[i])
+        assert np.abs(alone.q - together.q[i]).max() < 1e-12
+    off_axis = ro.use.compensate(result, q, orientation=False, payload=2.5, payload_centre=(0.3, 0, 0.2))
+    there = ro.CalibrationProblem(
+        arm(payload=2.5, centre=(0.3, 0, 0.2)), result.problem.parameters, data_at(off_axis.q)
+    )
+    nominal = (ro.robot.forward_kinematics(ARM, q) @ np.array([*TOOL[:3], 1.0]))[:, :3]
+    ok = np.array(off_axis.status) == "ok"
+    assert np.abs(there.modelled(result.x)[0] - nominal)[ok].max() < 1e-7
+
+
+def test_targets_state_payloads_and_no_sides(tmp_path: Path) -> None:
+    result, *_ = calibrated(arm())
+    q = np.random.default_rng(9).uniform(-1.5, 1.5, (5, 6))
+    columns = {f"q{i + 1}_rad": q[:, i] for i in range(6)}
+    targets = columns | {"payload_kg": [0.0, 0.5, 1.0, 2.0, 2.5]}
+    found = ro.use.compensate_file(result, targets, tmp_path / "commands.csv", orientation=False)
+    same = ro.use.compensate(result, q, payload=[0.0, 0.5, 1.0, 2.0, 2.5], orientation=False)
+    assert np.abs(found.q - same.q).max() < 1e-12
+    without = ro.use.compensate_file(result, columns, tmp_path / "commands.csv", orientation=False)
+    assert np.abs(without.q - found.q).max() > 1e-5
+    sides = {f"approach{i}": [1] * 5 for i in range(1, 7)}
+    with pytest.raises(ro.InputError, match="column approach1"):
+        ro.read_targets(columns | sides, ARM)
+
+
+def test_a_payload_that_cannot_count_is_refused() -> None:
+    result, *_ = calibrated(arm())
+    q = np.zeros((2, 6))
+    for wrong in (-1.0, np.nan, [1.0, 2.0, 3.0]):
+        with pytest.raises(ro.InputError, match="payload: found"):
+            ro.use.compensate(result, q, payload=wrong)
+    stiff = result.problem.with_parameters(result.problem.parameters.identify(GEOMETRY))
+    geometry = ro.calibrate(stiff, ro.tikhonov, 1.0)
+    with pytest.raises(ro.InputError, match="payload that bends nothing"):
+        ro.use.compensate(geometry, q, payload=1.0)
+    with pytest.raises(ro.InputError, match="joint torques"):
+        ro.use.compensate(result, q, torque=np.zeros((2, 6)))
+    with pytest.raises(ro.InputError, match="joint torques"):
+        result.forward(q, torque=np.zeros((2, 6)))
+
+
+def test_free_first_moments_are_predicted_and_compensated() -> None:
+    robot = arm("wall")
+    bends = ro.robot.bend_names(robot)[:12]
+    parameters = table(robot, bends)
+    x = 2e-4 * np.random.default_rng(0).normal(size=12)
+    q = np.random.default_rng(1).uniform(-1.5, 1.5, (60, 6))
+    real = ro.CalibrationProblem(robot, parameters, data_at(q))
+    data = ro.Dataset.of(q, real.modelled(x)[0], SIGMA)
+    result = ro.calibrate(real.on(data), ro.tikhonov, 1e-12)
+    assert np.abs(result.predict(q).position - data.blocks[0].y).max() < 1e-8
+    found = ro.use.compensate(result, q, orientation=False)
+    nominal = (ro.robot.forward_kinematics(ARM, q) @ np.array([*TOOL[:3], 1.0]))[:, :3]
+    ok = np.array(found.status) == "ok"
+    reached = real.on(data_at(found.q)).modelled(x)[0]
+    assert np.abs(reached - nominal)[ok].max() < 2e-7
+
+
+# --- the wrong way up -----------------------------------------------------------------------------------------------
+
+
+def upwards(result: ro.calibration.Calibration) -> list[int]:
+    return bends_upwards(result.problem, result.x, np.sqrt(np.diag(result.covariance)))
+
+
+def test_a_robot_that_hangs_otherwise_than_stated_seems_to_bend_upwards() -> None:
+    right, *_ = calibrated(arm())
+    assert upwards(right) == []
+    assert said_of_bending([]) == ""
+    wrong, *_ = calibrated(arm("ceiling"), believed=arm("floor"))
+    assert {2, 3} <= set(upwards(wrong))
+    assert "bend upwards, which gravity cannot do" in said_of_bending(upwards(wrong))
+
+
+def test_a_table_whose_first_axis_points_down_warns_until_it_is_told_so() -> None:
+    """The same arm from a table whose frame 0 is upside down: on the floor there gravity points along +z."""
+    turned = ARM.mdh.copy()
+    turned[1, 0] += np.pi  # frame 0 and the first axis point down: alpha2 takes the half turn
+    down = replace(ARM, mdh=turned)
+    real = replace(down, gravity=ro.robot.Gravity().mounted([0, 0, 1]))
+    wrong, *_ = calibrated(real, believed=down)
+    assert {2, 3} <= set(upwards(wrong))
+    right, *_ = calibrated(real)
+    assert upwards(right) == []
+
+
+def test_measured_torques_have_the_sign_of_their_controller() -> None:
+    result, *_ = calibrated(arm("ceiling"), believed=arm("floor"))
+    data = result.problem.data
+    loaded = replace(data, blocks=(replace(data.blocks[0], torque=np.ones((len(data), 1, 6))),))
+    measured = ro.CalibrationProblem(ARM, result.problem.parameters, loaded)
+    assert bends_upwards(measured, result.x, np.sqrt(np.diag(result.covariance))) == []
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_result_keeps_its_gravity_and_an_older_one_loads(tmp_path: Path) -> None:
+    masses = ro.robot.Gravity(masses=(4.0, 3, 2, 1, 1, 0.5), centres=((0.0, 0.01, 0.1),) * 6)
+    robot = replace(ARM, gravity=masses.carrying(1.5, (0, 0, 0.08)).mounted("wall"))
+    result, *_ = calibrated(robot)
+    data = result.problem.data
+    side = np.ones((len(data), 1, 6))
+    block = replace(data.blocks[0], payload=np.full(len(data), 1.5), approach=side)
+    result = ro.calibrate(result.problem.on(replace(data, blocks=(block,))), ro.tikhonov, 1.0)
+    path = tmp_path / "result.json"
+    ro.store.save_result(result, path)
+    again = ro.load_result(path)
+    assert again.problem.robot.gravity == robot.gravity
+    kept = again.problem.data.blocks[0]
+    assert kept.payload is not None
+    assert kept.approach is not None
+    assert np.array_equal(kept.payload, np.full(len(data), 1.5))
+    assert np.array_equal(kept.approach, side)
+    q = np.random.default_rng(3).uniform(-2, 2, (10, 6))
+    assert np.abs(again.forward(q, payload=2.0) - result.forward(q, payload=2.0)).max() == 0
+
+
+def test_a_result_of_an_older_package_loads(tmp_path: Path) -> None:
+    """It states no gravity, no payloads, no sides, and a table with fewer parameters."""
+    result, *_ = calibrated(arm())
+    stiff = result.problem.with_parameters(result.problem.parameters.identify(GEOMETRY))
+    geometry = ro.calibrate(stiff, ro.tikhonov, 1.0)
+    path = tmp_path / "result.json"
+    ro.store.save_result(geometry, path)
+    stored = json.loads(path.read_text())
+    del stored["robot"]["gravity"]
+    for block in stored["data"]["identification"]["blocks"]:
+        del block["payload"], block["approach"]
+    young = ("bend", "ecc2", "backlash")
+    stored["model"] = [row for row in stored["model"] if not row["name"].startswith(young)]
+    stored["digest"] = digest(stored)
+    path.write_text(json.dumps(stored))
+    old = ro.load_result(path)
+    assert old.problem.robot.gravity == ro.robot.Gravity()
+    assert old.problem.data.blocks[0].payload is None
+    q = np.random.default_rng(3).uniform(-2, 2, (10, 6))
+    assert np.abs(old.forward(q) - geometry.forward(q)).max() == 0
+
+
+def test_gravity_is_stated_in_a_problems_folder(tmp_path: Path) -> None:
+    ro.robot.write_robot(ARM, tmp_path / "robot.toml")
+    q = np.degrees(np.random.default_rng(0).uniform(-2, 2, (12, 6)))
+    lines = ["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm,payload_kg"]
+    lines += [",".join(map(repr, [*row.tolist(), 1.0, 2.0, 3.0, 0.5])) for row in q]
+    (tmp_path / "data.csv").write_text("\n".join(lines))
+    head = 'title = "t"\nidentification = "data.csv"\nidentify = ["theta[2-6]", "compliance2"]\n'
+    tail = "[noise]\nposition_mm = 0.1\n"
+    (tmp_path / "problem.toml").write_text(head + 'mounting = "wall"\n' + tail + "[payload]\nmass_kg = 2\nz_mm = 80\n")
+    problem = ro.load(tmp_path).problem
+    assert problem.robot.gravity == ro.robot.Gravity().mounted("wall").carrying(2.0, (0, 0, 0.08))
+    assert problem.data.blocks[0].payload is not None
+    assert [name for name in problem.parameters.names if name.startswith("bend1_")]
+    for stated, match in (
+        ('mounting = "roof"\n', "key mounting: found 'roof'"),
+        ("mounting = [0, 0, 0]\n", "mounting"),
+    ):
+        (tmp_path / "problem.toml").write_text(head + stated + tail)
+        with pytest.raises(ro.InputError, match=match):
+            ro.load(tmp_path)
+    (tmp_path / "problem.toml").write_text(head + tail + "[payload]\nmass_g = 2\n")
+    with pytest.raises(ro.InputError, match="mass_kg"):
+        ro.load(tmp_path)
+
+
+def test_a_mounting_speaks_of_a_urdfs_base_wherever_its_first_axis_points(tmp_path: Path) -> None:
+    from tests.robot.test_gravity import DRAWN, UPSIDE_DOWN, URDF
+
+    head = 'title = "t"\nrobot = "arm.urdf"\nurdf_base = "base"\nurdf_tip = "tip"\nidentification = "data.csv"\n'
+    head += 'identify = ["theta[23]"]\n'
+    (tmp_path / "data.csv").write_text("q1_deg,q2_deg,q3_deg,x_mm,y_mm,z_mm\n1,2,3,4,5,6\n3,2,1,4,5,6\n")
+    for drawn, sign in ((DRAWN, 1), (UPSIDE_DOWN, -1)):
+        (tmp_path / "arm.urdf").write_text(URDF.format(**drawn))
+        for mounting, z in (("", -1), ('mounting = "ceiling"\n', 1), ("mounting = [0, 0, -1]\n", -1)):
+            (tmp_path / "problem.toml").write_text(head + mounting + "[noise]\nposition_mm = 0.1\n")
+            gravity = ro.load(tmp_path).problem.robot.gravity
+            assert gravity.direction == pytest.approx((0, 0, sign * z))
+            assert len(gravity.masses) == 3
+
+
+SIMULATED = """title = "bent"
+robot = "robot.toml"
+identification = "identification.csv"
+validation = "validation.csv"
+mounting = "wall"
+identify = ["theta[2-6]", "compliance[234]"]
+[noise]
+position_mm = 0.02
+[payload]
+mass_kg = 3
+[simulation]
+seed = 1
+configurations = 30
+validation = 20
+torques = "gravity"
+"""
+
+
+def test_a_simulated_folder_bends_by_gravity_without_a_column_of_torques(tmp_path: Path) -> None:
+    limited = replace(ARM, limits=np.tile([-2.0, 2.0], (6, 1)))
+    ro.robot.write_robot(limited, tmp_path / "robot.toml")
+    (tmp_path / "problem.toml").write_text(SIMULATED)
+    write_simulation(tmp_path)
+    assert "tau1" not in (tmp_path / "identification.csv").read_text()
+    instance = ro.load(tmp_path)
+    assert instance.validation is not None
+    assert instance.problem.robot.gravity.direction == (-1, 0, 0)
+    result = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
+    assert 1e3 * result.errors(instance.validation).mean() < 0.02  # as good as the noise
+    stiff = instance.problem.with_parameters(instance.problem.parameters.identify(["theta[2-6]"]))
+    assert 1e3 * ro.calibrate(stiff, ro.tikhonov, 1.0).errors(instance.validation).mean() > 0.06
+
+
+def test_a_urdf_does_not_hold_what_bends(tmp_path: Path) -> None:
+    result, *_ = calibrated(arm())
+    with pytest.raises(ro.InputError, match=r"compliance2.*files hold nothing else"):
+        ro.use.identified(result)
