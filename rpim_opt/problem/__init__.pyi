@@ -15,4 +15,5 @@ from .placing import hand_eye as hand_eye
 from .placing import register as register
 from .placing import tool_from_distances as tool_from_distances
 from .problem import CalibrationProblem as CalibrationProblem
+from .scatter import Scatter as Scatter
 from .source import Source as Source

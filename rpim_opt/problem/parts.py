@@ -12,13 +12,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.data.reading import read_data
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.scatter import Scatter
 from rpim_opt.problem.source import Source
-from rpim_opt.problem.triangles import joined, reduced, whole_configurations
+from rpim_opt.problem.triangles import joined, reduced
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
@@ -72,6 +73,8 @@ class PartitionedProblem:
     (9, 34)
     >>> len(problem.sample().labels), problem.on(whole.data).labels[0]
     (20, 'c0')
+    >>> problem.scatter, problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position
+    (None, 0.0001)
     """
 
     def __init__(
@@ -122,6 +125,15 @@ class PartitionedProblem:
     def with_parameters(self, parameters: Parameters) -> PartitionedProblem:
         """Return the same problem with another table of parameters."""
         return self._with(self._first.with_parameters(parameters))
+
+    @property
+    def scatter(self) -> Scatter | None:
+        """The robot's own noise; None for the instrument's alone."""
+        return self._first.scatter
+
+    def scattered(self, scatter: Scatter | None) -> PartitionedProblem:
+        """Return the same problem with other noise of the robot's own, or none."""
+        return self._with(self._first.scattered(scatter))
 
     def identifying(self, identified: np.ndarray) -> PartitionedProblem:
         """Return the same problem with other parameters identified, (P,) true or false."""

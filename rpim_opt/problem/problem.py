@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -11,10 +11,20 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.functions import Functions, Kept, Structure, asked
 from rpim_opt.problem.linear import LinearModel, Reweigh
+from rpim_opt.problem.loads import (
+    Loads,
+    Needs,
+    columns,
+    loads_of,
+    measured_torques,
+    require_loads,
+    require_same_torques,
+)
+from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.robot.compiled import compiled
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
@@ -42,6 +52,8 @@ class CalibrationProblem:
         The measurements, of one kind or several.
     asked
         What `frozen` keeps; None where every call asks the measurements anew.
+    scatter
+        The robot's own noise; None for the instrument's alone.
 
     Raises
     ------
@@ -67,6 +79,7 @@ class CalibrationProblem:
     parameters: Parameters
     data: Dataset
     asked: Kept | None = field(default=None, repr=False)
+    scatter: Scatter | None = None
 
     def __post_init__(self) -> None:
         p = self.parameters
@@ -83,14 +96,17 @@ class CalibrationProblem:
                 if of_fixture(name, block.fixture) not in p.names:
                     where = f"measurement {block.measurement.name}"
                     raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
-        compliant = [n for n, used in zip(p.names, p.identified, strict=True) if used and n.startswith("compliance")]
-        if compliant and not any(block.torque is not None for block in self.data.blocks):
-            raise InputError(
-                "key identify", f"'{compliant[0]}' without joint torques", "columns tau1_Nm, ... in the data"
-            )
+        require_loads(p, self.data)
 
     def on(self, data: Dataset) -> CalibrationProblem:
-        """Return the same problem with other measurements."""
+        """Return the same problem with other measurements.
+
+        Raises
+        ------
+        InputError
+            When data and parameters do not fit, or compliances have measured torques here and not there.
+        """
+        require_same_torques(self.parameters, self.data, measured_torques(data))
         return replace(self, data=data)
 
     def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
@@ -102,6 +118,15 @@ class CalibrationProblem:
         6
         """
         return replace(self, parameters=parameters)
+
+    def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
+        """Return the same problem with other noise of the robot's own, or none.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("position").problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position
+        0.0001
+        """
+        return replace(self, scatter=scatter)
 
     def identifying(self, identified: np.ndarray) -> CalibrationProblem:
         """Return the same problem with other parameters identified, (P,) true or false.
@@ -233,10 +258,12 @@ class CalibrationProblem:
         >>> norms[:3].round(1), count[:3]
         (array([72.9, 68.5, 54.5]), array([3, 3, 3]))
         """
-        norms, count = np.zeros(len(self.data)), np.zeros(len(self.data), dtype=int)
+        norms = np.zeros(len(self.data))
+        count = np.zeros(len(self.data), dtype=int)
         for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
             r = (whitening @ self._evaluate(block, "residual", x)[0].transpose(0, 2, 1))[:, :, 0]
-            norms[block.row], count[block.row] = np.sqrt(np.sum(r**2, axis=1)), r.shape[1]
+            norms[block.row] = np.sqrt(np.sum(r**2, axis=1))
+            count[block.row] = r.shape[1]
         return norms, count
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
@@ -249,9 +276,11 @@ class CalibrationProblem:
         >>> norms.shape, count[:2]
         ((25,), array([9, 9]))
         """
-        norms, count = self.whitened_errors(x)
-        which = np.unique(self.data.configuration, return_inverse=True)[1]
-        return np.sqrt(np.bincount(which, norms**2)), np.bincount(which, count).astype(int)
+        numbers = [np.repeat(b.row, len(b.measurement.components)) for b in self.data.blocks]
+        configuration = self.data.configuration[np.concatenate(numbers)]
+        which = np.unique(configuration, return_inverse=True)[1]
+        squares = np.bincount(which, self.whitened_residual(x) ** 2)
+        return np.sqrt(squares), np.bincount(which)
 
     def whitened_residual(self, x: Array) -> Array:
         """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations.
@@ -263,6 +292,8 @@ class CalibrationProblem:
         >>> bool(np.allclose(problem.whitened_residual(nominal), problem.linearize(nominal).b))
         True
         """
+        if self.scatter is not None:
+            return self._whitened(self.residual(x)[:, None])[:, 0]
         parts = []
         for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
             residual = self._evaluate(block, "residual", x)[0]
@@ -315,6 +346,9 @@ class CalibrationProblem:
         [15, 12]
         """
         constrained = any(not block.measurement.columns for block in self.data.blocks)
+        if self.scatter is not None:
+            yield from self._scattered(x, most, constrained)
+            return
         for i, block in enumerate(self.data.blocks):
             each = len(block.measurement.components)
             for start in range(0, len(block.row), most):
@@ -340,16 +374,148 @@ class CalibrationProblem:
         A *= scale
         return A, r + A @ (x / scale)
 
+    def _scattered(self, x: Array, most: int, constrained: bool) -> Iterator[LinearModel]:
+        """Yield the linear model by whole configurations, whose rows share the robot's scatter."""
+        scale = self.parameters.free.scale
+        parts = [np.arange(len(self.data))]
+        if len(self.data) > most:
+            parts = whole_configurations(self.data, most)
+        for rows in parts:
+            problem = self
+            if len(rows) < len(self.data):
+                problem = self.on(self.data.take(rows))
+            residual, jacobian = problem._slopes(x)
+            A = problem._whitened(jacobian) * scale
+            r = problem._whitened(residual[:, None])[:, 0]
+            yield LinearModel(A, r + A @ (x / scale), problem.groups, self.parameters.free, constrained)
+
+    def _slopes(self, x: Array) -> tuple[Array, Array]:
+        """Return residual (m,) and Jacobian (m, n) [SI], evaluated together."""
+        both = [self._evaluate(block, "jacobian", x) for block in self.data.blocks]
+        residual = np.concatenate([r.ravel() for r, _ in both])
+        return residual, np.concatenate([J.reshape(-1, len(x)) for _, J in both])
+
+    def _whitened(self, values: Array) -> Array:
+        """Return values (m, c) of the equations in units of their noise, configuration by configuration."""
+        found = np.empty_like(values)
+        for stack, L in self._factors:
+            found[stack.index] = np.linalg.solve(L, values[stack.index])
+        return found
+
+    @cached_property
+    def _factors(self) -> list[tuple[Stack, Array]]:
+        """Covariances of whole configurations as L L'."""
+        scatter = self.scatter or Scatter()
+        stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
+        return [(stack, _cholesky(stack.covariance(scatter))) for stack in stacks]
+
+    def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
+        """Return the equations by configuration, with what divides their noise.
+
+        Parameters
+        ----------
+        joints
+            Whether the slopes by the joints' angles are wanted.
+        at
+            (P,) values of all parameters at which they are taken [SI]; None for nominal.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> stacks = ro.load("markers").problem.stacks()  # 25 configurations, three reflectors
+        >>> [stack.index.shape for stack in stacks], stacks[0].joint.shape
+        ([(25, 9)], (25, 9, 6))
+        """
+        slopes = None
+        if joints:
+            slopes = self.joint_slopes(at)
+        return stacked(self.data, slopes)
+
+    def joint_slopes(self, at: Array | None = None) -> Array:
+        """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
+
+        Parameters
+        ----------
+        at
+            (P,) values of all parameters [SI]; None for nominal.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.joint_slopes().shape
+        (27, 6)
+        """
+        p = self.parameters
+        types = self.robot.joint_types
+        number = {f"theta{i}": i - 1 for i, kind in enumerate(types, start=1) if kind == "revolute"}
+        angles = np.array([name in number for name in p.names])
+        nominal = p.nominal
+        if at is not None:
+            nominal = at
+        alone = replace(self, parameters=replace(p, nominal=nominal, identified=angles), scatter=None)
+        found = np.zeros((len(self.groups), len(types)))
+        if angles.any():
+            columns = [number[name] for name in p.names if name in number]
+            found[:, columns] = alone.jacobian(np.zeros(len(columns)))
+        return found
+
+    @cached_property
+    def groups(self) -> np.ndarray:
+        """Number of the configuration that every equation belongs to, (m,).
+
+        >>> import rpim_opt as ro
+        >>> ro.load("position").problem.groups.reshape(-1, 3)[:2]  # three equations a position
+        array([[19, 19, 19],
+               [ 0,  0,  0]])
+        """
+        rows = [np.repeat(block.row, len(block.measurement.components)) for block in self.data.blocks]
+        return np.asarray(self.data.configuration[np.concatenate(rows)])
+
     @cached_property
     def _whitening(self) -> list[Array]:
-        """L^-1 with covariance = L L', for every block."""
+        """L^-1 with a row's covariance = L L', for every block."""
         if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
             raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
-        try:
-            factors = [np.linalg.cholesky(block.covariance) for block in self.data.blocks]
-            return [np.asarray(np.linalg.inv(L), dtype=float) for L in factors]
-        except np.linalg.LinAlgError:
-            raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
+        factors = [_cholesky(covariance) for covariance in self.covariances()]
+        return [np.asarray(np.linalg.inv(L), dtype=float) for L in factors]
+
+    def covariances(self, reading: bool = True) -> list[Array]:
+        """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].
+
+        Parameters
+        ----------
+        reading
+            Of a reading; otherwise without the instrument's part: the robot's own scatter.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> [V.shape for V in ro.load("paper_arm").problem.covariances()]
+        [(1, 3, 3)]
+        """
+        scatter = self.scatter
+        if scatter is None:
+            return [block.covariance * reading for block in self.data.blocks]
+        slopes = None
+        if scatter.joint > 0:
+            slopes = self.joint_slopes(scatter.at)
+        # each row as a configuration of its own
+        alone = replace(self.data, configuration=np.arange(len(self.data)))
+        found: dict[int, Array] = {}
+        for stack in stacked(alone, slopes):
+            found |= dict(zip(stack.index[:, 0].tolist(), stack.covariance(scatter, reading), strict=True))
+        return self._by_block(found)
+
+    def _by_block(self, found: Mapping[int, Array]) -> list[Array]:
+        """Return what stands under the number of every row's first equation, block by block."""
+        blocks = []
+        begin = 0
+        for block in self.data.blocks:
+            k = len(block.measurement.components)
+            numbers = begin + k * np.arange(len(block.row))
+            blocks.append(np.array([found[i] for i in numbers.tolist()]))
+            begin += k * len(block.row)
+        return blocks
 
     def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
         function = self._functions(block)[what]
@@ -363,12 +529,19 @@ class CalibrationProblem:
         absent = (p.nominal == 0) & ~p.identified
         structure = Structure(
             self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
-            block.markers, block.fixture, block.torque is not None,
+            block.markers, block.fixture, self._loads(block),
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 
+    @cached_property
+    def _needs(self) -> Needs:
+        return Needs.of(self.parameters)
+
+    def _loads(self, block: Block) -> Loads:
+        return loads_of(self.robot, self._needs, self.data, block)
+
     def _rows(self, block: Block, part: slice) -> Array:
-        """Return joint values of the model, torques, and measured values, side by side."""
+        """Return joint values of the model, what the joints bear, and measured values, side by side."""
         start, stop, _ = part.indices(len(block.row))
         if stop - start == len(block.row):
             if id(block) not in self._kept:
@@ -382,7 +555,12 @@ class CalibrationProblem:
 
     def _stacked(self, block: Block, part: slice) -> Array:
         M, y = self.robot.joint_map, block.y[part]
-        parts = [(block.q[part] @ M.T).reshape(len(y), -1)]
-        if block.torque is not None:  # virtual work: tau_model = M^-T tau
-            parts.append((block.torque[part] @ np.linalg.inv(M)).reshape(len(y), -1))
-        return np.hstack([*parts, y])
+        joints = (block.q[part] @ M.T).reshape(len(y), -1)
+        return np.hstack([joints, *columns(self.robot, block, part), y])
+
+
+def _cholesky(covariance: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(covariance), dtype=float)
+    except np.linalg.LinAlgError:
+        raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None

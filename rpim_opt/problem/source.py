@@ -11,6 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
@@ -84,6 +85,15 @@ class Source(Protocol):
 
     def with_parameters(self, parameters: Parameters) -> Source:
         """Return the same problem with another table of parameters."""
+        ...
+
+    @property
+    def scatter(self) -> Scatter | None:
+        """The robot's own noise; None for the instrument's alone."""
+        ...
+
+    def scattered(self, scatter: Scatter | None) -> Source:
+        """Return the same problem with other noise of the robot's own, or none."""
         ...
 
     def identifying(self, identified: np.ndarray) -> Source:

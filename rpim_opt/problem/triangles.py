@@ -10,7 +10,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import whole_configurations
 from rpim_opt.problem.linear import LinearModel, Reweigh, from_triangle, reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 
@@ -58,18 +58,6 @@ def joined(models: Sequence[LinearModel]) -> LinearModel:
         R = [reduced_rows(pair[-1], pair[0]) if len(pair) == 2 else pair[0] for pair in pairs]
     equations = sum(model.equations for model in models)
     return from_triangle(models[0], R[0], equations, sum(model.offset for model in models))
-
-
-def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:
-    """Return the rows in groups of whole configurations, at least one each, and ``most`` rows unless one has more."""
-    order = np.argsort(data.configuration, kind="stable")
-    ends = np.concatenate([[0], np.flatnonzero(np.diff(data.configuration[order])) + 1, [len(order)]])
-    cuts = [0]
-    while cuts[-1] < len(order):
-        last_fitting = ends[np.searchsorted(ends, cuts[-1] + most, side="right") - 1]
-        next_one = ends[np.searchsorted(ends, cuts[-1], side="right")]
-        cuts.append(max(last_fitting, next_one))
-    return np.split(order, cuts[1:-1])
 
 
 def _rotated(models: Iterable[LinearModel]) -> LinearModel:
