@@ -14,6 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display
+from rpim_opt.convex.structure import Quadratic
 from rpim_opt.robot.parameters import Parameters
 
 __all__ = [
@@ -47,6 +48,11 @@ class Ready:
         for value in astuple(self):  # type: ignore[call-overload]
             arguments += list(value) if isinstance(value, tuple) else [value]
         return [self.maker, *arguments]
+
+    @property
+    def quadratic(self) -> Quadratic | None:
+        """The quadratic of its argument that a penalty declares to be, where it knows that exactly."""
+        return None
 
 
 def spoken(deviation: float, dimension: str) -> str:

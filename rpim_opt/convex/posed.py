@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
-from rpim_opt.convex.constraints import Box
+from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
@@ -154,6 +154,8 @@ class Posed:
     def _form(self, function: Any, term: Term) -> Quadratic | None:
         if function is cp.sum_squares:  # declared; a test holds it against the canonicalization
             return identity(term.variable.size)
+        if isinstance(function, Ready) and function.quadratic is not None:  # so does one against this
+            return function.quadratic
         return quadratic(term.expression, term.variable)
 
     @cached_property
@@ -197,7 +199,17 @@ class Posed:
             z = np.array([float(np.linalg.norm(D @ z)) for D in self._differences])
         if self.formulation.penalty is cp.sum_squares:
             return float(z @ z)
+        if self._declared is not None:
+            return self._declared.value(z)
         return self._penalty_term(z)
+
+    @cached_property
+    def _declared(self) -> Quadratic | None:
+        """The quadratic of z that a penalty of the package's own declares to be."""
+        penalty = self.formulation.penalty
+        if isinstance(penalty, Ready) and not self._differences:
+            return penalty.quadratic
+        return None
 
     def seen(self, r: Array) -> Array:
         """Return what the loss gets of a residual: itself, or the norms of the configurations."""
@@ -240,6 +252,8 @@ class Posed:
             return None
         if self.formulation.penalty is cp.sum_squares and not self._differences:
             return 2 * z
+        if self._declared is not None:
+            return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
         return self._penalty_of_z.slope(z)
 
     @cached_property

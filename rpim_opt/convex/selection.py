@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,10 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel
+
+SMALLEST = 1e-100
+LARGEST = 1e100
+"""Weights that are not zero: far beyond those of any problem, and far within the range of doubles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +36,8 @@ class Selection:
         Whether the choice lies inside the weights that were tried. If not, ``note`` says what that means.
     note
         One sentence for the report.
+    groups
+        The weights of groups of parameters, where each has its own: they are in the scales then, and ``weight`` is 1.
 
     Examples
     --------
@@ -55,6 +61,7 @@ class Selection:
     score: Array
     interior: bool
     note: str = ""
+    groups: Mapping[str, float] = field(default_factory=dict)
 
 
 Selector = Callable[[Program], Selection]
@@ -83,6 +90,14 @@ def with_rows(program: Program, name: str) -> LinearModel:
         found = f"{program.model.equations} equations of which only the triangle is kept"
         raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
     return program.model
+
+
+def require_weight(weight: float, where: str, file: object = None) -> float:
+    """Return a weight whose square and inverse are numbers, too; or refuse it."""
+    if not (np.isfinite(weight) and (weight == 0 or SMALLEST <= weight <= LARGEST)):
+        accepted = f"a finite number, zero or more ({SMALLEST:g} to {LARGEST:g})"
+        raise InputError(where, f"'{weight}'", accepted, file)
+    return float(weight)
 
 
 def weight_grid(program: Program, count: int = 200) -> Array:

@@ -1,0 +1,252 @@
+"""A linear Gaussian statement about parameters: of their deviations, of their values, or an earlier posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.units import UNITS, display, split_unit
+from rpim_opt.convex.combination import combination
+from rpim_opt.robot.parameters import Parameters
+
+FAR = 100.0
+"""Expected sizes by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """Rows (v - reference) ~ N(values, I), where v are values of parameters, or their deviations.
+
+    Parameters
+    ----------
+    names, dimensions
+        (p) parameters that it speaks of, and what they are.
+    rows
+        (k, p) whitened [1 / SI].
+    values
+        (k,) whitened.
+    reference
+        (p,) [SI] from which the parameters' values count; None: from nominal, whatever that is.
+    whole
+        Whether it is all that is believed of these parameters: it stands in the place of their own scales, and says
+        what it says of some of them where others are not identified. Otherwise those that are not identified are
+        nominal.
+    text
+        As a person wrote it.
+    """
+
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    rows: tuple[tuple[float, ...], ...]
+    values: tuple[float, ...]
+    reference: tuple[float, ...] | None = None
+    whole: bool = False
+    text: str = ""
+
+    @property
+    def where(self) -> str:
+        """What an error calls it."""
+        return f"prior '{self.text}'"
+
+    def on(self, parameters: Parameters) -> tuple[Array, Array, np.ndarray]:
+        """Return rows (k, n) and values (k,) in units of the scales of the n identified parameters, and whom it serves.
+
+        Parameters
+        ----------
+        parameters
+            The whole table of a problem.
+
+        Raises
+        ------
+        InputError
+            For a name that the table has not, another dimension, a value far from nominal.
+        """
+        here = self._here(parameters)
+        known = [name for name in self.names if name in here]
+        place = np.array([here[name] for name in known], dtype=int)
+        own = np.array([self.names.index(name) for name in known], dtype=int)
+        offset = self._offset(parameters, place, own)
+        free = parameters.identified[place]
+        rows = np.array(self.rows, dtype=float).reshape(len(self.values), len(self.names))
+        values = np.array(self.values, dtype=float)
+        if self.whole:
+            rows, values = marginal(rows, values, own[free])
+        else:
+            values = values - rows[:, own] @ offset
+            rows = rows[:, own[free]]
+        return self._placed(parameters, rows, values, place[free], offset[free])
+
+    def _placed(
+        self, parameters: Parameters, rows: Array, values: Array, place: np.ndarray, offset: Array
+    ) -> tuple[Array, Array, np.ndarray]:
+        """Return rows of the places of a table as rows of the identified ones, in units of their scales."""
+        if self.whole:
+            values = values - rows @ offset
+        column = np.cumsum(parameters.identified) - 1
+        n = len(parameters.free)
+        full = np.zeros((len(rows), n))
+        full[:, column[place]] = rows * parameters.scale[place]
+        served = np.zeros(n, dtype=bool)
+        served[column[place]] = True
+        says = full.any(axis=1)
+        return full[says], values[says], served & self.whole
+
+    def _here(self, parameters: Parameters) -> dict[str, int]:
+        """Return the places of a table, names and dimensions checked."""
+        here = {name: i for i, name in enumerate(parameters.names)}
+        missing = [name for name in self.names if name not in here]
+        if missing and (not self.whole or len(missing) == len(self.names)):
+            raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
+        have = [parameters.dimensions[here[name]] for name in self.names if name in here]
+        said = [d for name, d in zip(self.names, self.dimensions, strict=True) if name in here]
+        for name, dimension, other in zip([n for n in self.names if n in here], have, said, strict=True):
+            if other not in (dimension, ""):
+                raise InputError(self.where, f"a unit of {other} for '{name}'", f"one of {dimension}")
+        if "" in said and len(set(have)) > 1:
+            raise InputError(self.where, f"a sum of {' and '.join(sorted(set(have)))}", "parameters of one dimension")
+        return here
+
+    def _offset(self, parameters: Parameters, place: np.ndarray, own: np.ndarray) -> Array:
+        """Return by how much nominal values (p,) [SI] differ from the reference; zero where that is nominal."""
+        if self.reference is None:
+            return np.zeros(len(place))
+        offset = parameters.nominal[place] - np.array(self.reference)[own]
+        if self.whole:
+            self._turned(parameters.take(place), offset)
+            return offset
+        rows = np.array(self.rows)[:, own]
+        far = np.array(self.values) - rows @ offset
+        room = FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))
+        if (np.abs(far) > room).any():
+            size = float(np.max(np.abs(far) / np.linalg.norm(rows, axis=1)))
+            unit, si = display(parameters.dimensions[place[0]])
+            found = f"a value {size / si:.4g} {unit} off nominal"
+            raise InputError(self.where, found, "one near it; '= nominal +- ...' where the drawing's value is meant")
+        return offset
+
+    def _turned(self, parameters: Parameters, offset: Array) -> None:
+        """Refuse angles of frames that count from another orientation: they do not add up."""
+        for name, frame, angle, off in zip(
+            parameters.names, parameters.of_frames, parameters.periodic, offset, strict=True
+        ):
+            if frame and angle and off != 0:
+                found = f"'{name}' that counts from another orientation"
+                raise InputError(self.where, found, "the same start of the frame; or leave out what was set up anew")
+
+
+def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
+    """Return rows (k', p') and values (k',) of what a statement says of some parameters, whatever the others are.
+
+    With the others first in a triangle, what is below their rows does not know them.
+    """
+    if len(kept) == rows.shape[1] and (kept == np.arange(len(kept))).all():
+        return rows, values
+    others = np.setdiff1d(np.arange(rows.shape[1]), kept)
+    norms = np.linalg.norm(rows, axis=0)
+    Q, R = np.linalg.qr(rows[:, others] / np.where(norms[others] > 0, norms[others], 1.0))
+    U, s, _ = np.linalg.svd(R)
+    seen = Q @ U[:, s > 1e-10 * np.max(s, initial=0.0)]
+    left = rows[:, kept] - seen @ (seen.T @ rows[:, kept])
+    right = values - seen @ (seen.T @ values)
+    return left, right
+
+
+def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
+    """Return the statement that a combination of parameters has a value; arguments as for `Prior.known`."""
+    said = combination(text)
+    if said.sd is not None:
+        if value is not None or sd is not None:
+            raise InputError(f"prior '{text}'", "a value or sd besides", "the text alone, or value and sd [SI]")
+        value, sd = said.value, said.sd
+    if sd is None or not (np.isfinite(sd) and sd > 0):
+        raise InputError(f"prior '{text}'", f"sd {sd}", "a standard deviation above zero: '+- 0.05 mm', or sd [SI]")
+    if value is not None and not np.isfinite(value):
+        raise InputError(f"prior '{text}'", f"value {value}", "a finite number [SI]")
+    row = tuple(factor / sd for factor in said.factors)
+    dimensions = (said.dimension,) * len(row)
+    if value is None:
+        return Statement(said.names, dimensions, (row,), (said.deviation / sd,), text=text.strip())
+    return Statement(said.names, dimensions, (row,), (value / sd,), (0.0,) * len(row), text=text.strip())
+
+
+def gaussian(mean: dict[str, float], covariance: Any, precision: Any, sd: Any) -> Statement:
+    """Return the statement that deviations have a mean and a covariance; arguments as for `Prior.gaussian`."""
+    given = [each is not None for each in (covariance, precision, sd)]
+    if sum(given) != 1:
+        raise InputError("Prior.gaussian", f"{sum(given)} of covariance, precision and sd", "one of them")
+    keys = [_key(key) for key in mean]
+    if not keys:
+        raise InputError("Prior.gaussian", "no parameter", "mean={'a2_mm': 0.0, ...}")
+    centre = np.array([float(value) for value in mean.values()])
+    if not np.isfinite(centre).all():
+        raise InputError("Prior.gaussian", "a mean that is not finite", "finite numbers")
+    if sd is not None:
+        covariance = np.diag(_vector(sd, len(keys)) ** 2)
+    if precision is None:
+        rows = _whitened(_square(covariance, len(keys), "covariance"))
+    else:
+        rows = _root(_square(precision, len(keys), "precision"))
+    values = rows @ centre
+    rows = rows / np.array([UNITS[unit].si for _, unit in keys])
+    names = tuple(name for name, _ in keys)
+    dimensions = tuple(UNITS[unit].dimension for _, unit in keys)
+    return Statement(names, dimensions, listed(rows), tuple(values.tolist()), None, True, "mean and covariance")
+
+
+def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix (k, p) as tuples, which are equal where their content is."""
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _key(key: str) -> tuple[str, str]:
+    name, unit = split_unit(key)
+    if unit is None:
+        raise InputError(f"Prior.gaussian, key {key}", "no unit", f"{key}_mm, {key}_mrad, ...")
+    return name, key.removeprefix(name + "_")
+
+
+def _vector(sd: float | Sequence[float], count: int) -> Array:
+    values = np.asarray(sd, dtype=float)
+    if values.ndim > 1 or values.size not in (1, count):
+        raise InputError("Prior.gaussian", f"sd of shape {values.shape}", f"a number, or {count} numbers")
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        raise InputError("Prior.gaussian", "an sd that is not above zero", "finite numbers above zero")
+    return np.broadcast_to(values.ravel(), (count,))
+
+
+def _square(matrix: Any, count: int, what: str) -> Array:
+    found = np.asarray(matrix, dtype=float)
+    if found.shape != (count, count):
+        raise InputError("Prior.gaussian", f"{what} of shape {found.shape}", f"({count}, {count})")
+    if not np.isfinite(found).all() or not np.allclose(found, found.T, rtol=1e-9, atol=0):
+        raise InputError("Prior.gaussian", f"a {what} that is not finite and symmetric", "one that is")
+    return found
+
+
+def _whitened(covariance: Array) -> Array:
+    """Return W (p, p) with W C W' = I."""
+    size = np.sqrt(np.maximum(np.diag(covariance), 0))
+    try:
+        if not (size > 0).all():
+            raise np.linalg.LinAlgError
+        factor = np.linalg.cholesky(covariance / np.outer(size, size))
+    except np.linalg.LinAlgError:
+        accepted = "one that is; [constraints] for what is known exactly, precision for what is not known at all"
+        raise InputError("Prior.gaussian", "a covariance that is not positive definite", accepted) from None
+    return np.linalg.inv(factor) / size
+
+
+def _root(precision: Array) -> Array:
+    """Return W (k, p) with W'W = P; k is less than p where nothing is known of some direction."""
+    size = np.sqrt(np.maximum(np.diag(precision), 0))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(precision / np.outer(unit, unit))
+    if np.min(values) < -1e-10 * max(np.max(values), 1e-300):
+        raise InputError("Prior.gaussian", "a precision with negative eigenvalues", "one that is positive semidefinite")
+    kept = values > 1e-13 * np.max(values, initial=0.0)
+    return (vectors[:, kept] * np.sqrt(values[kept])).T * unit

@@ -1,0 +1,199 @@
+"""What arms of one type share is learned, shrunken where they say little, and doubted by an arm that differs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+import rpim_opt as ro
+from rpim_opt.convex import Fleet, Prior
+from rpim_opt.convex.shared import EVEN, SIZES, Arm, _expected, learned
+
+n = 12
+
+
+def arms(count: int, common: np.ndarray, own: np.ndarray, sd: float, seed: int = 0) -> tuple[list[Arm], np.ndarray]:
+    """Arms that are seen through dense matrices with noise, and their deviations (count, n)."""
+    rng = np.random.default_rng(seed)
+    truth = common + own * rng.standard_normal((count, n))
+    made = []
+    for k, u in enumerate(truth):
+        rows = np.linalg.qr(rng.standard_normal((n, n)))[0] / sd
+        made.append(Arm(f"{k}", rows, rows @ u + rng.standard_normal(n)))
+    return made, truth
+
+
+def test_expectations_are_those_of_the_joint_normal_distribution() -> None:
+    K, few = 3, 4
+    rng = np.random.default_rng(1)
+    rows = rng.standard_normal((K, 6, few))
+    values = rng.standard_normal((K, 6))
+    s2, ratio = np.array([0.2, 1.0, 3.0, 0.5]), 0.7
+    P = np.einsum("kij,kil->kjl", rows, rows)
+    q = np.einsum("kij,ki->kj", rows, values)
+    m, C_m, d2 = _expected(P, q, s2, ratio)
+    # unknowns (m, d_1, ..., d_K), all at once
+    size = few * (K + 1)
+    precision = np.diag(np.concatenate([1 / (ratio * s2), *[1 / s2] * K]))
+    right = np.zeros(size)
+    for k in range(K):
+        see = np.zeros((6, size))
+        see[:, :few] = rows[k]
+        see[:, few * (k + 1) : few * (k + 2)] = rows[k]
+        precision += see.T @ see
+        right += see.T @ values[k]
+    C = np.linalg.inv(precision)
+    mean = C @ right
+    assert m == pytest.approx(mean[:few], rel=1e-9)
+    assert C_m == pytest.approx(C[:few, :few], rel=1e-9)
+    assert d2.ravel() == pytest.approx(mean[few:] ** 2 + np.diag(C)[few:], rel=1e-9)
+
+
+def test_many_arms_that_are_seen_well_tell_everything() -> None:
+    rng = np.random.default_rng(2)
+    own = np.geomspace(0.1, 3.0, n)
+    common = 2 * own * rng.standard_normal(n)
+    made, truth = arms(400, common, own, sd=0.01)
+    found = learned(made)
+    error = own / np.sqrt(400)
+    assert np.abs(found.centre - common).max() < 4 * error.max()
+    assert found.width == pytest.approx(truth.std(axis=0), rel=0.03)
+    ratio = np.mean((common / own) ** 2)
+    assert found.share == pytest.approx(ratio / (1 + ratio), abs=0.05)
+
+
+def test_arms_that_say_nothing_leave_the_generic_widths() -> None:
+    made = [Arm(f"{k}", 1e-6 * np.eye(n), np.zeros(n)) for k in range(3)]
+    found = learned(made)
+    assert found.centre == pytest.approx(np.zeros(n), abs=1e-9)
+    assert found.width == pytest.approx(np.ones(n), rel=1e-3)
+    assert found.share == pytest.approx(EVEN / (1 + EVEN), abs=1e-3)
+
+
+def test_few_arms_are_shrunken_towards_the_spread_that_all_have() -> None:
+    common, own = np.zeros(n), np.where(np.arange(n) == 0, 5.0, 0.5)
+    ratio = []
+    for count in (2, 5, 40):
+        made, truth = arms(count, common, own, sd=0.01, seed=3)
+        width = learned(made).width
+        sample = truth.std(axis=0)
+        ratio.append(np.ptp(np.log(width)) / np.ptp(np.log(sample)))
+    assert ratio[0] < ratio[1] < ratio[2]
+    assert ratio[0] < 0.6
+    assert ratio[2] > 0.8
+
+
+def test_the_evidence_is_the_density_of_the_data() -> None:
+    rng = np.random.default_rng(4)
+    arm = Arm("", rng.standard_normal((n, n)), 3 * rng.standard_normal(n))
+    centre, width = rng.standard_normal(n), np.geomspace(0.1, 2.0, n)
+    wanted = min(
+        -2
+        * multivariate_normal(arm.rows @ centre, t**2 * (arm.rows * width**2) @ arm.rows.T + np.eye(n)).logpdf(
+            arm.values
+        )
+        for t in SIZES
+    )
+    assert arm.evidence(centre, width) + n * np.log(2 * np.pi) == pytest.approx(wanted, rel=1e-9)
+
+
+def few_data(x: np.ndarray, sd: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((6, n)) / sd
+    return rows, rows @ x + rng.standard_normal(6)
+
+
+def estimate(rows: np.ndarray, values: np.ndarray, centre: np.ndarray, width: np.ndarray) -> np.ndarray:
+    left = np.linalg.inv(rows.T @ rows + np.diag(width**-2))
+    return left @ (rows.T @ values + centre / width**2)
+
+
+def test_another_arm_gains_by_what_the_others_share() -> None:
+    rng = np.random.default_rng(5)
+    better = []
+    for seed in range(30):
+        common = 0.9 * rng.standard_normal(n)
+        made, _ = arms(6, common, np.full(n, 0.4), sd=0.05, seed=seed)
+        found = learned(made[:5])
+        x = common + 0.4 * rng.standard_normal(n)
+        rows, values = few_data(x, 0.05, seed)
+        errors = [
+            np.linalg.norm(estimate(rows, values, *prior) - x)
+            for prior in ((found.centre, found.width), (np.zeros(n), np.ones(n)))
+        ]
+        better.append(errors[1] / errors[0])
+    assert np.exp(np.mean(np.log(better))) > 1.5
+
+
+def test_an_arm_that_differs_is_seen() -> None:
+    common = np.random.default_rng(6).standard_normal(n)
+    made, _ = arms(6, common, np.full(n, 0.1), sd=0.05)
+    odd, _ = arms(1, -common, np.full(n, 0.1), sd=0.05, seed=7)
+    everyone = Fleet(
+        tuple(f"a{i}" for i in range(n)),
+        ("length",) * n,
+        np.zeros(n),
+        np.ones(n),
+        (*made, Arm("odd", odd[0].rows, odd[0].values)),
+    )
+    assert np.argmin(everyone.gain) == 6
+    assert everyone.gain[6] < 0
+    assert "odd: unlike the others" in str(everyone)
+    alike = Fleet(everyone.names, everyone.dimensions, np.zeros(n), np.ones(n), tuple(made))
+    assert (alike.gain > 0).all()
+
+
+# --- from calibrations ----------------------------------------------------------------------------------------------
+
+
+def test_the_prior_of_a_fleet_centres_on_what_calibrations_share() -> None:
+    problem = ro.load("position").problem
+    rows = np.arange(len(problem.data))
+    results = {f"arm {k}": ro.calibrate(problem.on(problem.data.take(rows[k::3])), ro.tikhonov, 1.0) for k in range(3)}
+    found = Fleet.of(results)
+    prior = Prior.from_fleet(results)
+    stated = prior.stated(problem.parameters)
+    free = problem.parameters.free
+    robot = ~free.of_frames
+    assert (stated.centre * free.scale)[robot] == pytest.approx(found.centre, rel=1e-9)
+    assert (stated.scale * free.scale)[robot] == pytest.approx(found.width, rel=1e-9)
+    assert (stated.scale[~robot] == 10).all()
+    full = ro.calibrate(problem, ro.tikhonov, 1.0)
+    known = np.sqrt(np.diag(full.covariance))[robot] < 0.1 * found.generic
+    assert known.sum() > 8
+    assert np.abs(found.centre - full.x[robot])[known] / found.generic[known] == pytest.approx(0, abs=0.25)
+    assert list(found.gain.shape) == [3]
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_arm_is_no_fleet(count: int) -> None:
+    result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
+    with pytest.raises(ro.InputError, match="two arms"):
+        Prior.from_fleet([result] * count)
+
+
+def test_arms_of_another_type_are_refused() -> None:
+    results = [ro.calibrate(ro.load(name).problem, ro.tikhonov, 1.0) for name in ("position", "paper_arm")]
+    with pytest.raises(ro.InputError, match="arms of one type"):
+        Prior.from_fleet(results)
+
+
+def test_an_arm_that_the_fleet_has_not_is_believed_or_doubted() -> None:
+    problem = ro.load("position").problem
+    free = problem.parameters.free
+    rng = np.random.default_rng(9)
+    common = np.where(free.of_frames, 0.0, 2.0 * rng.standard_normal(len(free)))
+
+    def calibrated(seed: int, sign: float) -> ro.calibration.Calibration:
+        own = np.random.default_rng(seed)
+        x = free.scale * (sign * common + 0.1 * own.standard_normal(len(free)))
+        q = own.uniform(-1.2, 1.2, (12, 6))
+        exact = problem.on(ro.Dataset.of(q, np.zeros((12, 3)), 5e-5)).modelled(x)[0]
+        return ro.calibrate(
+            problem.on(ro.Dataset.of(q, exact + 5e-5 * own.standard_normal((12, 3)), 5e-5)), ro.tikhonov, ro.reml
+        )
+
+    found = Fleet.of([calibrated(seed, 1.0) for seed in range(4)])
+    assert found.gain_of(calibrated(10, 1.0)) > 10
+    assert found.gain_of(calibrated(11, -1.0)) < -10

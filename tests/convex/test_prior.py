@@ -1,0 +1,279 @@
+"""A prior says in numbers what it says in words, and its penalty is the density of that."""
+
+from __future__ import annotations
+
+import pickle
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex import Prior
+from rpim_opt.convex.combination import combination
+from rpim_opt.convex.structure import quadratic
+
+PROBLEM = ro.load("position").problem
+FREE = PROBLEM.parameters.free
+n = len(FREE)
+
+
+def at(*names: str) -> list[int]:
+    return [FREE.names.index(name) for name in names]
+
+
+def some_prior() -> Prior:
+    prior = Prior(centre={"d5_mm": 0.3}, scale={"theta?_mrad": 4.0})
+    prior &= Prior.known("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
+    return prior & Prior.gaussian({"d4_mm": 0.4, "alpha4_mrad": 0.1}, [[0.04, 0.01], [0.01, 0.02]])
+
+
+def density(prior: Prior, x: np.ndarray) -> float:
+    """-2 ln of the density that `some_prior` states, up to a constant, written out by hand."""
+    scale = np.where(FREE.of_frames, 10.0, 1.0) * FREE.scale
+    offsets = [i for i, name in enumerate(FREE.names) if name.startswith("theta")]
+    scale[offsets] = 4e-3
+    centre = np.zeros(n)
+    centre[at("d5")] = 3e-4
+    own = ((x - centre) / scale) ** 2
+    own[at("d4", "alpha4")] = 0.0
+    a2, a3 = x[at("a2", "a3")]
+    apart = 1e3 * x[at("d4", "alpha4")] - [0.4, 0.1]
+    statement = ((a2 - 0.5 * a3 - 2e-4) / 5e-5) ** 2
+    return float(own.sum() + statement + apart @ np.linalg.solve([[0.04, 0.01], [0.01, 0.02]], apart))
+
+
+def test_a_penalty_is_the_density_that_the_prior_states() -> None:
+    prior = some_prior()
+    mine = prior.penalized(ro.tikhonov, prior.stated(PROBLEM.parameters))
+    program = ro.convex.pose(mine, PROBLEM.linearize(np.zeros(n)))
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        z = 3 * rng.standard_normal(n)
+        wanted = density(prior, z * FREE.scale)
+        assert program.value(z)[1] == pytest.approx(wanted, rel=1e-12)
+        assert program.penalty_form.value(z) == pytest.approx(wanted, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "formulation", [ro.tikhonov, ro.Formulation("by link", penalty=cp.sum_squares, penalty_over=ro.constraints.by_link)]
+)
+def test_the_declared_quadratic_is_what_the_canonicalization_finds(formulation: ro.Formulation) -> None:
+    prior = some_prior()
+    penalty = prior.penalized(formulation, prior.stated(PROBLEM.parameters)).penalty
+    z = cp.Variable(n)
+    found = quadratic(penalty(z), z)
+    declared = penalty.quadratic
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        v = rng.standard_normal(n)
+        assert declared.value(v) == pytest.approx(found.value(v), rel=1e-8)
+    program = ro.convex.pose(
+        prior.penalized(formulation, prior.stated(PROBLEM.parameters)), PROBLEM.linearize(np.zeros(n))
+    )
+    at_v = ro.convex.pose(ro.Formulation("asked", penalty=lambda y: penalty(y)), PROBLEM.linearize(np.zeros(n)))
+    assert program.value(v) == pytest.approx(at_v.value(v), rel=1e-10)
+    assert program.gradient(v, 0.7) == pytest.approx(at_v.gradient(v, 0.7), rel=1e-8, abs=1e-8)
+
+
+def test_nothing_stated_is_the_formulation_itself() -> None:
+    prior = Prior(joint_offset=1.0, frames=1.0)
+    stated = prior.stated(PROBLEM.parameters)
+    assert stated.plain
+    assert prior.penalized(ro.lasso, stated) is ro.lasso
+    default = Prior().stated(PROBLEM.parameters)
+    assert Prior().penalized(ro.least_squares, default) is ro.least_squares
+
+
+def test_learned_widths_in_the_place_of_the_scales_say_the_same() -> None:
+    stated = some_prior().stated(PROBLEM.parameters)
+    size = np.geomspace(0.1, 10.0, n) * stated.scale
+    inside = stated.inside(size)
+    x = np.random.default_rng(3).standard_normal(n) * FREE.scale
+    z, other = x / FREE.scale, x / inside.parameters.scale
+    assert inside.rows @ other == pytest.approx(stated.rows @ z, rel=1e-12)
+    assert inside.centre * inside.parameters.scale == pytest.approx(stated.centre * FREE.scale, rel=1e-12)
+    assert (inside.scale == 1).all()
+
+
+def test_any_penalty_sees_what_is_not_replaced() -> None:
+    prior = some_prior()
+    stated = prior.stated(PROBLEM.parameters)
+    z = np.random.default_rng(4).standard_normal(n)
+    y = np.where(stated.replaced, 0.0, (z - stated.centre) / stated.scale)
+    rest = np.sum((stated.rows @ z - stated.values) ** 2)
+    for formulation, wanted in (
+        (ro.lasso, np.abs(y).sum()),
+        (ro.group_lasso, sum(np.linalg.norm(D @ y) for D in ro.constraints.by_link(FREE))),
+        (ro.Formulation("mine", penalty=lambda v: cp.sum(cp.huber(v))), float(cp.sum(cp.huber(y)).value)),
+    ):
+        mine = prior.penalized(formulation, stated)
+        assert float(mine.penalty(cp.Constant(z)).value) == pytest.approx(wanted + rest, rel=1e-12)
+
+
+def test_equal_content_is_an_equal_formulation_and_travels() -> None:
+    one, other = (p.penalized(ro.tikhonov, p.stated(PROBLEM.parameters)) for p in (some_prior(), some_prior()))
+    assert one == other
+    assert one.ready
+    assert hash(one) == hash(other)
+    assert pickle.loads(pickle.dumps(one)) == one
+    assert (
+        not some_prior()
+        .penalized(ro.Formulation("mine", penalty=lambda z: cp.norm1(z)), some_prior().stated(PROBLEM.parameters))
+        .ready
+    )
+
+
+# --- what is believed where nothing is said -------------------------------------------------------------------------
+
+
+def test_what_is_believed_where_nothing_is_said() -> None:
+    parameters = PROBLEM.parameters.identify(["a?", "theta?", "ecc_*", "ratio?", "base_*"])
+    stated = Prior().stated(parameters)
+    by_name = dict(zip(parameters.free.names, zip(stated.scale, stated.group, stated.heavy, strict=True), strict=True))
+    assert by_name["a2"] == (1.0, 0, True)
+    assert by_name["theta2"] == (3.0, 0, True)
+    assert by_name["base_rx"] == (10.0, -1, False)
+    groups = {stated.names[by_name[name][1]] for name in ("ecc_cos3", "ecc_sin3")}
+    assert groups == {"ecc"}
+    assert not by_name["ecc_cos3"][2]
+    assert stated.names[by_name["ratio1"][1]] == "ratio"
+
+
+def test_groups_have_sizes_of_their_own_and_infinite_tails_are_normal() -> None:
+    stated = Prior(groups=("a? d?", ("alpha?",)), tails=np.inf).stated(PROBLEM.parameters)
+    names = [stated.names[k] if k >= 0 else "" for k in stated.group]
+    assert {name for name, p in zip(names, FREE.names, strict=True) if p[0] in "ad" and p[1].isdigit()} == {"a? d?"}
+    assert names[at("alpha2")[0]] == "alpha?"
+    assert names[at("theta2")[0]] == "geometry"
+    assert not stated.heavy.any()
+
+
+def test_a_stated_width_is_taken_at_its_word() -> None:
+    stated = Prior(scale={"joint_offset_mrad": 8.0, "base_mm": 2.0, "theta2_mrad": 1.0}).stated(PROBLEM.parameters)
+    wanted = np.array([8e-3, 1e-3, 2e-3])
+    assert (stated.scale * FREE.scale)[at("theta1", "theta2", "base_x")] == pytest.approx(wanted, rel=1e-12)
+
+
+# --- statements -----------------------------------------------------------------------------------------------------
+
+
+def test_values_of_parameters_count_from_nominal() -> None:
+    nominal = FREE.nominal[at("a2", "a3")].sum()
+    text = f"a2 + a3 = {1e3 * nominal + 0.3:.6f} +- 0.05 mm"
+    by_value = Prior.known(text).stated(PROBLEM.parameters)
+    in_si = Prior.known("a2 + a3", nominal + 3e-4, sd=5e-5).stated(PROBLEM.parameters)
+    by_deviation = Prior.known("a3 + a2 = nominal + 0.3 +- 0.05 mm").stated(PROBLEM.parameters)
+    for each in (by_value, in_si):
+        assert each.values == pytest.approx(by_deviation.values, rel=1e-6)
+        assert (each.rows == by_deviation.rows).all()
+
+
+def test_what_is_not_identified_is_nominal_in_a_combination_and_unknown_in_a_distribution() -> None:
+    parameters = PROBLEM.parameters.identify(["a2", "theta2"])
+    known = Prior.known("a2 + a3 +- 0.1 mm").stated(parameters)
+    assert known.rows == pytest.approx(np.array([[parameters.free.scale[0] / 1e-4, 0.0]]))
+    covariance = np.array([[4.0, 1.9], [1.9, 1.0]])
+    mean = {"a2_mm": 0.5, "a3_mm": -0.2}
+    both = (Prior.gaussian(mean, covariance), Prior.gaussian(mean, precision=np.linalg.inv(covariance)))
+    for prior in both:
+        stated = prior.stated(parameters)
+        sd = 1e-3 / np.linalg.norm(stated.rows[:, 0]) * parameters.free.scale[0] / 1e-3
+        assert sd == pytest.approx(2e-3, rel=1e-9)
+        assert stated.rows[:, 0] @ stated.values / np.sum(stated.rows**2) == pytest.approx(
+            0.5e-3 / parameters.free.scale[0], rel=1e-9
+        )
+        assert stated.replaced.tolist() == [True, False]
+
+
+def test_a_precision_may_leave_directions_open() -> None:
+    stated = Prior.gaussian({"a2_mm": 1.0, "a3_mm": 1.0}, precision=[[4.0, 4.0], [4.0, 4.0]]).stated(PROBLEM.parameters)
+    assert stated.rows.shape == (1, n)
+    open_direction = np.zeros(n)
+    open_direction[at("a2", "a3")] = [1.0, -1.0]
+    assert stated.rows @ open_direction == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_parser_reads_numbers_signs_and_units() -> None:
+    said = combination("- 2*a2 + .5 a3 -1e-1d4=  -12.5mm ± 50 um")
+    assert said.names == ("a2", "a3", "d4")
+    assert said.factors == (-2.0, 0.5, -0.1)
+    assert said.value == pytest.approx(-0.0125)
+    assert said.sd == pytest.approx(5e-5)
+    assert combination("theta2 = nominal - 0.1 +- 0.05 deg").deviation == pytest.approx(np.radians(-0.1))
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("", "''"),
+        ("a2 a3 +- 1 mm", "'a3'"),
+        ("a2 + a2 +- 1 mm", "'a2' twice"),
+        ("a2 * a3 +- 1 mm", "'* a3'"),
+        ("(a2 + a3) +- 1 mm", "'(a2 + a3)'"),
+        ("a2.__class__() +- 1 mm", "'()'"),
+        ("a? +- 1 mm", "'? '"),
+        ("a2 = 3", "no standard deviation"),
+        ("a2 +- 1", "no unit"),
+        ("a2 +- 0 mm", "above zero"),
+        ("a2 +- -1 mm", "above zero"),
+        ("a2 +- 1 lightyears", "unit 'lightyears'"),
+        ("a2 = 3 deg +- 1 mm", "units deg and mm"),
+        ("a2 = b +- 1 mm", "'b'"),
+        ("a2 = nominally +- 1 mm", "'nominally'"),
+        ("a2 +- 1 N m", "'1 N m'"),
+        ("a2", "sd None"),
+    ],
+)
+def test_the_parser_refuses_what_is_no_statement(text: str, names: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        Prior.known(text)
+    assert names.strip("' ") in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("prior", "says"),
+    [
+        (Prior.known("a2 + a33 +- 1 mm"), "'a33'"),
+        (Prior.known("a2 + theta3 +- 1 mm"), "'theta3'"),
+        (Prior.known("a2 + theta3", sd=1e-3), "sum of angle and length"),
+        (Prior.known("a2 + a3 = 0 +- 0.05 mm"), "off nominal"),
+        (Prior.gaussian({"a22_mm": 0.0}, sd=1.0), "'a22'"),
+        (Prior.gaussian({"a2_mrad": 0.0}, sd=1.0), "a unit of angle for 'a2'"),
+        (Prior(scale={"thta?_mrad": 1.0}), "thta"),
+        (Prior(scale={"theta?_mm": 1.0}), "theta?_mm"),
+        (Prior(scale={"theta?_mrad": 0.0}), "greater than zero"),
+        (Prior(groups=("b?",)), "'b?'"),
+    ],
+)
+def test_a_prior_that_does_not_fit_the_robot_is_refused(prior: Prior, says: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        prior.stated(PROBLEM.parameters)
+    assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"covariance": [[1.0, 2.0], [2.0, 1.0]]}, "not positive definite"),
+        ({"covariance": [[1.0, 0.5], [0.0, 1.0]]}, "symmetric"),
+        ({"covariance": [[1.0]]}, "shape (1, 1)"),
+        ({"precision": [[1.0, 2.0], [2.0, 1.0]]}, "negative eigenvalues"),
+        ({"sd": [1.0, 0.0]}, "above zero"),
+        ({"sd": 1.0, "covariance": [[1.0, 0.0], [0.0, 1.0]]}, "2 of covariance"),
+        ({}, "0 of covariance"),
+    ],
+)
+def test_a_distribution_that_is_none_is_refused(arguments: dict[str, object], says: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        Prior.gaussian({"a2_mm": 0.0, "a3_mm": 0.0}, **arguments)
+    assert says in str(error.value)
+
+
+def test_priors_together_say_both_or_contradict() -> None:
+    both = Prior(tails=5.0) & Prior(centre={"d5_mm": 1.0}) & Prior.known("a2 +- 1 mm") & Prior.known("a3 +- 1 mm")
+    assert (both.tails, both.centre, len(both.statements)) == (5.0, {"d5_mm": 1.0}, 2)
+    with pytest.raises(ro.InputError, match=r"tails: found 5\.0 and 4\.0"):
+        _ = both & Prior(tails=4.0)
+    with pytest.raises(ro.InputError, match="'d5_mm' as 1 and 2"):
+        _ = both & Prior(centre={"d5_mm": 2.0})

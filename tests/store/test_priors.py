@@ -1,0 +1,215 @@
+"""What a folder believes before the data, in files: words, numbers, earlier results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex import Prior
+from tests import ROOT
+
+FOLDER = ROOT / "problems" / "position"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of a problem's folder, to write to."""
+    shutil.copytree(FOLDER, tmp_path / "arm")
+    return tmp_path / "arm"
+
+
+def with_prior(folder: Path, text: str, scale: str = "") -> ro.store.Instance:
+    stated = (FOLDER / "problem.toml").read_text(encoding="utf-8")
+    stated = stated.replace("[scale]\n", f"[scale]\n{scale}\n")
+    (folder / "problem.toml").write_text(f"{stated}\n{text}\n", encoding="utf-8")
+    return ro.load(folder)
+
+
+def solved(
+    problem: ro.CalibrationProblem, prior: Prior, formulation: ro.Formulation = ro.tikhonov
+) -> ro.calibration.Calibration:
+    mine = prior.penalized(formulation, prior.stated(problem.parameters))
+    return ro.calibrate(problem, mine, weight=1.0)
+
+
+def a_prior() -> Prior:
+    prior = Prior(
+        centre={"d5_mm": 0.1 + 0.2}, scale={"theta?_mrad": 1 / 3}, tails=np.inf, groups=("a? d?",), frames=7.0
+    )
+    prior &= Prior.known("a2 - 0.3 a3 = nominal + 0.1 +- 0.07 mm")
+    return prior & Prior.gaussian({"d4_mm": 0.1, "alpha4_mrad": 1e-17}, [[0.3, 0.1], [0.1, 0.2]])
+
+
+def test_a_prior_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    prior = a_prior()
+    ro.store.save_prior(prior, tmp_path / "prior.json")
+    assert ro.store.load_prior(tmp_path / "prior.json") == prior
+
+
+def test_the_posterior_of_a_result_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
+    prior = Prior.from_result(result, without=("base_*",))
+    ro.store.save_prior(prior, tmp_path / "prior.json")
+    assert ro.store.load_prior(tmp_path / "prior.json") == prior
+    assert Prior.from_result(result, without=("base_*",)) == prior
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"format": "rpim-opt result"}, "no prior of rpim-opt"),
+        ({"version": 2}, "key version"),
+        ({"tails": -1.0}, "prior, key tails"),
+        ({"frames": "wide"}, "key frames"),
+        ({"statements": [{"names": ["a2"]}]}, "key statements 1"),
+    ],
+)
+def test_a_file_that_is_no_prior_is_refused(tmp_path: Path, change: dict[str, object], says: str) -> None:
+    path = tmp_path / "prior.json"
+    ro.store.save_prior(a_prior(), path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(ro.InputError) as error:
+        ro.store.load_prior(path)
+    assert str(path) in str(error.value)
+    assert says in str(error.value)
+
+
+def test_statements_of_other_lengths_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "prior.json"
+    ro.store.save_prior(a_prior(), path)
+    content = json.loads(path.read_text())
+    content["statements"][0]["rows"][0].append(1.0)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ro.InputError, match="key statements 1"):
+        ro.store.load_prior(path)
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+PENALTIES = [
+    ro.tikhonov,
+    ro.bounded,
+    ro.lasso,
+    ro.group_lasso,
+    ro.robust,
+    ro.Formulation("by kind", penalty=cp.sum_squares, penalty_over=ro.constraints.by_kind),
+]
+
+
+@pytest.mark.parametrize("formulation", PENALTIES, ids=lambda f: f.name)
+def test_a_result_with_a_prior_is_loaded_and_solved_again(tmp_path: Path, formulation: ro.Formulation) -> None:
+    problem = ro.load("position").problem
+    problem = problem.with_parameters(problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 1.0}))
+    result = solved(problem, a_prior(), formulation)
+    assert result.converged, result.message
+    ro.store.save_result(result, tmp_path)
+    again = ro.load_result(tmp_path)
+    assert again.formulation == result.formulation
+    assert np.array_equal(again.x, result.x)
+    assert str(again) == str(result)
+    anew = again.asked(again.problem)
+    assert anew.x == pytest.approx(result.x, abs=1e-6 * np.abs(result.x).max())
+
+
+def test_a_script_s_penalty_with_a_prior_keeps_its_covariance(tmp_path: Path) -> None:
+    formulation = ro.Formulation("mine", penalty=lambda z: cp.sum_squares(2 * z))
+    result = solved(ro.load("position").problem, a_prior(), formulation)
+    ro.store.save_result(result, tmp_path)
+    again = ro.load_result(tmp_path)
+    assert not again.formulation.solvable
+    assert again.covariance == pytest.approx(result.covariance, rel=1e-9)
+
+
+# --- problem files --------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_that_says_nothing_believes_the_usual() -> None:
+    assert ro.load("position").prior == Prior()
+
+
+def test_a_folder_states_a_prior_in_words(folder: Path) -> None:
+    text = """[prior]
+known = ["a2 + a3 = nominal +- 0.05 mm", "d5 +- 0.1 mm"]
+tails = inf
+groups = ["a? d?", "alpha?"]
+frames = 5
+[prior.centre]
+theta5_mrad = 4.0
+[prior.scale]
+"tool_?_mm" = 2
+"""
+    wanted = Prior(
+        centre={"theta5_mrad": 4.0}, scale={"tool_?_mm": 2}, tails=np.inf, groups=("a? d?", "alpha?"), frames=5.0
+    )
+    for statement in ("a2 + a3 = nominal +- 0.05 mm", "d5 +- 0.1 mm"):
+        wanted &= Prior.known(statement)
+    assert with_prior(folder, text).prior == wanted
+
+
+@pytest.mark.parametrize(
+    ("scale", "first"), [("", 3.0), ("joint_offset_mrad = 10.0", 1.0), ('"theta?_mrad" = 5.0', 1.0)]
+)
+def test_joint_offsets_are_three_times_the_angle_scale_unless_said(folder: Path, scale: str, first: float) -> None:
+    instance = with_prior(folder, "", scale)
+    parameters = instance.problem.parameters
+    stated = instance.prior.stated(parameters)
+    theta1 = parameters.free.names.index("theta1")
+    assert stated.scale[theta1] == pytest.approx(first, rel=1e-12)
+    assert instance.prior.stated(parameters, widened=False).plain
+    if scale:
+        assert parameters.free.scale[theta1] == pytest.approx(1e-3 * float(scale.split("=")[1]), rel=1e-12)
+
+
+def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: Path) -> None:
+    result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
+    ro.store.save_result(result, tmp_path / "earlier.json")
+    ro.store.save_prior(a_prior(), tmp_path / "prior.json")
+    found = with_prior(folder, '[prior]\nfrom = "../earlier.json"\ninflate = 2\nwithout = ["base_*"]')
+    assert found.prior == Prior.from_result(result, 2.0, ("base_*",))
+    assert "../earlier.json" in found.files
+    assert with_prior(folder, '[prior]\nfrom = "../prior.json"').prior == a_prior()
+
+
+def test_a_folder_learns_from_a_fleet(folder: Path, tmp_path: Path) -> None:
+    problem = ro.load("position").problem
+    results = {}
+    for k in range(2):
+        part = problem.on(problem.data.take(np.arange(k, len(problem.data), 2)))
+        results[f"../arm{k}"] = ro.calibrate(part, ro.tikhonov, 1.0)
+        (tmp_path / f"arm{k}").mkdir()
+        ro.store.save_result(results[f"../arm{k}"], tmp_path / f"arm{k}")
+    found = with_prior(folder, '[prior]\nfleet = ["../arm0", "../arm1"]').prior
+    wanted = Prior.from_fleet(results)
+    assert found.centre == pytest.approx(wanted.centre, rel=1e-6, abs=1e-12)
+    assert found.scale == pytest.approx(wanted.scale, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('known = ["a2 + a3"]', "key prior.known 1"),
+        ('known = ["d5 +- 1 mm", "a2 + q3 +- 1 mm"]', "'q3'"),
+        ('known = "a2 +- 1 mm"', "key prior.known"),
+        ("tails = 0", "key prior.tails"),
+        ("frames = -1", "key prior.frames"),
+        ("[prior.scale]\ntheta5 = 1.0", "table scale, key theta5"),
+        ("[prior.centre]\ntheta55_mrad = 1.0", "unknown key 'theta55_mrad'"),
+        ('groups = ["b?"]', "key groups"),
+        ('from = "nowhere.json"', "nowhere.json"),
+        ('from = "robot.toml"', "robot.toml"),
+        ('fleet = ["robot.toml"]', "robot.toml"),
+        ("inflate = 2", "no key from beside it"),
+        ('form = "x.json"', "from"),
+    ],
+)
+def test_a_wrong_prior_is_refused_by_file_and_key(folder: Path, text: str, says: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        with_prior(folder, f"[prior]\n{text}")
+    assert "problem.toml" in str(error.value) or "robot.toml" in str(error.value) or "nowhere.json" in str(error.value)
+    assert says in str(error.value)
