@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
-from rpim_opt.show.console import fail, left_out_line, progress, show, written_line, written_to
-from rpim_opt.show.options import corrected_files, require_positive, tool_frame
+from rpim_opt.show.console import arriving, fail, left_out_line, progress, show, written_line, written_to
+from rpim_opt.show.options import carried, corrected_files, require_positive, tool_frame
 
 if TYPE_CHECKING:
     from rpim_opt.calibration.result import Calibration
@@ -28,6 +27,25 @@ Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge;
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+ABORT: Any = (KeyboardInterrupt, typer.Abort)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"rpim-opt {version('rpim-opt')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", help="Say the version and end.", is_eager=True, callback=_version)
+    ] = False,
+) -> None:
+    """Take what stands before a command."""
+
 
 Problem = Annotated[str, typer.Argument(help="A problem folder, or the name of one that comes with rpim-opt.")]
 Variant = Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")]
@@ -43,8 +61,19 @@ Json = Annotated[
 def new(
     folder: Annotated[Path, typer.Argument(help="The problem folder to make; none that is there already.")],
     robot: Annotated[str, typer.Option(help="A ready robot (rpim-opt robots), or a file .urdf, .toml, .json, .csv.")],
-    data: Annotated[Path, typer.Option(help="Joint values and measured values: .csv, .parquet or .xlsx.")],
+    data: Annotated[
+        list[Path], typer.Option(help="Joint and measured values: text, Excel, Parquet; several are stacked or joined.")
+    ],
     units: Units = "",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what the tables mean, and write nothing.")] = False,
+    sheet: Annotated[str, typer.Option(help="Excel sheet, by name or number.")] = "",
+    columns: Annotated[str, typer.Option(help="Names of the columns, where there is no header: label,q1_deg,...")] = "",
+    key: Annotated[str, typer.Option(help="Column that joins several files, or row for the number of the row.")] = "",
+    quaternion: Annotated[str, typer.Option(help="Order of numbered components, wxyz or xyzw.")] = "",
+    rotation: Annotated[str, typer.Option(help="vector, where rx, ry, rz are a rotation vector.")] = "",
+    encoding: Annotated[str, typer.Option(help="Of text files, if not found: utf-8, cp1252, utf-16.")] = "",
+    separator: Annotated[str, typer.Option(help="comma, semicolon, tab, bar, space.")] = "",
+    decimal: Annotated[str, typer.Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[
         str | None, typer.Option(help="position, pose, cable, distance, plane or sphere; guessed from the columns.")
     ] = None,
@@ -52,37 +81,56 @@ def new(
     hold_out: Annotated[
         float | None, typer.Option(help="Part of the configurations to keep apart instead, 0.25.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the configurations that are kept apart.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the configurations that are kept apart.")] = 0,
     urdf_base: Annotated[str | None, typer.Option(help="Link where the robot starts, if not the root.")] = None,
     urdf_tip: Annotated[str | None, typer.Option(help="Link where it ends, if there are several.")] = None,
     as_json: Json = False,
 ) -> None:
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with progress():
-        from rpim_opt.basics.files import refused
+        from rpim_opt.basics.writing import refused
+        from rpim_opt.show.options import asked_of
+        from rpim_opt.store.raw import understand_tables
         from rpim_opt.store.starting import new_problem
 
+        asked = asked_of(
+            units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
+            separator=separator, decimal=decimal,
+        )  # fmt: skip
+        if dry_run:
+            found = understand_tables(robot, data, measurement, asked, urdf_base, urdf_tip)
+            show(found, found.content(), as_json)
+            return
         with refused(folder):
             made = new_problem(
-                folder, robot, data, measurement=measurement, units=units, validation=validation, hold_out=hold_out,
+                folder, robot, data, measurement=measurement, asked=asked, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip,
+                understood=None if as_json else lambda found: show(f"{found}\n", {}, as_json),
             )  # fmt: skip
-    show(made, {"written": [made.folder], "rows": made.rows, "notes": made.notes}, as_json)
+    document = {"written": [made.folder], "rows": made.rows, "notes": made.notes, **made.understood.content()}
+    show(made, {**document, "notes": made.notes}, as_json)
 
 
 @app.command()
 def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) -> None:
     """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
     with progress() as say:
+        from rpim_opt.calibration.lack_of_fit import foreseen
         from rpim_opt.problem.inspection import inspect
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
         say("inspecting")
-        found = inspect(instance.problem)
-    head = {"title": instance.title, "source": instance.source}
-    show(f"{instance.title}\n{instance.source}\n\n{found}", {**head, **found.content()}, as_json)
+        found = inspect(instance.problem, instance.validation)
+        say("looking at what a quick fit leaves")
+        lacking = foreseen(instance.problem)
+    document = {"title": instance.title, "source": instance.source, **found.content(), "lack_of_fit": None}
+    text = f"{instance.title}\n{instance.source}\n\n{found}"
+    if lacking is not None:
+        document["lack_of_fit"] = lacking.content()
+        text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
+    show(text, document, as_json)
 
 
 @app.command()
@@ -90,7 +138,13 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     select: Annotated[
-        str | None, typer.Option(help="How to choose the weight: reml, l_curve, gcv, k_fold, ..., or a number.")
+        str | None,
+        typer.Option(
+            help="Sizes that are learned (learned), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
+        ),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="auto: families that the evidence wants (gravity, gears); geometry: none.")
     ] = None,
     formulation: Annotated[
         str | None,
@@ -98,6 +152,10 @@ def calibrate(
             help="Instead of the file's: least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, "
             "group_lasso."
         ),
+    ] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(help="What of the noise is learned: robot (beside the instrument's), free, level, declared."),
     ] = None,
     refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
@@ -116,7 +174,7 @@ def calibrate(
         say("reading the problem")
         instance = load(problem, variant)
         with clock() as running:
-            result = _calibrated(instance, select, formulation, say)
+            result = _calibrated(instance, select, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())
         without: list[str] = []
         if refit and result.flagged:
@@ -139,36 +197,35 @@ def calibrate(
 
 
 def _calibrated(
-    instance: Instance, select: str | None, formulation: str | None, say: Callable[[str], None]
+    instance: Instance,
+    select: str | None,
+    formulation: str | None,
+    words: dict[str, str | None],
+    say: Callable[[str], None],
 ) -> Calibration:
     """Calibrate as a problem's file says, or as the options say instead."""
-    from rpim_opt.calibration.loop import calibrate
     from rpim_opt.store.named import named_formulation, named_weight
 
-    weight = instance.weight
+    changes: dict[str, Any] = {key: word for key, word in words.items() if word}
     if select:
-        weight = named_weight(select)
-    posed = instance.formulation
+        changes["weight"] = named_weight(select)
     if formulation:
-        posed = named_formulation(formulation)
-    say("choosing the weight")
-    result = calibrate(
-        instance.problem,
-        posed,
-        weight,
-        progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}"),
+        changes["formulation"] = named_formulation(formulation)
+    say("learning sizes" if changes.get("weight", instance.weight) is None else "choosing the weight")
+    return instance.calibrate(
+        **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
     )
-    return replace(result, record=instance.record)
 
 
 def _saved(result: Calibration, out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
-    from rpim_opt.basics.files import refused
+    from rpim_opt.basics.inputs import inside
+    from rpim_opt.basics.writing import refused
     from rpim_opt.store.result_file import save_result
 
     if out is None:
         return []
-    file = out / "result.json"
+    file = inside(out, "result.json", "the file", out)
     with refused(file):
         save_result(result, file)
     return [file]
@@ -182,14 +239,17 @@ def report(
 ) -> None:
     """Write a result as one HTML page that works offline, for whoever has to believe it."""
     with progress() as say:
-        from rpim_opt.basics.files import refused
+        from rpim_opt.basics.inputs import inside
+        from rpim_opt.basics.writing import refused
         from rpim_opt.show.report import write_report
         from rpim_opt.store.result_file import load_result
 
         say("reading the result")
         loaded = load_result(result)
         say("writing the report")
-        out = out or (result if result.is_dir() else result.parent) / "report.html"
+        if out is None:
+            folder = result if result.is_dir() else result.parent
+            out = inside(folder, "report.html", "the file", folder)
         with refused(out):
             write_report(loaded, out)
     show(f"Written: {out}", {"written": [out]}, as_json)
@@ -286,6 +346,9 @@ def compensate(
     ] = None,
     marker: Marker = None,
     base: Annotated[bool, typer.Option(help="Correct for the base, too.")] = False,
+    payload: Annotated[
+        str | None, typer.Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")
+    ] = None,
     largest: Annotated[float, typer.Option(help="Largest correction of a joint [rad or m].")] = 0.2,
     limit: Annotated[float | None, typer.Option(help="Error that may be left [mm]; exit code 1 above.")] = None,
     out: Annotated[Path | None, typer.Option(help="CSV file for the corrected commands.")] = None,
@@ -293,7 +356,7 @@ def compensate(
 ) -> None:
     """Correct joint commands so that the real robot goes where the nominal one would."""
     with progress() as say:
-        from rpim_opt.basics.tables import read_columns
+        from rpim_opt.basics.layouts import read_raw
         from rpim_opt.data.models import pose
         from rpim_opt.data.naming import parse_units, rename
         from rpim_opt.store.result_file import load_result
@@ -301,11 +364,13 @@ def compensate(
         from rpim_opt.use.targets import read_targets
 
         require_positive("--limit", limit)
+        mass, centre = carried(payload)
         say("reading the result")
         loaded = load_result(result)
         robot = loaded.problem.robot
         try:
-            named = rename(read_columns(targets), robot, pose, parse_units(units))
+            raw = read_raw(targets)
+            named = rename(raw.columns, robot, pose, parse_units(units), heads=raw.heads)
             read = read_targets(named.columns, robot)
         except InputError as error:
             raise error.within(targets) from None
@@ -313,6 +378,7 @@ def compensate(
         found = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=tool_frame(tool), marker=marker or "", base=base, largest=largest,
+            payload=read.payload if mass is None else mass, payload_centre=centre,
         )  # fmt: skip
     document = {**found.content(), "left_out": named.left_out, "limit_mm": limit}
     document["written"] = written_to(out, found.csv())
@@ -325,12 +391,12 @@ def compensate(
 @app.command()
 def simulate(
     problem: Annotated[str, typer.Argument(help="A problem folder with a [simulation] table.")],
-    seed: Annotated[int | None, typer.Option(help="Instead of the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the file's.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the tables; the problem's own by default.")] = None,
     as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
-    from rpim_opt.basics.files import refused
+    from rpim_opt.basics.writing import refused
     from rpim_opt.store.simulation import write_simulation
 
     with refused(out or problem):
@@ -343,9 +409,11 @@ def design(
     problem: Problem,
     count: Annotated[int, typer.Option(help="How many configurations to choose.")] = 30,
     criterion: Annotated[str, typer.Option(help="V (predicted positions), D, A or E.")] = "V",
-    candidates: Annotated[int, typer.Option(help="How many random candidates within the joint limits.")] = 1000,
+    candidates: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="How many random candidates within the joint limits.")
+    ] = 1000,
     table: Annotated[Path | None, typer.Option(help="A table of candidates instead: q1_deg, ...")] = None,
-    seed: Annotated[int, typer.Option(help="Of the random candidates.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random candidates.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -429,6 +497,11 @@ def _written_or_shown(out: Path | None, text: str) -> str:
 
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
+    with arriving():
+        _run()
+
+
+def _run() -> None:
     try:
         sys.exit(app(standalone_mode=False))
     except USAGE as error:
@@ -436,6 +509,8 @@ def main() -> None:
             error.show()
             sys.exit(error.exit_code)
         fail(error.format_message(), error.exit_code)
+    except ABORT:
+        fail("Interrupted.", 130)
     except NoSolutionFound as error:
         fail(str(error), 3)
     except RpimError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from io import StringIO
+from unicodedata import category
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -22,6 +23,20 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(line.rstrip() for line in stream.getvalue().strip("\n").splitlines() if line.strip())
 
 
+def visible(text: str) -> str:
+    r"""Return a text for a terminal: what is not printable but a line break is written out, ``\x1b`` for escape.
+
+    Titles, sources, labels and file names may come from somebody else, and a terminal obeys what they say.
+    """
+    return "".join(map(_visible, text))
+
+
+def _visible(character: str) -> str:
+    if character.isprintable() or character == "\n" or category(character) == "Zs":
+        return character
+    return character.encode("unicode_escape").decode("ascii")
+
+
 def listed(items: Sequence[str], most: int = 8, between: str = ", ") -> str:
     """Return the first items in a line, and how many more there are."""
     more = f" and {len(items) - most} more" if len(items) > most else ""
@@ -32,3 +47,16 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table; the first column is aligned left, the others right."""
     lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def joined(parts: Sequence[str]) -> str:
+    """Return parts as an English list: ``a, b and c``.
+
+    >>> from rpim_opt.basics.text import joined
+    >>> joined(["gravity"]), joined(["a", "b", "c"])
+    ('gravity', 'a, b and c')
+    """
+    *before, last = parts
+    if not before:
+        return last
+    return f"{', '.join(before)} and {last}"

@@ -1,8 +1,11 @@
 from . import baselines as baselines
+from .asking import calibrate as calibrate
+from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
-from .loop import calibrate as calibrate
 from .outcome import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
+from .sag import bends_upwards as bends_upwards
+from .sag import said_of_bending as said_of_bending
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo

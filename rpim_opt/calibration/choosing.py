@@ -10,6 +10,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.select import SELECTORS, Selection, Selector
+from rpim_opt.convex.selection import require_weight
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this part of the solution, then stays."""
@@ -122,6 +123,4 @@ def choosing(weight: float | str | Selector, penalized: bool) -> Choosing:
         return Choosing(weight, settled=not penalized, final=not penalized)
     if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):
         raise InputError("weight", f"{weight!r}", "a number, zero or more, or a selector")
-    if not (np.isfinite(weight) and weight >= 0):
-        raise InputError("weight", f"{weight}", "a finite number, zero or more")
-    return Choosing(None, float(weight), settled=True, final=True)
+    return Choosing(None, require_weight(weight, "weight"), settled=True, final=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,17 +12,15 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.phases import phase
-from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.choosing import Choosing, choosing
-from rpim_opt.calibration.result import Calibration, Iteration
-from rpim_opt.convex.formulation import Formulation, tikhonov
+from rpim_opt.calibration.outcome import Iteration
+from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.majorize import Squares, on_triangles
 from rpim_opt.convex.objective import Damping
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.select import Selector
 from rpim_opt.convex.trust import trusted_parts
-from rpim_opt.problem.frames import relocated
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
@@ -285,75 +283,31 @@ def _merit(program: Program, z: Array, weight: float) -> float:
     return objective + PENALTY * (1 + abs(objective)) * excess
 
 
-@one_blas_thread
-def calibrate(
+@dataclass(frozen=True, eq=False)
+class Ended:
+    """Where the loop ended, and the evidence that this is a solution."""
+
+    state: State
+    certificate: Certificate
+    x: Array
+    converged: bool
+    message: str
+
+
+def run(
     problem: Source,
-    formulation: Formulation = tikhonov,
-    weight: float | str | Selector = 0.0,
-    *,
+    formulation: Formulation,
+    weight: float | str | Selector,
     start: Array | None = None,
     max_iterations: int = 500,
     tolerance: float = 1e-8,
     progress: Callable[[Iteration], None] | None = None,
-    solver: str | None = None,
-    settings: Mapping[str, Any] | None = None,
-    verbose: bool = False,
-) -> Calibration:
-    """Identify the parameters of a problem.
-
-    Every pass linearizes at the current deviations, solves for the *total* deviation and takes the step; a step that
-    bends follows the curve of the residual, and where the nonlinear objective falls by less than a quarter of what the
-    convex program promises, a term of Levenberg's and Marquardt's kind shortens the next one. The loop ends when the
-    undamped program promises no decrease beyond its solver's accuracy, or its step is shorter than
-    ``tolerance * (1 + ||z||)``. The result has converged if a `Certificate` computed anew agrees: then it is a
-    stationary point of the nonlinear problem.
-
-    Parameters
-    ----------
-    problem
-        What was measured, and what is to be identified.
-    formulation
-        The convex program of a pass; its functions are asked now.
-    weight
-        A number, or a selector (or its name), which sees identification data only. It is asked anew until the steps
-        become small; then the weight stays. One that takes turns between weights is answered, with a sentence.
-    start
-        (n,) deviations [SI] to begin with; nominal by default, and then frames that are stated metres or half a
-        turn from where the data put them count from there (`frames.relocated`). The answer does not depend on
-        a given start, as long as the loop converges: the deviations count from nominal all the same, angles within
-        half a turn.
-    max_iterations, tolerance
-        When to stop: linearizations, and length of a step. A calibration that did not converge says so in ``converged``
-        and ``message``.
-    progress
-        Called after every pass.
-    solver, settings, verbose
-        Any installed solver of CVXPY, with its options (`Program.solve`).
-
-    Raises
-    ------
-    InputError
-        For fewer equations than unknowns without a penalty, and a start that does not fit.
-    NoSolutionFound
-        When a convex program fails.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> instance = ro.load("position")
-    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
-    >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm. {result.message}")
-    0.024 mm. Converged after 4 passes.
-    """
-    if isinstance(max_iterations, bool) or not isinstance(max_iterations, int) or max_iterations < 1:
-        raise InputError("max_iterations", f"{max_iterations!r}", "a whole number, 1 or more")
-    elsewhere = None
-    if start is None:
-        elsewhere = relocated(problem)
-    problem = elsewhere or problem
-    how = {"solver": solver, "settings": settings, "verbose": verbose}
+    how: Mapping[str, Any] = MappingProxyType({}),
+) -> Ended:
+    """Run the loop from some deviations (n,) [SI] to its end; arguments as for `calibrate`."""
     source = in_parts(problem.frozen())
-    solved, reweigh = formulation, None
+    solved = formulation
+    reweigh = None
     if not source.keeps_rows:
         solved, reweigh = on_triangles(formulation, _equations(source))
     loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations)
@@ -368,23 +322,8 @@ def calibrate(
     except NoSolutionFound as error:
         raise error.naming(_names(source)) from None
     converged = state.outcome == "rest" and evidence.holds(state.z)
-    message = _message(state, evidence, converged, max_iterations, elsewhere is not None)
-    asked = partial(
-        calibrate, formulation=formulation, weight=weight, max_iterations=max_iterations, tolerance=tolerance, **how
-    )
-    return Calibration(
-        problem=problem,
-        formulation=formulation,
-        x=source.parameters.free.scale * state.z,
-        weight=state.choice.weight,
-        selection=state.choice.selection,
-        converged=converged,
-        message=message,
-        history=state.history,
-        program=state.program,
-        certificate=evidence,
-        asked=asked,
-    )
+    message = _message(state, evidence, converged, max_iterations)
+    return Ended(state, evidence, source.parameters.free.scale * state.z, converged, message)
 
 
 def _floor(merit: float) -> float:
@@ -451,7 +390,7 @@ def _names(source: Source) -> dict[int, str]:
     return names
 
 
-def _message(state: State, evidence: Certificate, converged: bool, most: int, elsewhere: bool) -> str:
+def _message(state: State, evidence: Certificate, converged: bool, most: int) -> str:
     """Say how the loop ended, and why."""
     count = len(state.history)
     passes = f"{count} passes" if count != 1 else "1 pass"
@@ -468,8 +407,6 @@ def _message(state: State, evidence: Certificate, converged: bool, most: int, el
         text = f"Not converged: {_unfinished(state, most)}"
     if state.choice.note:
         text += f" {state.choice.note}"
-    if elsewhere:
-        text += " Frames were stated far from where the data put them; their deviations count from there."
     return text
 
 

@@ -14,6 +14,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration import diagnosis
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
+from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
+from rpim_opt.calibration.learned import Learned
+from rpim_opt.calibration.ranges import Outside, measured_ranges, outside
 from rpim_opt.calibration.spread import Spread
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
@@ -26,6 +29,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import fitted_frames
 from rpim_opt.problem.functions import transform
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
@@ -65,6 +69,8 @@ class Iteration:
 class Prediction(NamedTuple):
     """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals.
 
+    ``outside`` says which rows are beyond the joint ranges that were measured; there an interval may be too narrow.
+
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
@@ -76,6 +82,7 @@ class Prediction(NamedTuple):
     position: Array
     covariance: Array
     coverage_factor: float = 1.0
+    outside: Outside = Outside()
 
     @property
     def standard(self) -> Array:
@@ -118,6 +125,7 @@ class Outcome:
     asked: Callable[[Source], Self]
     record: Record = field(default_factory=Record)
     kept: Kept | None = None
+    learned: Learned | None = None
 
     @property
     def z(self) -> Array:
@@ -149,10 +157,13 @@ class Outcome:
                 mdh[places[name]] += deviation
         return replace(self.problem.robot, mdh=mdh)
 
-    def forward(self, q: Array, marker: str = "", torque: Array | None = None) -> Array:
+    def forward(
+        self, q: Array, marker: str = "", torque: Array | None = None, payload: float | Array | None = None
+    ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
-        Base, robot and tool, gears and joints' elasticity included; of `robot` alone: `forward_kinematics`.
+        Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash; of `robot`
+        alone: `forward_kinematics`.
 
         Parameters
         ----------
@@ -161,7 +172,14 @@ class Outcome:
         marker
             The reflector; the only one by default.
         torque
-            (N, dof) joint torques [Nm], where the compliance of joints is identified.
+            (N, dof) joint torques [Nm], where the compliance of joints was identified from measured ones.
+        payload
+            Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
+
+        Raises
+        ------
+        InputError
+            For torques that are missing, or given where compliances multiply the torques of gravity.
 
         Examples
         --------
@@ -170,44 +188,87 @@ class Outcome:
         >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
         array([ 0.822, -0.026,  0.197])
         """
-        return self._at(q, transform, marker, torque).modelled(self.x)[0].reshape(-1, 4, 4)
+        return self._at(q, transform, marker, torque, payload).modelled(self.x)[0].reshape(-1, 4, 4)
 
-    def predict(self, q: Array, marker: str = "", torque: Array | None = None) -> Prediction:
+    def predict(
+        self,
+        q: Array,
+        marker: str = "",
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        of: Interval = "reached",
+    ) -> Prediction:
         """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
 
-        Positions in the instrument's frame; their covariance J C J', without the noise of a new measurement, at
-        coverage factor 1. `Uncertainty.predict` states the factor of a confidence.
+        Positions in the instrument's frame, and their covariance at coverage factor 1 (`Uncertainty.predict` states
+        the factor of a confidence).
+
+        Parameters
+        ----------
+        q, marker, torque
+            As for `forward`.
+        of
+            ``"mean"``: of what the model says, J C J'. ``"reached"``: of the position that the robot will reach, with
+            its own scatter. ``"reading"``: of what the instrument will read there.
 
         Raises
         ------
         InputError
-            For a penalty without covariance (lasso).
+            For a penalty without covariance (lasso), and another ``of``.
 
         Examples
         --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> where = result.predict(np.radians([[10, 20, -30, 40, 50, 60]]))
+        >>> where = result.predict(np.radians([[10, 20, -30, 40, 50, 60]]), of="mean")
         >>> where.position.round(3), (1e3 * where.standard).round(3)  # [m], [mm]
         (array([[ 1.522, -0.347,  0.972]]), array([[0.013, 0.014, 0.012]]))
         """
+        of = checked(of)
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
-        problem = self._at(q, position, marker, torque)
+        problem = self._at(q, position, marker, torque, payload)
+        noise = position_noise(self.problem)[None]
+        problem = problem.on(replace(problem.data, blocks=(replace(problem.data.blocks[0], covariance=noise),)))
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
-        return Prediction(problem.modelled(self.x)[0], self.spread.of_positions(J))
+        covariance = self.spread.of_positions(J)
+        added = scattered(problem, self.noise_level)
+        if of == "reached":
+            covariance = covariance + added.robot[0]
+        if of == "reading":
+            covariance = covariance + added.reading[0]
+        return Prediction(problem.modelled(self.x)[0], covariance, outside=self.outside(problem.data))
 
-    def _at(self, q: Array, measurement: Measurement, marker: str, torque: Array | None) -> CalibrationProblem:
+    def outside(self, data: Dataset) -> Outside:
+        """Return which rows are beyond the measured joint ranges, where no measurement checked the model.
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1.0)
+        >>> result.outside(instance.validation).rows
+        ()
+        """
+        return outside(self._ranges, data)
+
+    @cached_property
+    def _ranges(self) -> Array:
+        return measured_ranges(self.problem)
+
+    def _at(
+        self,
+        q: Array,
+        measurement: Measurement,
+        marker: str,
+        torque: Array | None,
+        payload: float | Array | None = None,
+    ) -> CalibrationProblem:
         """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
         q = np.atleast_2d(np.asarray(q, dtype=float))
         data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
-        torques = None
-        if torque is not None:
-            torques = np.reshape(np.asarray(torque, dtype=float), (len(q), 1, -1))
-        block = replace(data.blocks[0], markers=(marker,), torque=torques)
-        return self.problem.on(replace(data, blocks=(block,)))
+        data = bearing(data, self.problem.data, torque, payload)
+        return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,)),)))
 
     # --- errors ------------------------------------------------------------------------------------------------
 
@@ -256,7 +317,7 @@ class Outcome:
             torque = None
             if block.torque is not None:
                 torque = block.torque[:, 0]
-            points[block.row] = self.forward(block.q[:, 0], block.markers[0], torque)[:, :3, 3]
+            points[block.row] = self.forward(block.q[:, 0], block.markers[0], torque, block.payload)[:, :3, 3]
             if {"x", "y", "z"} <= set(names):
                 points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
         return points
@@ -298,7 +359,28 @@ class Outcome:
     @cached_property
     def _nominal(self) -> tuple[Source, Array]:
         """The problem that identifies frames alone, and its solution under the prior that the scales state."""
-        return fitted_frames(self.problem)
+        return fitted_frames(self.stated)
+
+    @cached_property
+    def stated(self) -> Source:
+        """The problem as it was stated: without what was learned of scales, noise and families.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> result = ro.calibrate(problem)
+        >>> scales = [p.parameters.free.scale for p in (problem, result.stated, result.problem)]
+        >>> bool((scales[0] == scales[1]).all()), bool((scales[0] == scales[2]).all())
+        (True, False)
+        """
+        learned = self.learned
+        if learned is None:
+            return self.problem
+        p = self.problem.parameters
+        scale = p.scale.copy()
+        scale[p.identified] = learned.stated
+        identified = p.identified & ~np.isin(p.names, learned.added)
+        bare = self.problem.scattered(None)
+        return bare.with_parameters(replace(p, scale=scale, identified=identified))
 
     # --- how the fit is, and what it rests on ------------------------------------------------------------------
 
@@ -369,7 +451,41 @@ class Outcome:
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
         linear = self.linear
         form = ridge(linear, self.program.penalty_form)
-        return Spread(linear, form, self.penalty_weight, self.z, self._factor)
+        if self.learned is None:
+            return Spread(linear, form, self.penalty_weight, self.z, self._factor)
+        return Spread(linear, form, self.penalty_weight, self.z, self._factor, 1.0, self.learned.drift)
+
+    @cached_property
+    def declared_squares(self) -> float:
+        """Sum of the squared residuals of the rows that the fit trusts, in units of the instrument's declared noise."""
+        if self.problem.scatter is None:
+            return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self._factor
+        bare = self.problem.scattered(None)
+        return float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
+
+    @property
+    def noise_level(self) -> float:
+        """The noise's variance over the declared one, where it is larger than chance would have it, and otherwise 1."""
+        if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
+            return 1.0
+        return max(self.noise_variance, 1.0)
+
+    def noise_test(self) -> NoiseTest:
+        """Compare the scatter of the residuals with the instrument's noise as declared.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
+        'The data scatter as declared (1.02 times).'
+        """
+        spare = self.equations - self.degrees_of_freedom
+        return noise_test(self.declared_squares, spare, self.problem.scatter is not None)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the noise: learned with it, or what equations are left over, m - sum f."""
+        if self.learned is not None:
+            return self.learned.freedom
+        return max(self.equations - self.degrees_of_freedom, 0.0)
 
     @cached_property
     def _factor(self) -> float:
@@ -424,6 +540,14 @@ class Outcome:
         """
         return diagnosis.flagged(self.problem, self.x)
 
+    @property
+    def doubted(self) -> list[str]:
+        """Labels of all rows that are not trusted: left out as blunders before the fit, and flagged after it."""
+        before: list[str] = []
+        if self.learned is not None:
+            before = [row.label for row in self.learned.left_out]
+        return [*before, *(flag.label for flag in self.flagged)]
+
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
 
@@ -432,7 +556,7 @@ class Outcome:
         >>> [len(result.problem.labels) - len(result.without_flagged().problem.labels), len(result.flagged)]
         [5, 5]
         """
-        kept = self.problem.without({flag.label for flag in self.flagged})
+        kept = self.stated.without({flag.label for flag in self.flagged})
         reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in self.flagged}
         record = replace(self.record, excluded={**self.record.excluded, **reasons})
         return replace(self.asked(kept), record=record)

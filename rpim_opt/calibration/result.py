@@ -35,6 +35,8 @@ class Calibration(Outcome):
         `calibrate` with all that it was given but the problem.
     record
         Where the data come from, for files and reports.
+    learned
+        What was learned before the fit: sizes of deviations and noise, families, rows left out; None with a weight.
     kept
         What functions said that a file cannot hold; None where they can be asked.
 
@@ -64,6 +66,15 @@ class Calibration(Outcome):
     def selector(self) -> str:
         """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""
         return words.selector(self)
+
+    def noise_sentence(self) -> list[str]:
+        """Say how the noise that the data show compares with what was declared.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).noise_sentence()
+        ['The data scatter as declared (1.02 times).']
+        """
+        return words.noise_sentence(self)
 
     def weight_sentence(self) -> str:
         """Say the weight and where it came from.

@@ -27,6 +27,10 @@ class Spread:
         (n,) the solution in units of the scales.
     factor
         By how much a robust loss weighs the equations, against squared residuals in sigmas.
+    drift
+        (n, s) what sizes that were learned add: D with D D' a covariance of the deviations [SI]; None for nothing.
+    level
+        The noise's variance where it was learned with the scatter, in units of the equations'; None: the residuals say.
     """
 
     linear: LinearModel
@@ -34,6 +38,8 @@ class Spread:
     weight: float
     z: Array
     factor: float
+    level: float | None = None
+    drift: Array | None = None
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -43,6 +49,8 @@ class Spread:
     @cached_property
     def noise_variance(self) -> float:
         """sigma^2 = RSS / (m - dof) in units of the declared variance, or 1 where no equation is left over."""
+        if self.level is not None:
+            return self.level
         spare = self.linear.equations - self.degrees_of_freedom
         if spare <= 1e-6:
             return 1.0
@@ -61,7 +69,10 @@ class Spread:
     @cached_property
     def prior(self) -> Array:
         """Mean square (n, n) [SI] of what the penalty holds back; directions that the data do not see are here."""
-        return self._in_si(self.form.prior(self.weight))
+        found = self._in_si(self.form.prior(self.weight))
+        if self.drift is not None:
+            found = found + self.drift @ self.drift.T
+        return found
 
     @cached_property
     def covariance(self) -> Array:

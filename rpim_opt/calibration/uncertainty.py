@@ -4,25 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import t as student
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import display
+from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor
 from rpim_opt.calibration.result import Calibration, Prediction
-
-
-class NoiseTest(NamedTuple):
-    """Observed over declared standard deviation, its two-sided probability under declared noise, and a verdict."""
-
-    ratio: float
-    probability: float
-    verdict: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +67,8 @@ class Uncertainty:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom that are left to estimate the noise: m - sum f."""
-        return max(self.result.equations - self.result.degrees_of_freedom, 0.0)
+        """Degrees of freedom of the noise: m - sum f, or what was learned with it."""
+        return self.result.freedom
 
     @cached_property
     def noise_level(self) -> float:
@@ -88,8 +78,7 @@ class Uncertainty:
     @property
     def coverage_factor(self) -> float:
         """Quantile k of Student's t at (1 + confidence) / 2, with `freedom` degrees of freedom, at least one."""
-        probability = (1 + self.confidence) / 2
-        return float(student.ppf(probability, self.freedom)) if self.freedom > 1 else float(student.ppf(probability, 1))
+        return coverage_factor(self.freedom, self.confidence)
 
     @property
     def noise(self) -> Array:
@@ -124,27 +113,29 @@ class Uncertainty:
         >>> print(ro.calibration.Uncertainty(result).noise_test().verdict)
         The data scatter as declared (1.02 times).
         """
-        if self.freedom < 1:
-            return NoiseTest(1.0, 1.0, "No equation is left over to tell the noise: it is the declared one.")
-        statistic = self.noise_level**2 * self.freedom
-        upper = float(chi2.sf(statistic, self.freedom))
-        probability = 2 * min(upper, 1 - upper)
-        if probability >= 0.01:
-            verdict = f"The data scatter as declared ({self.noise_level:.2f} times)."
-        elif upper < 0.5:
-            verdict = (
-                f"The data scatter {self.noise_level:.2f} times as much as declared: noise is larger, rows are wrong, "
-                "or the model lacks something (backlash, elasticity)."
-            )
-        else:
-            verdict = (
-                f"The data scatter {self.noise_level:.2f} times as much as declared: the noise is stated too large."
-            )
-        return NoiseTest(self.noise_level, probability, verdict)
+        return self.result.noise_test()
 
-    def predict(self, q: Array, marker: str = "", torque: Array | None = None) -> Prediction:
-        """Return what `Calibration.predict` does, with the confidence's coverage factor; arguments as for `forward`.
+    def predict(
+        self,
+        q: Array,
+        marker: str = "",
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        of: Interval = "reached",
+    ) -> Prediction:
+        """Return what `Calibration.predict` does, with the confidence's coverage factor.
 
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m].
+        marker, torque, payload
+            As for `Calibration.forward`; torques (N, dof) [Nm].
+        of
+            ``"mean"``, ``"reached"`` or ``"reading"``, as for `Calibration.predict`.
+
+        Examples
+        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -152,7 +143,7 @@ class Uncertainty:
         >>> (where.expanded / where.standard).round(2)
         array([[2.63, 2.63, 2.63]])
         """
-        return self.result.predict(q, marker, torque)._replace(coverage_factor=self.coverage_factor)
+        return self.result.predict(q, marker, torque, payload, of)._replace(coverage_factor=self.coverage_factor)
 
     def budget(self) -> str:
         """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty).

@@ -12,6 +12,7 @@ from rpim_opt.basics.markup import html_table
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import Held
+from rpim_opt.calibration.learned_words import sentences
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.select import disagreement
 
@@ -88,25 +89,50 @@ def _sentences(result: Outcome) -> list[str]:
     before = 1e3 * result.nominal_errors().mean()
     after = 1e3 * result.errors().mean()
     errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
-    return [errors, weight_sentence(result), *remarks(result)]
+    return [errors, *weight_lines(result), *noise_sentence(result), *remarks(result)]
+
+
+def noise_sentence(result: Outcome) -> list[str]:
+    """Say how the noise that the data show compares with what was declared; nothing where it cannot be told."""
+    try:
+        return [result.noise_test().verdict]
+    except InputError:  # no freedom: a penalty that is no prior, or a loss that no squared one stands for
+        return []
 
 
 def selector(result: Outcome) -> str:
-    """Return the name of the rule that chose the weight, ``given`` for a number, ``none`` without a penalty."""
+    """Return the rule's name: ``learned`` sizes, ``given`` for a number, ``none`` without a penalty."""
     if result.formulation.penalty is None:
         return "none"
+    if result.learned is not None:
+        return "learned"
     if result.selection is None:
         return "given"
     return result.selection.name
 
 
+def weight_lines(result: Outcome) -> list[str]:
+    """Say the weight and where it came from, or what was learned in its place: a few sentences."""
+    if result.learned is None:
+        return [_one_weight(result)]
+    names = result.problem.parameters.free.names
+    return [f"Formulation '{result.formulation.name}'.", *sentences(result.learned, names, result.z)]
+
+
 def weight_sentence(result: Outcome) -> str:
-    """Say the weight and where it came from."""
+    """Say the same in one line."""
+    return " ".join(weight_lines(result))
+
+
+def _one_weight(result: Outcome) -> str:
     name = result.formulation.name
     if result.formulation.penalty is None:
         return f"Formulation '{name}' has no penalty and needs no weight."
     if result.selection is None:
         return f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."
+    if result.selection.groups:
+        weights = ", ".join(f"{group} {weight:.4g}" for group, weight in result.selection.groups.items())
+        return f"Weights {weights} ({selector(result)}: {result.selection.note}), formulation '{name}'."
     text = f"Weight {result.weight:.4g} ({selector(result)}: {result.selection.note}), formulation '{name}'."
     return " ".join(filter(None, [text, disagreement(result.program)]))
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import LARGEST
+
+if TYPE_CHECKING:
+    from rpim_opt.data.understanding import Asked
 
 Writer = tuple[Path, Callable[[Path], Any]]
 """A file, and what is to be done with it."""
@@ -49,6 +53,29 @@ def tool_frame(text: str | None) -> list[float] | None:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != 6:
+    if len(values) != 6 or not all(abs(value) < LARGEST for value in values):
         raise InputError("--tool", f"'{text}'", "six numbers: x,y,z [mm], roll,pitch,yaw [deg]")
     return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]
+
+
+def carried(text: str | None) -> tuple[float | None, list[float] | None]:
+    """Return a payload [kg] and, of four numbers, its centre [m]."""
+    if text is None:
+        return None, None
+    try:
+        mass, *centre = (float(part) for part in text.split(","))
+    except ValueError:
+        mass, centre = -1.0, []
+    if mass < 0 or len(centre) not in (0, 3):
+        raise InputError("--payload", f"'{text}'", "a mass [kg], or mass and centre: kg,x,y,z [mm]")
+    return mass, [1e-3 * v for v in centre] or None
+
+
+def asked_of(units: str, *, columns: str, key: str, quaternion: str, rotation: str, **layout: str) -> Asked:
+    """Return what the options of a command state of its raw tables."""
+    from rpim_opt.basics.layouts import Layout
+    from rpim_opt.data.spelling import parse_units
+    from rpim_opt.data.understanding import Asked
+
+    names = tuple(name.strip() for name in columns.split(",")) if columns else ()
+    return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key)

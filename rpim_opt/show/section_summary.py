@@ -7,6 +7,7 @@ from typing import Any
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.show.pieces import bullets, mm, quantity, repeated, sets
 
@@ -30,8 +31,20 @@ def summary_section(result: Calibration) -> list[Element]:
     return [
         tag("p", _sentence(result, name, before, after), class_="lead" if result.converged else "lead alarm"),
         tag("dl", *cards, class_="cards"),
+        *_left(result),
         *bullets(_notes(result, name), "notes"),
     ]
+
+
+def _left(result: Calibration) -> list[Element]:
+    """Return how the noise compares with the declared one, and what the errors that are left are made of."""
+    sentences = result.noise_sentence()
+    lacking = judged(result)
+    if lacking is not None:
+        sentences += lacking.sentences()
+    if not sentences:
+        return []
+    return [tag("p", " ".join(sentences))]
 
 
 def _sentence(result: Calibration, name: str, before: dict[str, Any], after: dict[str, Any]) -> str:

@@ -9,7 +9,10 @@ import numpy as np
 
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import table
+from rpim_opt.calibration.causes import likely_causes
+from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.words import weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.store.content import figures, sets
 
@@ -46,6 +49,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         if np.isfinite(turn).any():
             angles.append({"what": name, **statistics(turn, "mrad")})
     whole = figures(result)
+    lacking = judged(result)
     return {
         "title": record.title,
         "source": record.source,
@@ -53,6 +57,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "errors": errors,
         "orientation": angles,
         "remarks": _remarks(result),
+        "lack_of_fit": lacking and lacking.content(),
     }
 
 
@@ -74,7 +79,8 @@ def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any
 def _remarks(result: Calibration) -> list[str]:
     model = result.program.model
     count = f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see."
-    remarks = [result.weight_sentence(), count, *result.remarks()]
+    remarks = [*weight_lines(result), count, *result.noise_sentence(), *result.remarks()]
+    remarks += likely_causes(result)
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     if fitted.any():
         remarks.insert(0, "Nominal: the drawing's robot, frames fitted.")
@@ -88,7 +94,10 @@ def describe(result: Calibration, found: Mapping[str, Any]) -> str:
     if found["orientation"]:
         rows = [_row(e, "mrad") for e in found["orientation"]]
         lines.append(table(["orientation error [mrad]", "rows", "mean", "RMS", "max"], rows))
-    return "\n".join([*lines, "", *found["remarks"]])
+    lines += ["", *found["remarks"]]
+    if found["lack_of_fit"]:
+        lines += ["", *found["lack_of_fit"]["text"]]
+    return "\n".join(lines)
 
 
 def _row(e: Mapping[str, Any], unit: str) -> Sequence[str]:

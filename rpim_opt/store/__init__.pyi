@@ -1,5 +1,9 @@
 from .instances import Instance as Instance
 from .instances import load as load
+from .prior_file import load_prior as load_prior
+from .prior_file import save_prior as save_prior
+from .raw import Understanding as Understanding
+from .raw import understand_tables as understand_tables
 from .result_file import load_result as load_result
 from .result_file import save_result as save_result
 from .starting import new_problem as new_problem

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -13,24 +16,23 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Record
 from rpim_opt.store.definition import defined, definition, forms
+from rpim_opt.store.learned_parts import learned_part, scatter_part
 from rpim_opt.store.parts import data_part, finite, parameters_part, robot_part, selection_part
 from rpim_opt.store.schema import FORMAT, VERSION
 
 
 def content(result: Calibration) -> dict[str, Any]:
-    """Return what a file says of a calibration: its figures, and then all that they follow from.
+    """Return what a file says of a calibration: its figures, then all that they follow from, and the digest of both.
 
     The figures that a reader looks for are in mm and degrees, what they follow from is in SI.
     """
     record = result.record.dated()
     data = sets(result.problem.data, record)
-    return {
+    parts = {
         "format": FORMAT,
         "version": VERSION,
         "title": record.title,
-        **figures(result),
-        "nominal": {name: statistics(result.nominal_errors(part)) for name, part in data.items()},
-        "rows": {name: _rows(result, part) for name, part in data.items()},
+        **derived(result),
         "x": result.x.tolist(),
         "certificate": _certificate(result),
         "trust": _trust(result),
@@ -42,7 +44,30 @@ def content(result: Calibration) -> dict[str, Any]:
         "robot": robot_part(result.problem.robot),
         "model": parameters_part(result.problem.parameters),
         "data": {name: data_part(part) for name, part in data.items()},
+        "scatter": scatter_part(result.problem.scatter),
+        "learned": learned_part(result.learned),
         "record": _record(record),
+    }
+    return {**parts, "digest": digest(parts)}
+
+
+def digest(parts: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a file's content without its digest, however it is laid out and ordered."""
+    content = {key: value for key, value in parts.items() if key != "digest"}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return sha256(text.encode()).hexdigest()
+
+
+def derived(result: Calibration) -> dict[str, Any]:
+    """Return the figures of a file that follow from its data and parameters: they are computed anew where it is read.
+
+    Those are what a reader looks for first, and the errors before and after, also row by row.
+    """
+    data = sets(result.problem.data, result.record)
+    return {
+        **figures(result),
+        "nominal": {name: statistics(result.nominal_errors(part)) for name, part in data.items()},
+        "rows": {name: _rows(result, part) for name, part in data.items()},
     }
 
 
@@ -59,7 +84,7 @@ def figures(result: Calibration) -> dict[str, Any]:
         "converged": result.converged,
         "message": result.message,
         "iterations": len(result.history),
-        "flagged": [flag.label for flag in result.flagged],
+        "flagged": result.doubted,
         "parameters": result.parameter_rows(),
     }
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.believed import believed
 from rpim_opt.convex.constraints import (
     at_nominal,
     by_kind,
@@ -39,6 +40,8 @@ READY: dict[str, Callable[..., Any]] = {
 MAKERS: dict[str, Callable[..., Any]] = {
     f.__name__: f for f in (huber, at_nominal, signed, equal, in_ball, differences)
 }
+BELIEVED = "believed"
+"""The maker of a prior's penalty, whose first argument is the penalty that it was made of."""
 
 
 def definition(formulation: Formulation) -> dict[str, Any]:
@@ -106,7 +109,11 @@ def _term(function: Callable[..., Any]) -> Term:
     for name, ready in READY.items():
         if ready == function:
             return name
-    return getattr(function, "stated", None)
+    stated = getattr(function, "stated", None)
+    if stated is None or stated[0] != BELIEVED:
+        return stated
+    maker, penalty, *numbers = stated
+    return [maker, _optional(penalty), *numbers]
 
 
 def _function(term: Term, name: str) -> Any:
@@ -117,6 +124,9 @@ def _function(term: Term, name: str) -> Any:
     if isinstance(term, str):
         return _known(READY, term)
     maker, *arguments = term
+    if maker == BELIEVED:
+        penalty, *numbers = arguments
+        return believed(_function(penalty, name), *numbers)
     return _known(MAKERS, str(maker))(*arguments)
 
 

@@ -11,7 +11,11 @@ from typing import Any
 import cvxpy as cp
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
+from rpim_opt.calibration.asking import calibrate
+from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
@@ -23,7 +27,8 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.named import named_formulation, named_weight
 from rpim_opt.store.observations import Tables, read_tables
-from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem
+from rpim_opt.store.prior_table import prior_files, stated_prior
+from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +43,13 @@ class Instance:
         Robot, parameters and identification data.
     validation
         Measurements that no step of the calibration may see; None when there are none.
-    formulation, weight
-        How the folder wants it solved.
+    formulation, weight, model
+        How the folder wants it solved; weight None where sizes are learned, model ``"auto"`` for families that the
+        evidence wants.
+    noise
+        What of the noise is learned, as `calibrate` has it.
+    prior
+        What the folder believes of the deviations.
     published
         Mean errors [mm] that the source prints for the same table, by role (identification,
         validation) and method, to show beside ours.
@@ -56,7 +66,7 @@ class Instance:
     --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
-    >>> result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    >>> result = instance.calibrate()
     >>> instance.record.title, instance.excluded["T8-7"], instance.published["validation"]["RPIM"]
     ("The paper's cooperative manipulator", 'z misprinted, off by 15.0 mm', 0.468)
     """
@@ -66,12 +76,34 @@ class Instance:
     problem: CalibrationProblem
     validation: Dataset | None
     formulation: Formulation
-    weight: float | Selector
+    weight: float | Selector | None
+    prior: Prior = field(default_factory=Prior)
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     simulation: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     excluded: Mapping[str, str] = field(default_factory=dict)
+    model: str = "geometry"
+    noise: str = "robot"
+
+    def calibrate(self, **changes: Any) -> Calibration:
+        """Return the calibration as the folder wants it, with its record.
+
+        Parameters
+        ----------
+        changes
+            Arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``, ``model="auto"``.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> result = ro.load("paper_arm").calibrate()
+        >>> result.selector, result.record.title
+        ('l_curve', "The paper's cooperative manipulator")
+        """
+        asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
+        asked |= {"model": self.model, "noise": self.noise}
+        return replace(calibrate(self.problem, **{**asked, **changes}), record=self.record)
 
     @property
     def record(self) -> Record:
@@ -111,6 +143,7 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
     try:
         problem = _problem(stated, tables)
         formulation = _formulation(table, problem.parameters, path)
+        prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
     except InputError as error:
         raise error.within(path) from None
     return Instance(
@@ -120,11 +153,14 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         validation=tables.validation,
         formulation=formulation,
         weight=named_weight(table.selector, path),
+        prior=prior,
         published=_published(table, tables, path),
         reference=_reference(table, path),
         simulation=table.simulation,
         files=_hashes(stated, tables),
         excluded=table.exclude,
+        model=table.model,
+        noise=table.scatter if isinstance(table.scatter, str) else "declared",
     )
 
 
@@ -136,7 +172,7 @@ def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
     problem = CalibrationProblem(stated.robot, stated.chosen(parameters, data), data)
     if tables.validation is not None:
         problem.on(tables.validation)
-    return problem
+    return problem.scattered(stated_scatter(stated.table, stated.path))
 
 
 def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> Formulation:
@@ -150,7 +186,7 @@ def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> For
 
 def _published(table: ProblemTable, tables: Tables, path: Path) -> dict[str, Mapping[str, float]]:
     for file in table.published:
-        if not (path.parent / file).is_file():
+        if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
     return {role: table.published.get(files[0], {}) for role, files in tables.files.items() if files}
 
@@ -168,4 +204,12 @@ def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
     used = {stated.path.name: stated.path, drawing.name: drawing}
     for files in tables.files.values():
         used |= {file: folder / file for file in files}
-    return {name: sha256(file.read_bytes()).hexdigest() for name, file in used.items()}
+    used |= {file: _result(folder / file) for file in prior_files(stated.table.prior)}
+    return {name: sha256(read_bytes(file, LARGEST_DATA)).hexdigest() for name, file in used.items()}
+
+
+def _result(file: Path) -> Path:
+    """Return a result's file, which may be named by its folder."""
+    if file.is_dir():
+        return file / "result.json"
+    return file

@@ -9,6 +9,7 @@ from typing import TypeVar
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.select import SELECTORS, Selector
+from rpim_opt.convex.selection import require_weight
 
 Named = TypeVar("Named")
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -39,15 +40,19 @@ def named_formulation(text: str, file: Path | None = None) -> Formulation:
     return pick(FORMULATIONS, text, "formulation", file)
 
 
-def named_weight(text: str, file: Path | None = None) -> float | Selector:
-    """Return the selector of that name, or the number that the text is."""
+LEARNED = "learned"
+"""What a file or a command says for sizes that are learned from the data, and no weight."""
+
+
+def named_weight(text: str, file: Path | None = None) -> float | Selector | None:
+    """Return the selector of that name, or the number that the text is; None for sizes that are learned."""
+    if text == LEARNED:
+        return None
     try:
         value = float(text)
     except ValueError:
-        return pick(SELECTORS, text, "selector", file, "a number, ")
-    if not 0 <= value < float("inf"):
-        raise InputError("selector", f"'{text}'", "a finite number, zero or more", file)
-    return value
+        return pick(SELECTORS, text, "selector", file, f"a number, {LEARNED}, ")
+    return require_weight(value, "selector", file)
 
 
 def pick(known: Mapping[str, Named], name: str, what: str, file: Path | None = None, also: str = "") -> Named:

@@ -15,6 +15,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.convex.selection import Selection
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import Measurement
+from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.schema import BlockPart, DataPart, ParameterPart, RobotPart, SelectionPart
@@ -34,6 +35,7 @@ def robot_part(robot: Robot) -> dict[str, Any]:
         "joint_types": list(robot.joint_types),
         "joint_map": robot.joint_map.tolist(),
         "limits": [[finite(value) for value in pair] for pair in robot.limits],
+        "gravity": {key: list(value) if key != "payload" else value for key, value in vars(robot.gravity).items()},
     }
 
 
@@ -43,7 +45,17 @@ def robot_of(part: RobotPart) -> Robot:
     mdh = _array(part.mdh, "key robot.mdh", -1, 5)
     joints = len(part.mdh)
     joint_map = _array(part.joint_map, "key robot.joint_map", joints, joints)
-    return Robot(part.name, mdh, tuple(part.joint_types), joint_map, np.array(limits), part.source)
+    return Robot(part.name, mdh, tuple(part.joint_types), joint_map, np.array(limits), part.source, _gravity_of(part))
+
+
+def _gravity_of(part: RobotPart) -> Gravity:
+    """Return the gravity that a file holds; an older one has none, and nothing that would ask for it."""
+    stated = part.gravity
+    if stated is None:
+        return Gravity()
+    centres = tuple((x, y, z) for x, y, z in stated.centres)
+    gravity = Gravity(masses=tuple(stated.masses), centres=centres).carrying(stated.payload, stated.payload_centre)
+    return gravity.mounted(stated.direction)
 
 
 def parameters_part(parameters: Parameters) -> list[dict[str, Any]]:
@@ -100,8 +112,14 @@ def _block_part(block: Block) -> dict[str, Any]:
         "q": block.q.tolist(),
         "y": block.y.tolist(),
         "covariance": block.covariance.tolist(),
-        "torque": None if block.torque is None else block.torque.tolist(),
+        "torque": _optional(block.torque),
+        "payload": _optional(block.payload),
+        "approach": _optional(block.approach),
     }
+
+
+def _optional(values: Array | None) -> Any:
+    return None if values is None else values.tolist()
 
 
 def data_of(part: DataPart, known: Mapping[str, Measurement]) -> Dataset:
@@ -125,6 +143,12 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
     torque = None
     if part.torque is not None:
         torque = _array(part.torque, f"{where}.torque", N, kind.points, -1)
+    payload = None
+    if part.payload is not None:
+        payload = _array(part.payload, f"{where}.payload", N)
+    approach = None
+    if part.approach is not None:
+        approach = _array(part.approach, f"{where}.approach", N, kind.points, -1)
     return Block(
         kind,
         q=_array(part.q, f"{where}.q", N, kind.points, -1),
@@ -134,6 +158,8 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         markers=tuple(part.markers),
         fixture=part.fixture,
         torque=torque,
+        payload=payload,
+        approach=approach,
     )
 
 
@@ -146,6 +172,7 @@ def selection_part(selection: Selection | None) -> dict[str, Any] | None:
         "weights": [float(weight) for weight in selection.weights],
         "score": [finite(value) for value in selection.score],
         "interior": bool(selection.interior),
+        "groups": {name: float(weight) for name, weight in selection.groups.items()},
     }
 
 
@@ -154,7 +181,7 @@ def selection_of(part: SelectionPart | None) -> Selection | None:
     if part is None:
         return None
     score = np.array([np.inf if value is None else value for value in part.score])
-    return Selection(part.weight, part.name, np.array(part.weights), score, part.interior, part.note)
+    return Selection(part.weight, part.name, np.array(part.weights), score, part.interior, part.note, part.groups)
 
 
 def _array(values: Any, where: str, *shape: int) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -11,20 +11,26 @@ from typing import Any, Literal
 from pydantic import Field
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import Angle, Length, Table, read_toml, validate
+from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
+from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.units import split_unit
 from rpim_opt.convex.constraints import Constraint, at_nominal, equal, signed
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.named import find, named_formulation, named_weight, pick
+from rpim_opt.store.prior_table import PriorTable
 from rpim_opt.store.proposal import proposed
 
 Layout = Literal["named", "robodk"]
+Model = Literal["geometry", "auto"]
+Noise = Literal["robot", "free", "level", "declared"]
 
 
 class FrameTable(Table):
@@ -36,6 +42,14 @@ class FrameTable(Table):
     rx: Angle = 0.0
     ry: Angle = 0.0
     rz: Angle = 0.0
+
+
+class ScatterTable(Table):
+    """The robot's own scatter, where it is known."""
+
+    position: Length = 0.0
+    orientation: Angle = 0.0
+    joint: Angle = 0.0
 
 
 class Observation(Table):
@@ -51,10 +65,10 @@ class Observation(Table):
 class Constraints(Table):
     """What is known of parameters besides their scales: ``[constraints]``."""
 
-    at_nominal: list[str] = Field(default_factory=list)
-    positive: list[str] = Field(default_factory=list)
-    negative: list[str] = Field(default_factory=list)
-    equal: list[list[str]] = Field(default_factory=list)
+    at_nominal: list[Name] = Field(default_factory=list)
+    positive: list[Name] = Field(default_factory=list)
+    negative: list[Name] = Field(default_factory=list)
+    equal: list[list[Name]] = Field(default_factory=list)
 
     def all(self) -> tuple[Constraint, ...]:
         """Return them as functions of a formulation."""
@@ -75,18 +89,23 @@ class ProblemTable(Table):
     robot: str = "robot.toml"
     urdf_base: str | None = None
     urdf_tip: str | None = None
+    mounting: Mounting | None = None
+    payload: PayloadTable | None = None
     measurement: str = "position"
     layout: Layout = "named"
     identification: str | None = None
     validation: str | None = None
     observation: list[Observation] = Field(default_factory=list)
     exclude: dict[str, str] = Field(default_factory=dict)
-    identify: list[str] | Literal["auto"]
+    identify: list[Name] | Literal["auto"]
     formulation: str = "tikhonov"
-    selector: str = "reml"
+    selector: str = "learned"
+    model: Model = "geometry"
+    scatter: Noise | dict[str, Any] = "robot"
     noise: dict[str, Any] = Field(default_factory=dict)
-    scale: dict[str, float | int] = Field(default_factory=dict)
-    tolerance: dict[str, float | int] = Field(default_factory=dict)
+    scale: dict[Name, Any] = Field(default_factory=dict)
+    tolerance: dict[Name, Any] = Field(default_factory=dict)
+    prior: PriorTable = PriorTable()
     constraints: Constraints = Constraints()
     base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
     tool: dict[str, Any] = Field(default_factory=dict)
@@ -124,12 +143,14 @@ class Stated:
 
 def read_problem(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Stated:
     """Return what a problem file states; arguments and errors as for `load`."""
-    path = find(name) / "problem.toml"
+    folder = find(name)
+    path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     table, placed = _tables(read_toml(path), variant, kinds, path)
     observations = _observations(table, path)
     for each in observations:
         pick(kinds, each.measurement, "measurement", path)
+        _require_inside(each, path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
@@ -193,11 +214,21 @@ def _observations(table: ProblemTable, path: Path) -> tuple[Observation, ...]:
     return tuple(table.observation)
 
 
+def _require_inside(each: Observation, path: Path) -> None:
+    """Refuse tables elsewhere, before anything reads or writes them."""
+    inside(path.parent, each.identification, "key identification", path)
+    if each.validation:  # an empty one is how a variant has none
+        inside(path.parent, each.validation, "key validation", path)
+
+
 def _arm(table: ProblemTable, path: Path) -> Described:
     file = find_robot(table.robot, path.parent)
     if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip):
         raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
-    return read_arm(file, table.urdf_base, table.urdf_tip)
+    arm = read_arm(file, table.urdf_base, table.urdf_tip)
+    turned = numeric_frame(arm.base)[:3, :3]
+    gravity = stated_gravity(arm.robot.gravity, table.mounting, table.payload, path, turned)
+    return replace(arm, robot=replace(arm.robot, gravity=gravity))
 
 
 def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[float, ...]]:
@@ -213,6 +244,17 @@ def _base(table: ProblemTable, arm: Described, path: Path) -> tuple[float, ...] 
     if table.base == "auto":
         return None
     return _frame(table.base, "base", path) if table.base else tuple(arm.base)
+
+
+def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
+    """Return the robot's scatter that a file states, or None."""
+    if isinstance(table.scatter, str):
+        return None
+    found = validate(ScatterTable, table.scatter, path)
+    for name, value in found.model_dump().items():
+        if value < 0:
+            raise InputError(f"key scatter.{name}", f"{value}", "a standard deviation, zero or more", path)
+    return Scatter(float(found.position), float(found.orientation), float(found.joint))
 
 
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import read_json, validate, write_json
+from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held
-from rpim_opt.calibration.loop import calibrate
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import Unposed
@@ -26,8 +27,10 @@ from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.store.content import content, sets
+from rpim_opt.store.agreement import agreement
+from rpim_opt.store.content import content, derived, digest, sets
 from rpim_opt.store.definition import formulation_of, quadratic_of
+from rpim_opt.store.learned_parts import learned_of, scatter_of
 from rpim_opt.store.parts import data_of, parameters_of, robot_of, selection_of
 from rpim_opt.store.schema import FORMAT, VERSION, File, RowPart
 
@@ -72,6 +75,8 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
     """Return the calibration that a file holds.
 
     Its figures are computed anew from the data in the file, and those that the file states are compared with them.
+    A digest tells whether anything else was changed since it was written: by error, that is, and not by somebody who
+    also writes a new digest.
     A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
     works.
 
@@ -105,9 +110,17 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
     try:
         result = _calibration(file, known)
         _compare(file, result)
+        if _same_formulas(file):
+            agreement(stored, derived(result), "key")
+        _require_digest(stored)
     except InputError as error:
         raise error.within(path) from None
-    except (TypeError, ValueError, LookupError) as error:  # well-formed parts that were put together by hand
+    except (
+        TypeError,
+        ValueError,
+        LookupError,
+        ArithmeticError,
+    ) as error:  # well-formed parts that were put together by hand
         found = f"parts that do not fit together ({error})"
         raise InputError("the file", found, "one as it was written", path) from None
     return result
@@ -123,14 +136,17 @@ def _require_format(stored: Any, path: Path) -> None:
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         accepted = "a file of `rpim-opt calibrate --out` or save_result()"
         raise InputError("the file", "no result of rpim-opt", accepted, path)
-    version = stored.get("version")
-    if version != VERSION:
-        raise InputError("key version", repr(version)[:40], f"{VERSION}; a newer rpim-opt may read it", path)
+    written = stored.get("version")
+    if written != VERSION:
+        raise InputError("key version", repr(written)[:40], f"{VERSION}; a newer rpim-opt may read it", path)
 
 
 def _calibration(file: File, known: Mapping[str, Measurement]) -> Calibration:
     problem = CalibrationProblem(
-        robot_of(file.robot), parameters_of(file.model), data_of(file.data.identification, known)
+        robot_of(file.robot),
+        parameters_of(file.model),
+        data_of(file.data.identification, known),
+        scatter=scatter_of(file.scatter),
     )
     x = np.array(file.x)
     unknowns = len(problem.parameters.free)
@@ -149,9 +165,10 @@ def _calibration(file: File, known: Mapping[str, Measurement]) -> Calibration:
         history=_history(file),
         program=program,
         certificate=_certificate(file),
-        asked=partial(calibrate, formulation=formulation, weight=_rule(file)),
+        asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
         record=_record(file, problem, known),
         kept=None if formulation.solvable else _kept(file, program),
+        learned=learned_of(file.learned),
     )
 
 
@@ -172,11 +189,20 @@ def _certificate(file: File) -> Certificate:
     return Certificate(**stated)
 
 
-def _rule(file: File) -> float | Selector:
-    """Return the selector that chose the weight, where it is a ready one, and otherwise the weight."""
+def _rule(file: File) -> float | Selector | None:
+    """Return the selector that chose the weight, where it is a ready one, and otherwise the weight; None: learned."""
+    if file.learned is not None:
+        return None
     if file.selection is None:
         return file.weight
     return SELECTORS.get(file.selection.name, file.weight)
+
+
+def _model(file: File) -> str:
+    """Return whether families were compared."""
+    if file.learned is not None and file.learned.trials:
+        return "auto"
+    return "geometry"
 
 
 def _history(file: File) -> tuple[Iteration, ...]:
@@ -227,6 +253,18 @@ def _compare(file: File, result: Calibration) -> None:
         if off > AGREEMENT_MM:
             found = f"errors up to {off:.2g} mm off those that the file's data give"
             raise InputError(f"key rows.{name}", found, "the file as it was written, and the same measurement models")
+
+
+def _same_formulas(file: File) -> bool:
+    """Whether this version wrote the file; a later one may define a figure differently, and must still read it."""
+    return file.record.versions.get("rpim-opt", version("rpim-opt")) == version("rpim-opt")
+
+
+def _require_digest(stored: Mapping[str, Any]) -> None:
+    found = digest(stored)
+    if stored["digest"] != found:
+        accepted = "the file as it was written: something in it was changed"
+        raise InputError("key digest", f"'{stored['digest'][:12]}...' for a content of '{found[:12]}...'", accepted)
 
 
 def _stated(rows: Sequence[RowPart]) -> np.ndarray:

@@ -21,6 +21,16 @@ class Part(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
 
 
+class GravityPart(Part):
+    """Where gravity points and what it pulls at, as `Gravity` has it."""
+
+    direction: Vector
+    masses: Vector
+    centres: Matrix
+    payload: float
+    payload_centre: Vector
+
+
 class RobotPart(Part):
     """The nominal robot."""
 
@@ -30,6 +40,7 @@ class RobotPart(Part):
     joint_types: list[str]
     joint_map: Matrix
     limits: list[Annotated[list[float | None], Field(min_length=2, max_length=2)]]
+    gravity: GravityPart | None = None
 
 
 class ParameterPart(Part):
@@ -54,6 +65,8 @@ class BlockPart(Part):
     y: Matrix
     covariance: Cube
     torque: Cube | None
+    payload: Vector | None = None
+    approach: Cube | None = None
 
 
 class DataPart(Part):
@@ -80,6 +93,7 @@ class SelectionPart(Part):
     score: list[float | None]
     interior: bool
     note: str
+    groups: dict[str, float] = Field(default_factory=dict)
 
 
 class QuadraticPart(Part):
@@ -162,6 +176,54 @@ class RowPart(Part):
     identified_mm: float | None
 
 
+class SizePart(Part):
+    """A size, and the standard deviation of its logarithm."""
+
+    value: float
+    spread: float
+
+
+class TrialPart(Part):
+    """Families of a model, and -2 ln of their likelihood."""
+
+    families: list[str]
+    value: float
+
+
+class LeftOutPart(Part):
+    """A row that was left out, and its error over the median."""
+
+    label: str
+    ratio: float
+
+
+class LearnedPart(Part):
+    """What was learned before the last fit."""
+
+    sizes: dict[str, SizePart]
+    noise: dict[str, SizePart]
+    local: Vector
+    trials: list[TrialPart]
+    value: float
+    freedom: float
+    left_out: list[LeftOutPart]
+    covariance: Matrix
+    stated: Vector
+    drift: Matrix
+    added: list[str]
+    notes: list[str] = Field(default_factory=list)
+
+
+class ScatterPart(Part):
+    """The robot's own noise."""
+
+    position: float
+    orientation: float
+    joint: float
+    instrument: float
+    at: Vector | None
+
+
 class File(Part):
     """A result file; what it holds besides follows from this."""
 
@@ -185,3 +247,6 @@ class File(Part):
     data: SetsPart
     record: RecordPart
     rows: dict[str, list[RowPart]]
+    scatter: ScatterPart | None = None
+    learned: LearnedPart | None = None
+    digest: str

@@ -38,7 +38,8 @@ identification = "identification.csv"
 identify = {identify}
 
 formulation = "tikhonov"        # "robust" where rows may be wrong; "bounded" keeps to [tolerance]
-selector = "reml"               # how the penalty's weight is chosen: l_curve, gcv, k_fold, ..., or a number, "0.5"
+model = "auto"                  # adds what geometry lacks (gravity, gears) where the data want it; or "geometry"
+# selector = "learned"          # sizes of deviations and noise; or one weight over [scale]: reml, l_curve, ...
 {auto}
 # Standard deviation of a measured value, for rows that state none (column sigma_mm). Guessed: a laser tracker, and a
 # robot that repeats well. reml finds the level itself; what counts is how kinds and rows compare.
@@ -46,7 +47,8 @@ selector = "reml"               # how the penalty's weight is chosen: l_curve, g
 {noise}
 
 # Expected size of deviations (prior standard deviation). Guessed: a machined arm, a reflector measured roughly.
-# Single parameters by name: d5_mm, theta3_mrad.
+# Single parameters by name: d5_mm, theta3_mrad; joint_offset_mrad for every theta, which is otherwise expected to be
+# three times as large, because joint offsets are set at assembly.
 [scale]
 length_mm = 1.0                 # a, d
 angle_mrad = 1.0                # alpha, theta, beta

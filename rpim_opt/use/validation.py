@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import f as fisher
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.statistics import statistics
-from rpim_opt.basics.tables import csv_text, read_columns
+from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.calibration.intervals import coverage_factor, scattered
+from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.naming import parse_units, rename
+from rpim_opt.data.naming import rename
 from rpim_opt.data.reading import read_data
+from rpim_opt.data.spelling import parse_units
+from rpim_opt.data.understanding import Asked, understand
+from rpim_opt.robot.mdh import Robot
 
 RARE = 0.01
 """Probability that data like those of the calibration have any row that is named."""
+CONFIDENCE = 0.95
+"""Of the intervals whose coverage is counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +49,14 @@ class Validation:
     angle
         (N,) orientation errors [rad]; NaN for rows that are no poses.
     sigmas, allowed
-        (N,) |S^-1/2 r| of a row's residual r, with S = J C J' + its measurement's covariance and C the calibration's,
-        and what of it chi^2 allows so that one of all N rows exceeds it with probability `RARE`. NaN where the
-        calibration has no covariance, or none in a direction that the row depends on.
+        (N,) |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the instrument's as the
+        row states it, and the robot's scatter) and C the calibration's, and what of it Fisher's F allows so that one
+        of all N rows exceeds it with probability `RARE`. NaN where the calibration has no covariance, or none in a
+        direction that the row depends on.
+    coverage
+        Share of the lengths that lie in the interval of a new reading at a confidence of 0.95; None without covariance.
+    outside
+        Rows beyond the joint ranges that the calibration measured.
 
     Examples
     --------
@@ -54,7 +66,7 @@ class Validation:
     >>> f"{1e3 * found.largest:.2f} mm", found.beyond  # no row that the uncertainty does not explain
     ('0.04 mm', ())
     >>> found.csv().splitlines()[0].split(",")[0], sorted(found.content())[:3]
-    ('label', ['axes', 'beyond', 'identified'])
+    ('label', ['axes', 'beyond', 'coverage95'])
     """
 
     label: tuple[str, ...]
@@ -64,6 +76,8 @@ class Validation:
     angle: Array
     sigmas: Array
     allowed: Array
+    coverage: float | None = None
+    outside: Outside = field(default_factory=Outside)
 
     @property
     def largest(self) -> float:
@@ -86,6 +100,8 @@ class Validation:
             "axes": {a: {**statistics(np.abs(v)), "bias_mm": 1e3 * v.mean()} for a, v in axes.items() if len(v)},
             "orientation": statistics(self.angle, "mrad"),
             "beyond": [self.label[i] for i in self.beyond],
+            "coverage95": self.coverage,
+            "outside": [self.label[i] for i in self.outside.rows],
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
         }  # fmt: skip
@@ -108,18 +124,22 @@ class Validation:
         if turn["count"]:
             figures = [f"{turn[k]:.4f}" for k in ("mean_mrad", "rms_mrad", "max_mrad")]
             rows.append(["orientation, identified [mrad]", str(turn["count"]), *figures])
-        return "\n".join([table(["error [mm]", "rows", "mean", "RMS", "max"], rows), self._judgement()])
+        errors = table(["error [mm]", "rows", "mean", "RMS", "max"], rows)
+        return "\n".join([errors, self._judgement(), *self.outside.sentences()])
 
     def _judgement(self) -> str:
         if not np.isfinite(self.sigmas).any():
             return "The calibration has no covariance for these rows: how large errors may be is not known."
+        covered = ""
+        if self.coverage is not None:
+            covered = f" {self.coverage:.0%} of the coordinates lie in their 95 % intervals of a reading."
         if not self.beyond:
-            return "No row is beyond what the prediction's uncertainty allows."
+            return f"No row is beyond what the prediction's uncertainty allows.{covered}"
         named = ", ".join(
             f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond[:8]
         )
         more = f" and {len(self.beyond) - 8} more" if len(self.beyond) > 8 else ""
-        return f"Beyond what the prediction's uncertainty allows: {named}{more}."
+        return f"Beyond what the prediction's uncertainty allows: {named}{more}.{covered}"
 
     def _rows(self) -> dict[str, Sequence[Any]]:
         mm = {f"{axis}_mm": (1e3 * v).tolist() for axis, v in zip("xyz", self.vectors.T, strict=True)}
@@ -150,7 +170,7 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     """
     return Validation(
         data.label, result.nominal_errors(data), result.errors(data), result.error_vectors(data),
-        result.errors(data, "angle"), *_sigmas(result, data),
+        result.errors(data, "angle"), *_judged(result, data), result.outside(data),
     )  # fmt: skip
 
 
@@ -159,14 +179,14 @@ def read_measurements(
 ) -> tuple[Dataset, tuple[str, ...]]:
     """Return the measurements of a table, whose columns `naming.rename` recognises, and columns that were left out.
 
-    Rows that state no uncertainty have that of the calibration's data, at the noise level that it observed.
+    Rows that state no uncertainty have that of the calibration's data.
 
     Parameters
     ----------
     result
         The calibration.
     source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), or a data frame.
+        A text, Excel or Parquet file as ``rpim-opt new`` takes it, or a data frame.
     measurement
         Which of the calibration's kinds, where it has several.
     units
@@ -188,46 +208,69 @@ def read_measurements(
         raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
     given = parse_units(units)
     try:
-        found = rename(read_columns(source), result.problem.robot, kinds[name], given)
-        data = read_data(found.columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
+        columns, left_out = _columns(source, result.problem.robot, kinds[name], given)
+        data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
-    return data, found.left_out
+    return data, left_out
+
+
+def _columns(source: Any, robot: Robot, kind: Measurement, units: Mapping[str, str]) -> tuple[Columns, tuple[str, ...]]:
+    """Return the columns of a table by our names, and those that were left out; files as `rpim-opt new` has them."""
+    if not isinstance(source, str | Path):
+        renamed = rename(read_columns(source), robot, kind, units)
+        return renamed.columns, renamed.left_out
+    found = understand(Path(source), robot, kind, Asked(units=units))
+    if found.numbered and kind.name == "pose":
+        raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+    return found.columns, tuple(each.column for each in found.meant if each.meaning == "left out")
 
 
 def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:
     """Return the typical standard deviation of every component, as a table ``[noise]`` has it."""
     blocks = [block for block in result.problem.data.blocks if block.measurement is kind]
     variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
-    level = 1.0 if known_covariance(result) is None else result.noise_variance
     si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in kind.components.values()}
-    sigma = zip(kind.components.items(), np.sqrt(level * variance), strict=True)
+    sigma = zip(kind.components.items(), np.sqrt(variance), strict=True)
     return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma}
 
 
-def _sigmas(result: Calibration, data: Dataset) -> tuple[Array, Array]:
-    """Return the rows' residuals in standard deviations of their prediction and measurement, and the bound of them."""
+def _judged(result: Calibration, data: Dataset) -> tuple[Array, Array, float | None]:
+    """Return the rows' residuals in standard deviations of a reading, what of it is allowed, and the coverage."""
     N = len(data)
-    C = known_covariance(result)
-    start = 0
     sigmas = np.full(N, np.nan)
     allowed = np.full(N, np.nan)
+    inside: list[np.ndarray] = []
+    C = known_covariance(result)
     if C is None:
-        return sigmas, allowed
+        return sigmas, allowed, None
     problem = result.problem.on(data)
     residual = problem.residual(result.x)
     J = problem.jacobian(result.x)
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
-    for block in data.blocks:
+    factor = coverage_factor(result.freedom, CONFIDENCE)
+    start = 0
+    for block, reading in zip(data.blocks, scattered(problem, result.noise_level).reading, strict=True):
         k = len(block.measurement.components)
         end = start + k * len(block.row)
         r = residual[start:end].reshape(-1, k)
         A = J[start:end].reshape(-1, k, len(C))
         start = end
-        S = A @ C @ A.transpose(0, 2, 1) + block.covariance
+        S = A @ C @ A.transpose(0, 2, 1) + reading
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
         sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
-        allowed[block.row] = np.where(seen, np.sqrt(chi2.ppf(1 - RARE / N, k)), np.nan)
-    return sigmas, allowed
+        allowed[block.row] = np.where(seen, _limit(k, result.freedom, N), np.nan)
+        lengths = np.array([d == "length" for d in block.measurement.components.values()])
+        within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
+        inside.append(within[seen][:, lengths].ravel())
+    covered = np.concatenate(inside)
+    if not len(covered):
+        return sigmas, allowed, None
+    return sigmas, allowed, float(covered.mean())
+
+
+def _limit(k: int, freedom: float, rows: int) -> float:
+    """Return above which norm one of so many rows with k components lies with probability `RARE`."""
+    return float(np.sqrt(k * fisher.isf(RARE / rows, k, max(freedom, 1.0))))

@@ -14,7 +14,7 @@ VARIANTS = (None, "tikhonov", "bounded", "weighted", "two_step", "swap", "length
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_papers_arm_and_its_variants_reproduce_their_reference(variant: str | None) -> None:
     instance = ro.load("paper_arm", variant)
-    result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    result = instance.calibrate()
     assert result.converged
     assert result.selection is not None
     mean = {
@@ -59,7 +59,7 @@ def test_the_answer_is_a_stationary_point_of_the_nonlinear_problem(weight: float
 
 def test_the_papers_answer_is_stationary() -> None:
     instance = ro.load("paper_arm")
-    assert gradient(ro.calibrate(instance.problem, instance.formulation, instance.weight)) < 1e-8
+    assert gradient(instance.calibrate()) < 1e-8
 
 
 @pytest.mark.parametrize("formulation", [ro.tikhonov, ro.bounded])
@@ -128,7 +128,7 @@ def test_weights_of_the_data_act() -> None:
 
 def test_identified_robot_predicts_what_the_calibration_does() -> None:
     instance = ro.load("paper_arm")
-    result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    result = instance.calibrate()
     data = instance.problem.data
     position = ro.robot.forward_kinematics(result.robot, data.q)[:, :3, 3]
     assert np.abs(np.linalg.norm(position - data.blocks[0].y, axis=1) - result.errors()).max() < 1e-12
@@ -169,6 +169,6 @@ def test_a_start_has_one_deviation_a_parameter() -> None:
 
 def test_a_calibration_prints_itself() -> None:
     instance = ro.load("paper_arm")
-    text = str(ro.calibrate(instance.problem, instance.formulation, instance.weight))
+    text = str(instance.calibrate())
     for expected in ("deviation", "d5", "deg", "mm after", "corner of the L-curve", "Converged"):
         assert expected in text

@@ -16,7 +16,7 @@ BLUNDERS = set(tomllib.loads((problems_folder() / "blunders" / "truth.toml").rea
 
 def test_all_published_points_with_the_two_misprints() -> None:
     instance = ro.load("paper_arm", "misprints")
-    result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    result = instance.calibrate()
     assert result.converged
     assert len(instance.problem.data) == 27
     assert [flag.label for flag in result.flagged[:2]] == ["T8-6", "T8-7"]
@@ -54,7 +54,7 @@ def test_without_blunders_a_robust_loss_costs_little() -> None:
 
 
 def test_the_command_names_and_refits(monkeypatch, capsys) -> None:
-    assert run(monkeypatch, "calibrate", "blunders", "--formulation", "robust", "--refit") == 0
+    assert run(monkeypatch, "calibrate", "blunders", "--formulation", "robust", "--select", "reml", "--refit") == 0
     out = capsys.readouterr().out
     assert "Refitted without " in out
     assert all(label in out for label in BLUNDERS)

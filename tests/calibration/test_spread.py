@@ -13,6 +13,7 @@ from scipy.stats import t as student
 
 import rpim_opt as ro
 from rpim_opt.calibration import Uncertainty
+from rpim_opt.calibration.intervals import noise_test
 from tests.simulate import simulated
 
 PROBLEM, _ = simulated(noise=5e-5, configurations=25)
@@ -50,7 +51,12 @@ def test_intervals_are_students() -> None:
 
 def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     result: Any = SimpleNamespace(
-        linear_penalty=True, equations=equations, degrees_of_freedom=dof, noise_variance=variance
+        linear_penalty=True,
+        equations=equations,
+        degrees_of_freedom=dof,
+        freedom=max(equations - dof, 0.0),
+        noise_variance=variance,
+        noise_test=lambda: noise_test(variance * (equations - dof), equations - dof),
     )
     return Uncertainty(result)
 
@@ -122,15 +128,15 @@ def test_predictions_propagate() -> None:
     h = 1e-6
 
     def at(x: np.ndarray) -> np.ndarray:
-        return RESULT._at(q, ro.data.models.position, "", None).modelled(x)[0]
+        return RESULT._at(q, ro.data.models.position, "", None, None).modelled(x)[0]
 
     J = np.stack([(at(RESULT.x + h * e) - at(RESULT.x - h * e)) / (2 * h) for e in np.eye(len(SCALE))], axis=2)
     want = np.einsum("nij,jk,nlk->nil", J, RESULT.covariance, J)
-    found = RESULT.predict(q)
+    found = RESULT.predict(q, of="mean")
     assert found.position == pytest.approx(at(RESULT.x), abs=1e-12)
     assert found.covariance == pytest.approx(want, rel=1e-4, abs=1e-14)
     assert found.standard**2 == pytest.approx(np.einsum("nii->ni", want), rel=1e-4)
-    wide = Uncertainty(RESULT, 0.99).predict(q)
+    wide = Uncertainty(RESULT, 0.99).predict(q, of="mean")
     assert wide.expanded == pytest.approx(Uncertainty(RESULT, 0.99).coverage_factor * wide.standard, rel=1e-12)
 
 

@@ -54,7 +54,7 @@ def test_the_noise_is_compared_with_the_declared() -> None:
 
 def test_what_active_bounds_do_is_said() -> None:
     instance = ro.load("constrained", "wrong_tolerance")
-    u = ro.calibration.Uncertainty(ro.calibrate(instance.problem, instance.formulation, instance.weight))
+    u = ro.calibration.Uncertainty(instance.calibrate())
     assert "a5" in u.at_bound
     assert "a5 *" in u.budget()
     assert "held by a bound" in u.budget()

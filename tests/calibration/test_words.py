@@ -99,14 +99,12 @@ def test_a_weight_is_said_with_where_it_came_from() -> None:
 def test_passes_are_counted(count: int, said: str) -> None:
     evidence = Certificate(None, 0.0, 0.0, 0.0)
     before = state(history=(None,) * count, outcome="rest")
-    assert _message(before, evidence, True, 500, False) == f"Converged after {said}."
-    far = _message(before, evidence, True, 500, True)
-    assert far.startswith(f"Converged after {said}. Frames were stated far from")
+    assert _message(before, evidence, True, 500) == f"Converged after {said}."
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
-    assert _message(noted, evidence, True, 500, False) == f"Converged after {said}. It alternates."
-    stuck = _message(replace(before, outcome="stuck"), evidence, False, 500, False)
+    assert _message(noted, evidence, True, 500) == f"Converged after {said}. It alternates."
+    stuck = _message(replace(before, outcome="stuck"), evidence, False, 500)
     assert "no step lowers the nonlinear objective" in stuck
-    doubted = _message(before, Certificate(None, 0.0, 0.0, 0.5), False, 500, False)
+    doubted = _message(before, Certificate(None, 0.0, 0.0, 0.5), False, 500)
     assert "still promises 0.5 of the objective" in doubted
-    ended = _message(replace(before, outcome="", history=()), evidence, False, 7, False)
+    ended = _message(replace(before, outcome="", history=()), evidence, False, 7)
     assert ended == "Not converged: 7 passes were not enough; give more (max_iterations)."

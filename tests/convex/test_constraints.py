@@ -72,7 +72,7 @@ def test_multipliers_are_the_slopes_of_the_optimum() -> None:
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_constrained_calibrations_reproduce_their_reference(variant: str | None) -> None:
     instance = ro.load("constrained", variant)
-    result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    result = instance.calibrate()
     assert result.converged
     assert 1e3 * result.errors(instance.validation).mean() == pytest.approx(
         *instance.reference["validation_mm"][:1], abs=1e-4
@@ -107,7 +107,7 @@ def test_what_is_known_helps() -> None:
     errors = {}
     for variant in (None, "equal_links", "parallel_axes"):
         instance = ro.load("constrained", variant)
-        result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+        result = instance.calibrate()
         errors[variant] = result.errors(instance.validation).mean()
     assert errors["equal_links"] < errors[None]
     assert errors["parallel_axes"] < errors[None]

@@ -142,7 +142,7 @@ def test_selectors_that_disagree_are_said() -> None:
     real = SHARED / "data" / "wam_jacobi"
     if real.is_dir():
         instance = ro.load(real)
-        result = ro.calibrate(instance.problem, instance.formulation, instance.weight)
+        result = ro.calibrate(instance.problem, instance.formulation, ro.reml)
         assert "selectors disagree by" in result.weight_sentence()
 
 

@@ -262,7 +262,7 @@ def test_least_squares_predicts_positions_that_the_data_know(name: str) -> None:
     assert np.isinf(np.diag(result.covariance)).any()
     block = problem.data.blocks[0]
     q = block.q[:5, 0]
-    found = result.predict(q, block.markers[0])
+    found = result.predict(q, block.markers[0], of="mean")
     assert np.isfinite(found.standard).all()
     assert found.standard.max() < 1e-3
     m, scale = len(model.b), model.parameters.scale

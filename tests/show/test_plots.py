@@ -54,7 +54,7 @@ def test_distrusted_rows_are_marked(ax) -> None:
 @pytest.fixture(scope="module")
 def fitted() -> tuple[ro.store.Instance, ro.calibration.Calibration]:
     instance = ro.load("constrained", "wrong_tolerance")
-    return instance, ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    return instance, ro.calibrate(instance.problem, instance.formulation, ro.reml)
 
 
 def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:

@@ -28,7 +28,7 @@ NEEDED = {"position", "pose", "markers", "cable", "distance", "plane", "sphere",
 @cache
 def calibrated(name: str) -> tuple[ro.store.Instance, ro.calibration.Calibration]:
     instance = ro.load(name)
-    return instance, ro.calibrate(instance.problem, instance.formulation, instance.weight)
+    return instance, instance.calibrate()
 
 
 def test_the_set_is_complete() -> None:

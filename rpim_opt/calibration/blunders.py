@@ -1,0 +1,201 @@
+"""Rows that are blunders: far from what all the others say, one by one and not as a cluster of neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.diagnosis import error_vectors
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
+
+BEYOND, LOOK = 6.0, 3.0
+"""Medians of the errors beyond which a position is suspected; and from which on anyone looks."""
+EXPECTED = 3
+"""Components of a row for which that number holds; of others the multiple with the same false rate."""
+SPARE = 0.4
+"""Part of the equations that must be left over: errors that the fit has swallowed tell nothing."""
+WELL_DETERMINED = 10.0
+"""Equations a parameter from which on no single row can pull the fit to itself."""
+TRUSTED, STEPS = 1.5, 50
+"""Medians up to which a resistant fit trusts a row wholly; reweighted fits, at most."""
+SAME = 1e-3
+"""Weights of rows that have settled change by no more."""
+NEIGHBOURS, ALIKE = 3, 0.7
+"""Suspects from which on they may be a cluster, and the cosine of errors that point the same way."""
+
+
+def ratios(problem: CalibrationProblem, x: Array) -> Array:
+    """Return every row's error over the median of its kind (N,), in multiples that are as rare as those of positions.
+
+    The larger of those of lengths and of angles, at the deviations x (n,) [SI].
+    """
+    components = np.zeros((len(problem.data), 2), dtype=int)
+    for block in problem.data.blocks:
+        dimensions = list(block.measurement.components.values())
+        components[block.row] = [dimensions.count("length"), dimensions.count("angle")]
+    found = np.zeros(len(problem.data))
+    for dimension, counts in zip(("length", "angle"), components.T, strict=True):
+        errors = problem.errors(x, dimension)
+        for k in np.unique(counts[counts > 0]):
+            rows = np.flatnonzero(counts == k)
+            median = max(float(np.median(errors[rows])), 1e-12)
+            found[rows] = np.maximum(found[rows], errors[rows] / median / _multiple(int(k)))
+    return found
+
+
+def _rare() -> float:
+    """Return how rarely the error of a good position is beyond `BEYOND` medians."""
+    return float(chdtrc(EXPECTED, BEYOND**2 * chdtri(EXPECTED, 0.5)))
+
+
+def _multiple(k: int) -> float:
+    """Return which multiple of the median is as rare for k components as `BEYOND` is for positions, over `BEYOND`."""
+    return float(np.sqrt(chdtri(k, _rare()) / chdtri(k, 0.5)) / BEYOND)
+
+
+def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
+    """Return deviations (n,) [SI] that no few rows pull to themselves.
+
+    Huber's loss of the rows' errors over their own median, by reweighted squares of the linearization at x::
+
+        minimize    sum_i w_i |e_i|^2 / median^2 + |x / scale|^2,    w_i = min(1, TRUSTED median / |e_i|)
+
+    Parameters
+    ----------
+    problem
+        In memory.
+    x
+        (n,) deviations where it is linearized [SI].
+    scale
+        (n,) their expected sizes [SI].
+    """
+    X = problem.jacobian(x) * scale
+    y = problem.residual(x) + problem.jacobian(x) @ x
+    rows = np.concatenate([np.repeat(b.row, len(b.measurement.components)) for b in problem.data.blocks])
+    angles = np.concatenate([_angles(b.measurement.components.values(), len(b.row)) for b in problem.data.blocks])
+    z = x / scale
+    weight = np.ones(len(problem.data))
+    for _ in range(STEPS):
+        unit = _medians(y - X @ z, rows, angles)
+        relative = (y - X @ z) / unit
+        size = np.sqrt(np.bincount(rows, relative**2) / np.bincount(rows))
+        before = weight
+        weight = np.minimum(1.0, TRUSTED / np.maximum(size, 1e-12))
+        root = np.sqrt(weight)[rows] / unit
+        A = np.vstack([X * root[:, None], np.eye(len(z))])
+        z = np.linalg.lstsq(A, np.concatenate([y * root, np.zeros(len(z))]), rcond=None)[0]
+        if np.abs(weight - before).max() <= SAME:
+            break
+    return scale * z
+
+
+def _angles(dimensions: Iterable[str], rows: int) -> np.ndarray:
+    return np.tile([dimension == "angle" for dimension in dimensions], rows)
+
+
+def _medians(e: Array, rows: np.ndarray, angles: np.ndarray) -> Array:
+    """Return the median size of an error of its kind for every equation (m,): of angles, and of all others."""
+    found = np.empty_like(e)
+    for kind in (angles, ~angles):
+        if kind.any():
+            mean = np.bincount(rows[kind], e[kind] ** 2) / np.maximum(np.bincount(rows[kind]), 1)
+            seen = np.bincount(rows[kind]) > 0
+            found[kind] = max(float(np.sqrt(np.median(mean[seen]))), 1e-12)
+    return found
+
+
+def suspected(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
+    """Return the rows that may be blunders, label to error over the median.
+
+    Parameters
+    ----------
+    problem
+        In memory.
+    x, scale
+        (n,) deviations of a squared fit, and their expected sizes [SI].
+    spare
+        Part of the equations that this fit left over.
+    """
+    ratio = ratios(problem, x)
+    if spare < SPARE or ratio.max() < LOOK:
+        return {}
+    if len(problem.groups) < WELL_DETERMINED * len(x):
+        ratio = ratios(problem, resistant(problem, x, scale))
+    rows = np.flatnonzero(ratio > BEYOND)
+    alone = rows[~clustered(problem, x, rows)]
+    return {problem.labels[i]: float(ratio[i]) for i in alone}
+
+
+def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
+    """Return which of some rows (r,) err as their neighbours in joint space do: that is physics, and no blunder."""
+    if len(rows) < NEIGHBOURS:
+        return np.zeros(len(rows), dtype=bool)
+    q = problem.data.q
+    unit = (q - q.mean(axis=0)) / (q.std(axis=0) + 1e-9)
+    errors = np.nan_to_num(error_vectors(problem, x))
+    length = np.maximum(np.linalg.norm(errors, axis=1), 1e-12)
+    among = np.zeros(len(q), dtype=bool)
+    among[rows] = True
+    found = np.zeros(len(rows), dtype=bool)
+    for k, i in enumerate(rows):
+        apart = np.sum((unit - unit[i]) ** 2, axis=1)
+        apart[problem.data.configuration == problem.data.configuration[i]] = np.inf
+        j = int(np.argmin(apart))
+        found[k] = among[j] and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
+    return found
+
+
+def beyond(problem: Source, x: Array) -> dict[str, float]:
+    """Return the rows that the noise of a fit to some of them cannot explain, by the same false rate.
+
+    For so many measurements that no single one pulls the fit, and that are not fitted all before sizes are known.
+
+    Parameters
+    ----------
+    problem
+        In memory or in parts, with the scatter.
+    x
+        (n,) deviations [SI].
+    """
+    norms, count = problem.whitened_errors(x)
+    rare = chdtrc(count, norms**2) < _rare()
+    typical = norms / np.sqrt(chdtri(count, 0.5))
+    labels = problem.labels
+    return {labels[i]: float(typical[i]) for i in np.flatnonzero(rare)}
+
+
+def unbelievable(
+    problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]
+) -> dict[str, float]:
+    """Return those of some left-out rows that a fit without them cannot explain, by the same false rate.
+
+    Parameters
+    ----------
+    problem
+        With all rows, and the scatter.
+    x, covariance
+        (n,) and (n, n): the fit without the rows, and what is not known of it [SI].
+    labels
+        The rows.
+    """
+    kept = dict(labels)
+    rows = problem.on(problem.data.take([problem.labels.index(label) for label in labels]))
+    residual = rows.residual(x)
+    J = rows.jacobian(x)
+    start = 0
+    for block, V in zip(rows.data.blocks, rows.covariances(), strict=True):
+        k = len(block.measurement.components)
+        end = start + k * len(block.row)
+        r = residual[start:end].reshape(-1, k, 1)
+        slopes = J[start:end].reshape(-1, k, len(x))
+        start = end
+        S = slopes @ covariance @ slopes.transpose(0, 2, 1) + V
+        squares = np.sum(r * np.linalg.solve(S, r), axis=(1, 2))
+        for row, square in zip(block.row, squares, strict=True):
+            if chdtrc(k, square) > _rare():
+                kept.pop(rows.labels[row])
+    return kept

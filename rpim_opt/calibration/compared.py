@@ -1,0 +1,201 @@
+"""The evidence of families at a result, whatever its weight: with what it identifies, without, and with more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.blunders import clustered
+from rpim_opt.calibration.families import members
+from rpim_opt.calibration.learning import sampled
+from rpim_opt.calibration.models import candidates, extended, restricted
+from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.sizing import Learning, few
+from rpim_opt.convex.evidence import CENTRES, Evidence, Point
+from rpim_opt.convex.prior import Prior, family_of
+from rpim_opt.problem.problem import CalibrationProblem
+
+SPEAK = 10.0
+"""By how much -2 ln L must fall for a family to be spoken of: 4 is what a false pick gains, 10 none in many."""
+EXACT = 1e-7
+"""Relative accuracy of -2 ln L: far below what decides."""
+OWNED = {"gravity": ("compliance", "bend"), "first harmonic": ("ecc",), "second harmonic": ("ecc2",)}
+"""Families whose worth is asked, and what stands for them."""
+KNOWN = Prior(joint_offset=1.0, frames=1.0)
+"""What is believed once scales were learned: they are as the problem says."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A model that was compared: families beside what the result identifies, its parameters, and their sizes."""
+
+    families: tuple[str, ...]
+    names: tuple[str, ...]
+    evidence: Evidence
+    point: Point
+
+    @cached_property
+    def residual(self) -> Array:
+        """What it leaves (m,) [SI]."""
+        data = self.evidence.data
+        return data.y - data.X @ self.point.z
+
+
+class Comparison:
+    """Models with and without families, all at the linearization of one result.
+
+    Parameters
+    ----------
+    result
+        Any calibration; of large data `learning.MOST` configurations are looked at.
+    """
+
+    def __init__(self, result: Outcome) -> None:
+        self.result = result
+        self.problem = _trusted(result)
+        self.own = self.problem.parameters.free.names
+        self.families = members(self.problem)
+        every = tuple(name for names in self.families.values() for name in names)
+        whole, x = extended(self.problem, result.x, every)
+        self.names = whole.parameters.free.names
+        self.columns = _learning(result).evidence(whole, x)
+
+    @cached_property
+    def configurations(self) -> int:
+        """How many configurations are looked at."""
+        return len(np.unique(self.problem.data.configuration))
+
+    @cached_property
+    def dimension(self) -> str:
+        """``length``, or ``angle`` where none was measured."""
+        if any(stack.length.any() for stack in self.columns.data.stacks):
+            return "length"
+        return "angle"
+
+    @cached_property
+    def equations(self) -> np.ndarray:
+        """The numbers of the equations of that dimension."""
+        stacks = self.columns.data.stacks
+        return np.sort(np.concatenate([stack.index[getattr(stack, self.dimension)] for stack in stacks]))
+
+    @cached_property
+    def row(self) -> np.ndarray:
+        """The row (m,) of every equation."""
+        blocks = self.problem.data.blocks
+        return np.concatenate([np.repeat(block.row, len(block.measurement.components)) for block in blocks])
+
+    @cached_property
+    def rows(self) -> int:
+        """How many rows have such equations."""
+        return len(np.unique(self.row[self.equations]))
+
+    @cached_property
+    def spare(self) -> float:
+        """How many equations the deviations leave over, in the result's model."""
+        point = self.plain.point
+        return len(self.row) - float(np.sum(1 - np.diag(point.C) / point.v))
+
+    @cached_property
+    def plain(self) -> Judged:
+        """The model that the result has."""
+        used = np.isin(self.names, self.own)
+        evidence = restricted(self.columns, used)
+        first = [self._start(evidence)]
+        if self.result.learned is None and few(self.problem):
+            first = evidence.starts()
+        return Judged((), self.own, evidence, evidence.mode(first, EXACT)[0])
+
+    @cached_property
+    def best(self) -> Judged:
+        """The model that the data want, at a price of `SPEAK` a family."""
+        models = [self.plain, *(self._with(families) for families in self._candidates)]
+        return min(models, key=lambda model: model.point.value + SPEAK * len(model.families))
+
+    @cached_property
+    def gain(self) -> float:
+        """By how much -2 ln L falls from the result's model to the best."""
+        return self.plain.point.value - self.best.point.value
+
+    def owned(self) -> dict[str, np.ndarray]:
+        """Return the families that the result identifies, with which parameters (n,) are theirs.
+
+        First moments of links are gravity's, too: either would stand for the other.
+        """
+        group = [family_of(name) for name in self.own]
+        found = {}
+        for family, patterns in OWNED.items():
+            members = np.isin(group, patterns)
+            if members.any():
+                found[family] = members
+        return found
+
+    def worth(self, members: np.ndarray) -> float:
+        """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""
+        keep = np.isin(self.names, [name for name, out in zip(self.own, members, strict=True) if not out])
+        return self._fitted((), keep).point.value - self.plain.point.value
+
+    @property
+    def _candidates(self) -> Sequence[tuple[str, ...]]:
+        learned = self.result.learned
+        if learned is not None and learned.trials:  # the evidence has spoken
+            return ()
+        return [families for families in candidates(self.problem, self.families) if families]
+
+    def _with(self, families: tuple[str, ...]) -> Judged:
+        used = set(self.own).union(*(self.families[family] for family in families))
+        return self._fitted(families, np.isin(self.names, list(used)))
+
+    def _fitted(self, families: tuple[str, ...], keep: np.ndarray) -> Judged:
+        """Return a model at its sizes, looked for from those of the result's."""
+        evidence = restricted(self.columns, keep)
+        names = tuple(np.array(self.names)[keep].tolist())
+        return Judged(families, names, evidence, evidence.mode([self._from_plain(evidence)], EXACT)[0])
+
+    def _from_plain(self, evidence: Evidence) -> Array:
+        plain = self.plain
+        known = dict(zip(_sizes(plain.evidence), plain.point.logs, strict=True))
+        return np.array([known.get(name, c) for name, c in zip(_sizes(evidence), evidence.centre, strict=True)])
+
+    def _start(self, evidence: Evidence) -> Array:
+        """Return the sizes that a result learned, as far as it did."""
+        learned = self.result.learned
+        logs = evidence.centre.copy()
+        if learned is None:
+            return logs
+        for i, name in enumerate(_sizes(evidence)):
+            if name in learned.noise and name in CENTRES:
+                logs[i] = np.log(learned.noise[name].value)
+        return logs
+
+
+def _sizes(evidence: Evidence) -> tuple[str, ...]:
+    """Return the names of all sizes."""
+    return (*evidence.believed.names, *evidence.noise)
+
+
+def _trusted(result: Outcome) -> CalibrationProblem:
+    """Return the problem in memory without scatter, and without flagged rows unless they err as their neighbours do."""
+    problem = sampled(result.problem.scattered(None))
+    labels = {label: i for i, label in enumerate(problem.labels)}
+    rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
+    if not len(rows) or len(rows) > len(labels) / 4:
+        return problem
+    alone = rows[~clustered(problem, result.x, rows)]
+    if not len(alone):
+        return problem
+    return problem.without({problem.labels[i] for i in alone})
+
+
+def _learning(result: Outcome) -> Learning:
+    """Return how the evidence is asked: scales that were learned are taken at their word."""
+    learned = result.learned
+    if learned is None:
+        return Learning(Prior(), ("position", "orientation", "joint"))
+    kinds = ["position", "orientation", "joint"]
+    if "instrument" in learned.noise:
+        kinds.append("instrument")
+    return Learning(KNOWN, tuple(kinds))

@@ -1,0 +1,217 @@
+"""What the data say of sizes, noise, families and blunders, laid into an ordinary problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.blunders import beyond, suspected, unbelievable
+from rpim_opt.calibration.doubts import doubts
+from rpim_opt.calibration.learned import Learned, LeftOut, Size, Trial
+from rpim_opt.calibration.models import modelled
+from rpim_opt.calibration.sizing import Fit, Learning
+from rpim_opt.convex.evidence import Evidence, Point
+from rpim_opt.convex.prior import Prior
+from rpim_opt.convex.stated import Stated
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.frames import fitted_frames
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
+
+MOST = 1000
+"""Configurations that sizes are learned from, drawn at random where there are more."""
+ROUNDS = 6
+"""Linearizations at which sizes are looked for."""
+STEP = 0.05
+"""Of logarithms of sizes, for second derivatives."""
+FLATTEST = 0.05
+"""Least second derivative of -2 ln L that is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was learned, ready for a fit at weight 1.
+
+    Parameters
+    ----------
+    problem
+        With local scales, scatter and families, without blunders.
+    learned
+        The evidence.
+    stated
+        The prior, in units of those scales.
+    x
+        (n,) where to begin [SI].
+    """
+
+    problem: Source
+    learned: Learned
+    stated: Stated
+    x: Array
+
+
+def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise: Sequence[str]) -> Found:
+    """Return what the data say of sizes, noise, families and blunders.
+
+    Parameters
+    ----------
+    problem
+        With stated scales.
+    prior
+        What is believed of the deviations.
+    model
+        ``"geometry"``, or ``"auto"`` for families that the evidence wants.
+    start
+        (n,) where to begin [SI], or None.
+    noise
+        Parts of the scatter that are looked for.
+    """
+    learning = Learning(prior, tuple(noise))
+    every = sampled(problem)
+    whole = learning.fitted(every, _begin(every, start), None, ROUNDS)
+    blunders = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
+    fit, trials = _explained(learning, whole, blunders, model)
+    if trials and trials[0].families:  # what they explain stood before the smaller blunders
+        again = fit.problem.on(every.data)
+        more = suspected(again, fit.x, fit.laid.parameters.free.scale, fit.spare)
+        if more.keys() - blunders.keys():
+            blunders |= more
+            fit, trials = _explained(learning, whole, blunders, model)
+    if blunders:
+        left = unbelievable(fit.laid.on(every.data), fit.x, fit.covariance, blunders)
+        if left.keys() != blunders.keys():
+            blunders = left
+            fit, trials = _explained(learning, whole, blunders, model)
+    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
+    if not problem.keeps_rows or len(every.data) < len(problem.labels):
+        blunders = beyond(laid, fit.x)
+    if blunders:
+        laid = laid.without(blunders)
+    worst = tuple(LeftOut(*item) for item in sorted(blunders.items(), key=lambda item: -item[1]))
+    added = tuple(set(fit.problem.parameters.free.names) - set(every.parameters.free.names))
+    return Found(laid, _learned(fit, added, trials, worst), learning.inside(fit.problem, fit.point), fit.x)
+
+
+def _explained(
+    learning: Learning, whole: Fit, blunders: Mapping[str, float], model: str
+) -> tuple[Fit, tuple[Trial, ...]]:
+    """Return the fit of the wanted model without some rows, and the models compared."""
+    fit = whole
+    if blunders:
+        fit = learning.fitted(whole.problem.without(blunders), whole.x, None, ROUNDS)
+    if model == "geometry":
+        return fit, ()
+    return modelled(learning, fit)
+
+
+def with_families(problem: Source, found: Found) -> Source:
+    """Return a problem with the families that were found in it, and all else as it was stated."""
+    p = problem.parameters
+    added = np.isin(p.names, found.learned.added)
+    scale = np.where(added, found.problem.parameters.scale, p.scale)
+    return problem.with_parameters(replace(p, scale=scale, identified=p.identified | added))
+
+
+def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
+    """Return where to linearize first: frames where the data put them, the robot as on its drawing."""
+    p = problem.parameters
+    if start is not None:
+        return start
+    x = np.zeros(len(p.free))
+    fitted, frames = fitted_frames(problem)
+    moved = fitted.parameters.of_frames & fitted.parameters.identified
+    if fitted is not problem and moved.any():
+        x[p.of_frames[p.identified]] = frames
+    return x
+
+
+def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
+    """Return the problem with some of its configurations in memory: all, or so many at random, from every part."""
+    if isinstance(problem, CalibrationProblem):
+        return _drawn(problem, most).frozen()
+    count = sum(1 for _ in problem.rows())
+    parts = [_drawn(part, max(most // count, 1)).data for part in problem.rows()]
+    return problem.on(Dataset.together(parts, [str(i) for i in range(len(parts))])).frozen()
+
+
+def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
+    """Return the problem with so many of its configurations at most."""
+    if len(np.unique(problem.data.configuration)) <= most:
+        return problem
+    return problem.on(problem.data.configurations(most, seed=0))
+
+
+def _learned(fit: Fit, added: tuple[str, ...], trials: tuple[Trial, ...], left_out: tuple[LeftOut, ...]) -> Learned:
+    """Return the sizes with what is not known of them."""
+    evidence, point = fit.evidence, fit.point
+    covariance, slopes, growth = _curvature(evidence, point)
+    spread = np.sqrt(np.diag(covariance))
+    names = evidence.believed.names
+    values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
+    size = np.append(np.exp(point.logs[: len(names)]), np.nan)[evidence.believed.group]
+    local = np.where(np.isfinite(size), np.sqrt(point.v) / size, 1.0)
+    return Learned(
+        sizes=dict(zip(names, values, strict=False)),
+        noise=dict(zip(evidence.noise, values[len(names) :], strict=True)),
+        local=local,
+        trials=trials,
+        value=point.value,
+        freedom=_freedom(growth, covariance),
+        left_out=left_out,
+        covariance=covariance,
+        stated=fit.problem.parameters.free.scale,
+        drift=_drift(fit, covariance, slopes),
+        added=added,
+        notes=tuple(doubts(evidence, point, fit.others, spread)),
+    )
+
+
+def _curvature(evidence: Evidence, point: Point) -> tuple[Array, Array, Array]:
+    """Return how the evidence and what follows from it change with the logarithms of sizes.
+
+    Returns
+    -------
+    Their covariance (s, s), twice the inverse of -2 ln L's second derivatives; the slopes (p, s) of the deviations; and
+    those (s,) of the logarithm of the variance of what is read, on average over the measured lengths.
+    """
+    H = []
+    slopes = []
+    growth = []
+    for step in STEP * np.eye(len(point.logs)):
+        ahead = evidence.at(point.logs + step, point)
+        behind = evidence.at(point.logs - step, point)
+        H.append((ahead.gradient - behind.gradient) / (2 * STEP))
+        slopes.append((ahead.z - behind.z) / (2 * STEP))
+        growth.append(np.log(_variance(evidence, ahead) / _variance(evidence, behind)) / (2 * STEP))
+    curvature, U = np.linalg.eigh((np.array(H) + np.array(H).T) / 2)
+    covariance = U @ np.diag(2 / np.maximum(curvature, FLATTEST)) @ U.T
+    return covariance, np.array(slopes).T, np.array(growth)
+
+
+def _variance(evidence: Evidence, point: Point) -> float:
+    """Return tr(X C X' + R) over the lengths (the angles where there are none): of a new reading, summed."""
+    total = 0.0
+    for stack in evidence.data.stacks:
+        which = stack.length if stack.length.any() else stack.angle
+        X = evidence.data.X[stack.index[which]]
+        R = stack.covariance(evidence.scatter(point.logs))
+        total += float(np.sum((X @ point.C) * X) + np.sum(np.einsum("nkk->nk", R)[which]))
+    return total
+
+
+def _drift(fit: Fit, covariance: Array, slopes: Array) -> Array:
+    """Return by what the deviations move (n, s) [SI] where sizes are others: D with D D' what that adds to theirs."""
+    unit = fit.laid.parameters.free.scale / np.sqrt(fit.point.v)
+    variance, U = np.linalg.eigh(covariance)
+    return (unit[:, None] * slopes) @ (U * np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _freedom(growth: Array, covariance: Array) -> float:
+    """Return Satterthwaite's degrees of freedom 2 V^2 / var(V) of the variance V of a reading, at least three.
+
+    Of all of it: what is not known of the model counts with how little is known of the sizes behind it.
+    """
+    return float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0))

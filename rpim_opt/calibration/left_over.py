@@ -1,0 +1,176 @@
+"""What a fit leaves over, part by part: noise, effects of families, neighbours, repeated readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import f as fisher
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.alike import Alike, alike
+from rpim_opt.calibration.compared import OWNED, SPEAK, Comparison, Judged
+from rpim_opt.calibration.families import TURNED
+from rpim_opt.calibration.sag import SURE
+from rpim_opt.convex.prior import family_of
+from rpim_opt.problem.loads import measured_torques
+from rpim_opt.problem.problem import CalibrationProblem
+
+PATTERNS = {
+    "gravity": ("compliance?",),
+    "first harmonic": ("ecc_cos?", "ecc_sin?"),
+    "second harmonic": ("ecc2_cos?", "ecc2_sin?"),
+    "moments": ("bend*",),
+}
+"""What `identify` says for the families."""
+FEWEST = 6
+"""Equations that must be left over, or repeated, to judge by."""
+NOTABLE = 0.5
+"""Effect of a joint's compliance over the largest, below which wrong masses explain its sign."""
+UNSEEN = 1e-10
+"""Relative singular value of a direction of the geometry that the data do not see."""
+RARE = 1e-3
+"""Probability that what is left exceeds the scatter of repeated readings by chance."""
+
+
+class Effect(NamedTuple):
+    """A family that the model has: by how much -2 ln L falls with it, and the RMS [m] that no geometry can imitate.
+
+    The RMS is None where too few equations are left over to tell.
+    """
+
+    gain: float
+    rms: float | None
+
+
+class Repeated(NamedTuple):
+    """RMS of repeated readings about their mean [m or rad], None for too few; its degrees of freedom."""
+
+    rms: float | None
+    freedom: int
+
+
+def parts(compared: Comparison, model: Judged) -> dict[str, float]:
+    """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
+    scatter = model.evidence.scatter(model.point.logs)
+    squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}
+    own = scatter.position
+    if compared.dimension == "angle":
+        own = scatter.orientation
+    for stack in model.evidence.data.stacks:
+        which = getattr(stack, compared.dimension)
+        stated = np.einsum("nkk->nk", stack.instrument)
+        levers = np.sum(stack.joint**2, axis=2)
+        squares["instrument"] += scatter.instrument**2 * float(np.sum(stated[which]))
+        squares["position"] += own**2 * float(np.sum(which))
+        squares["joint"] += scatter.joint**2 * float(np.sum(levers[which]))
+    return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
+
+
+def present(compared: Comparison) -> Mapping[str, Effect]:
+    """Return the families of the result's own model that are worth more than `SPEAK`, with what they do."""
+    found = {}
+    for family, members in compared.owned().items():
+        gain = compared.worth(members)
+        if gain > SPEAK:
+            found[family] = Effect(gain, _beyond_geometry(compared, members))
+    return found
+
+
+def _beyond_geometry(compared: Comparison, members: np.ndarray) -> float | None:
+    """Return the RMS of a row that some parameters (n,) move and geometry and frames cannot.
+
+    What is left after the projection is divided by the equations that the others leave over, so that many of them do
+    not make it small.
+    """
+    model = compared.plain
+    X = model.evidence.data.X[compared.equations]
+    terms = {term for terms in OWNED.values() for term in terms}
+    family = np.array([family_of(name) in terms for name in model.names])
+    moved = X[:, members] @ model.point.z[members]
+    geometry = X[:, ~family]
+    geometry = geometry / np.maximum(np.linalg.norm(geometry, axis=0), 1e-300)
+    U, s, _ = np.linalg.svd(geometry, full_matrices=False)
+    U = U[:, s > UNSEEN * s[0]]
+    spare = len(moved) - U.shape[1]
+    if spare < FEWEST:
+        return None
+    left = moved - U @ (U.T @ moved)
+    return float(np.sqrt(left @ left / spare * len(moved) / compared.rows))
+
+
+def upward(compared: Comparison) -> tuple[int, ...]:
+    """Return the joints that surely turn against gravity, where gravity is worth its parameters."""
+    model = compared.best
+    if "gravity" not in {*model.families, *present(compared)}:
+        return ()
+    if measured_torques(compared.problem.data):
+        return ()  # signs of measured torques are the table's
+    z = model.point.z
+    sd = np.sqrt(np.diag(model.point.C))
+    moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
+    joint = {i: int(name[10:]) for i, name in enumerate(model.names) if family_of(name) == "compliance"}
+    largest = max((moves[i] for i in joint), default=0.0)
+    return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
+
+
+def narrow(problem: CalibrationProblem) -> tuple[int, ...]:
+    """Return the revolute joints that turned by less than harmonics need."""
+    travel = np.ptp(problem.data.q @ problem.robot.joint_map.T, axis=0)
+    kinds = problem.robot.joint_types
+    return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED)
+
+
+def errors_alike(compared: Comparison, model: Judged) -> Alike | None:
+    """Return whether similar configurations err alike, errors in units of their noise."""
+    data = compared.problem.data
+    row = compared.row
+    scatter = model.evidence.scatter(model.point.logs)
+    stacks = model.evidence.data.stacks
+    widest = max(stack.index.shape[1] for stack in stacks)
+    errors = []
+    kinds = []
+    first = []
+    for kind, stack in enumerate(stacks):
+        sd = np.sqrt(np.einsum("nkk->nk", stack.covariance(scatter)))
+        e = model.residual[stack.index] / sd
+        errors.append(np.pad(e, ((0, 0), (0, widest - e.shape[1]))))
+        kinds.append(np.full(len(e), kind))
+        first.append(row[stack.index[:, 0]])
+    q = data.q @ compared.problem.robot.joint_map.T
+    return alike(q[np.concatenate(first)], np.concatenate(errors), np.concatenate(kinds))
+
+
+def repeated(problem: CalibrationProblem, x: Array, dimension: str) -> Repeated:
+    """Return how repeated readings of a configuration by the same instrument and reflector scatter."""
+    residual = problem.residual(x)
+    start = 0
+    squares = 0.0
+    rows = 0
+    freedom = 0
+    for block in problem.data.blocks:
+        components = list(block.measurement.components.values())
+        end = start + len(components) * len(block.row)
+        r = residual[start:end].reshape(-1, len(components))
+        start = end
+        r = r[:, [d == dimension for d in components]]
+        same = np.unique(block.q.reshape(len(r), -1).round(7), axis=0, return_inverse=True)[1].ravel()
+        count = np.bincount(same)
+        mean = np.array([np.bincount(same, column) / count for column in r.T]).reshape(-1, len(count)).T
+        squares += float(np.sum((r - mean[same]) ** 2))
+        rows += len(r) - len(count)
+        freedom += (len(r) - len(count)) * r.shape[1]
+    if freedom < FEWEST:
+        return Repeated(None, freedom)
+    return Repeated(float(np.sqrt(squares / rows)), freedom)
+
+
+def excess(again: Repeated, total: float, spare: float) -> float:
+    """Return the RMS of what is left beyond repeated readings, where it is more than chance; total is a square."""
+    if again.rms is None:
+        return 0.0
+    within = max(again.rms**2, 1e-24)
+    if total / within < fisher.isf(RARE, spare, again.freedom):
+        return 0.0
+    return float(np.sqrt(total - within))

@@ -1,0 +1,352 @@
+"""How likely the data are under sizes of deviations and of noise: restricted likelihood with heavy tails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+from scipy.optimize import minimize
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.problem.scatter import Scatter, Stack
+
+CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
+"""Median of what a robot's scatter is believed to be before the data [m, rad, rad], and of the instrument's factor."""
+NOISE_SD, GEOMETRY_SD, FAMILY_SD = 2.0, 3.0, 2.0
+"""Standard deviations of the natural logarithms of sizes, before the data."""
+FARTHEST = 7.0
+"""Logarithms of sizes stay within so much of their centres."""
+SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
+"""Local variances are a fixed point when their logarithms change by no more, and on the way to an optimum; rounds that
+they may take."""
+FURTHER = 1.4
+"""Local variances go this much further than their fixed point says: those that nothing decides are there at once."""
+RIDGE = 1e-13
+"""Added to the scaled information: rounding in directions that nothing decides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What is believed of p deviations before the data, in units of their scales.
+
+    Parameters
+    ----------
+    group
+        (p,) which size multiplies a deviation's scale; -1 for frames, which have none.
+    heavy
+        (p,) which deviations have Student's tails; the others are normal.
+    names
+        Of the sizes.
+    sd
+        Standard deviations of their logarithms, before the data.
+    tails
+        Degrees of freedom of Student's t.
+    replaced
+        (p,) which deviations have no belief of their own, because `rows` say all.
+    rows, values
+        (k, p) and (k,): rows z - values ~ N(0, I).
+    """
+
+    group: np.ndarray
+    heavy: np.ndarray
+    names: tuple[str, ...]
+    sd: Array
+    tails: float
+    replaced: np.ndarray
+    rows: Array
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """Equations y ~ X z in SI, z (p,) in units of the scales, and what divides their noise by configuration."""
+
+    X: Array
+    y: Array
+    stacks: Sequence[Stack]
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """What sizes make of the data.
+
+    Parameters
+    ----------
+    value
+        -2 ln of the restricted likelihood and of what was believed of the sizes.
+    gradient
+        By the logarithms of the sizes.
+    z, C
+        (p,) and (p, p): the deviations' mean and covariance, in units of the scales.
+    v
+        (p,) local variances: the prior's that a Tikhonov program has at these sizes.
+    logs
+        (s,) logarithms of the sizes: of deviations, then of noise.
+    """
+
+    value: float
+    gradient: Array
+    z: Array
+    C: Array
+    v: Array
+    logs: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitened:
+    """One stack at some noise: L^-1 X, L^-1 y, L^-1 with L L' the covariance, and its log determinant."""
+
+    stack: Stack
+    inverse: Array
+    X: Array
+    y: Array
+    logdet: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The evidence of one linearization as a function of sizes.
+
+    ::
+
+        y = X z + e
+        z_j ~ t_nu(0, size_g)     heavy ones: normal with own variance v_j = (nu size^2 + z_j^2 + C_jj) / (nu + 1)
+        z_j ~ N(0, size_g^2)      other groups;    N(0, 1) frames
+        e_c ~ N(0, R_c)           `Scatter`
+        C = (X'R^-1 X + diag(1/v))^-1,    z = C X'R^-1 y
+        -2 ln L = |y - X z|^2_R + z'z/v + ln|R| - ln|C| + sum ln v
+                  + sum over heavy of  (nu + 1) ln((nu size^2 + z^2 + C) / (nu + 1)) - nu ln size^2 - ln v
+                                       + 1 - (z^2 + C) / v
+
+    and logarithms of sizes are normal around `CENTRES` and 1. Student's t enters by its mean field (a variational
+    bound); a deviation that nothing decides adds nothing.
+
+    Parameters
+    ----------
+    data
+        The equations.
+    believed
+        Of deviations.
+    noise
+        Which parts of the scatter are to be found: names of `CENTRES`.
+    fixed
+        The other parts.
+    """
+
+    data: Linearized
+    believed: Believed
+    noise: tuple[str, ...]
+    fixed: Scatter = field(default_factory=Scatter)
+
+    @cached_property
+    def centre(self) -> Array:
+        """Logarithms of the sizes that are most likely before the data (s,)."""
+        return np.concatenate([np.zeros(len(self.believed.names)), np.log([CENTRES[kind] for kind in self.noise])])
+
+    @cached_property
+    def sd(self) -> Array:
+        """Their standard deviations (s,)."""
+        return np.concatenate([self.believed.sd, np.full(len(self.noise), NOISE_SD)])
+
+    def scatter(self, logs: Array) -> Scatter:
+        """Return the noise at logarithms of sizes (s,)."""
+        sizes = np.exp(logs[len(self.believed.names) :])
+        return replace(self.fixed, **dict(zip(self.noise, map(float, sizes), strict=True)))
+
+    def at(self, logs: Array, before: Point | None = None, settled: float = SETTLED) -> Point:
+        """Return the evidence at logarithms of sizes (s,); local variances are looked for from those of a point on."""
+        b = self.believed
+        whitened = self._whiten(self.scatter(logs))
+        H = b.rows.T @ b.rows
+        h = b.rows.T @ b.values
+        for part in whitened:
+            H = H + part.X.T @ part.X
+            h = h + part.X.T @ part.y
+        size2 = self._size2(logs)
+        v = size2
+        if before is not None:
+            v = before.v * size2 / self._size2(before.logs)
+        z, C, logdet, v = self._settled(H, h, size2, v, settled)
+        e2 = z**2 + np.diag(C)
+        own = ~b.replaced
+        normal = own & ~b.heavy
+        value = float(np.sum((b.rows @ z - b.values) ** 2)) + logdet
+        for part in whitened:
+            value += float(np.sum((part.y - part.X @ z) ** 2)) + part.logdet
+        value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
+        value += self._tails(e2, size2, v)
+        off = (logs - self.centre) / self.sd
+        gradient = 2 * off / self.sd
+        gradient[: len(b.names)] += self._by_size(e2, size2, v)
+        gradient[len(b.names) :] += self._by_noise(logs, whitened, z, C)
+        return Point(value + float(off @ off), gradient, z, C, v, logs)
+
+    def _whiten(self, scatter: Scatter) -> list[_Whitened]:
+        p = self.data.X.shape[1]
+        parts = []
+        for stack, X, y in self._stacked:
+            L = np.linalg.cholesky(stack.covariance(scatter))
+            inverse = np.asarray(np.linalg.inv(L), dtype=float)
+            logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+            parts.append(_Whitened(stack, inverse, (inverse @ X).reshape(-1, p), (inverse @ y).ravel(), logdet))
+        return parts
+
+    @cached_property
+    def _stacked(self) -> list[tuple[Stack, Array, Array]]:
+        return [(stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None]) for stack in self.data.stacks]
+
+    def _size2(self, logs: Array) -> Array:
+        """Return the square of every deviation's size (p,)."""
+        squares = np.append(np.exp(2 * logs[: len(self.believed.names)]), 1.0)
+        return squares[self.believed.group]
+
+    def _settled(self, H: Array, h: Array, size2: Array, v: Array, settled: float) -> tuple[Array, Array, float, Array]:
+        """Return z, C, -ln|C| and v, which determine each other."""
+        b = self.believed
+        heavy = np.flatnonzero(b.heavy & ~b.replaced)
+        v = np.where(b.heavy & ~b.replaced, v, size2)
+        own = np.where(b.replaced, 0.0, 1.0)
+        if len(heavy):
+            # the others' variances stay: their share of the information is taken out once
+            S, g = _without(H, h, own / v, heavy)
+            v[heavy] = self._local(S, g, size2[heavy], v[heavy], settled)
+        return *_posterior(H, h, own / v), v
+
+    def _local(self, S: Array, g: Array, size2: Array, v: Array, settled: float) -> Array:
+        """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g."""
+        tails = self.believed.tails
+        for _ in range(MOST_ROUNDS):
+            z, C, _ = _posterior(S, g, 1 / v)
+            change = np.log((tails * size2 + z**2 + C.diagonal()) / ((tails + 1) * v))
+            if np.abs(change).max() <= settled:
+                break
+            v = v * np.exp(FURTHER * change)
+        return v
+
+    def _tails(self, e2: Array, size2: Array, v: Array) -> float:
+        """Return what heavy tails add to -2 ln L."""
+        heavy = self.believed.heavy & ~self.believed.replaced
+        nu = self.believed.tails
+        if not heavy.any():
+            return 0.0
+        e2, t2, v = e2[heavy], size2[heavy], v[heavy]
+        return float(np.sum((nu + 1) * np.log((nu * t2 + e2) / (nu + 1)) - nu * np.log(t2) + 1 - e2 / v))
+
+    def _by_size(self, e2: Array, size2: Array, v: Array) -> Array:
+        """Return the gradient by the logarithms of the deviations' sizes."""
+        b = self.believed
+        slope = 2 * (1 - e2 / v)
+        if b.heavy.any():  # what is replaced has no size
+            slope = np.where(b.heavy, 2 * b.tails * (size2 / v - 1), slope)
+        sized = (b.group >= 0) & ~b.replaced
+        return np.asarray(np.bincount(b.group[sized], slope[sized], minlength=len(b.names)), dtype=float)
+
+    def _by_noise(self, logs: Array, whitened: Sequence[_Whitened], z: Array, C: Array) -> Array:
+        """Return the gradient by the logarithms of the noise: 2 s^2 [tr(Q K) - u'K u], Q = R^-1 - R^-1 X C X'R^-1."""
+        variance = np.exp(2 * logs[len(self.believed.names) :])
+        total = np.zeros(len(self.noise))
+        for part in whitened:
+            N, k = part.stack.index.shape
+            back = part.inverse.transpose(0, 2, 1)
+            u = (back @ (part.y - part.X @ z).reshape(N, k, 1))[:, :, 0]
+            WX = part.X.reshape(N, k, -1)
+            Q = np.eye(k) - WX @ (part.X @ C).reshape(N, k, -1).transpose(0, 2, 1)
+            Q = back @ Q @ part.inverse
+            total += [_trace(part.stack, kind, Q, u) for kind in self.noise]
+        return 2 * variance * total
+
+    def mode(self, starts: Sequence[Array], tolerance: float = 1e-8) -> list[Point]:
+        """Return the optima that are reached from some logarithms of sizes (s,) each, the best first.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            When the data are not finite.
+        """
+        found = []
+        for start in starts:
+            last: Point | None = None
+
+            def objective(logs: Array) -> tuple[float, Array]:
+                nonlocal last
+                last = self.at(logs, last, ROUGHLY)
+                return last.value, last.gradient
+
+            bounds = list(zip(self.centre - FARTHEST, self.centre + FARTHEST, strict=True))
+            options = {"maxiter": 80, "ftol": tolerance, "gtol": 1e-4}
+            best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            found.append(self.at(best.x, last))
+        return sorted(found, key=lambda point: point.value)
+
+    def starts(self) -> list[Array]:
+        """Return where optima are looked for: what is expected, all of it noise, and large deviations."""
+        sizes = len(self.believed.names)
+        noisy = np.arange(len(self.centre)) >= sizes
+        geometry = np.zeros(len(self.centre))
+        geometry[np.unique(self.believed.group[self.believed.heavy])] = 2.0
+        return [self.centre, self.centre + 3.0 * noisy, self.centre + geometry]
+
+
+_potrf: Any = get_lapack_funcs("potrf", dtype=float)
+_potri: Any = get_lapack_funcs("potri", dtype=float)
+
+
+_trtrs: Any = get_lapack_funcs("trtrs", dtype=float)
+
+
+def _factored(H: Array, precision: Array) -> tuple[Array, Array]:
+    """Return L and d with L L' = M scaled by d to a diagonal of ones, M = H + diag(precision)."""
+    M = H.copy()
+    M[np.diag_indices(len(precision))] += precision
+    d = 1 / np.sqrt(M.diagonal())
+    scaled = M * d[:, None] * d
+    scaled[np.diag_indices(len(d))] += RIDGE
+    factor, failed = _potrf(scaled, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("information matrix is not positive definite")
+    return factor, d
+
+
+def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, float]:
+    """Return z = M^-1 h, M^-1 and ln|M| of M = H + diag(precision), with M scaled to a diagonal of ones."""
+    factor, d = _factored(H, precision)
+    logdet = 2 * float(np.sum(np.log(factor.diagonal() / d)))
+    lower, _ = _potri(factor, lower=1)  # its upper half is zero, as potrf left it
+    C = lower + lower.T
+    C[np.diag_indices(len(d))] /= 2
+    C *= d[:, None] * d
+    return C @ h, C, logdet
+
+
+def _without(H: Array, h: Array, precision: Array, kept: np.ndarray) -> tuple[Array, Array]:
+    """Return the information on some deviations, and its product with their mean, where the others are integrated.
+
+    By Cholesky's factor, which loses no more than one of the whole matrix would: an inverse loses all digits where
+    frames are nearly free.
+    """
+    others = np.setdiff1d(np.arange(len(h)), kept)
+    if not len(others):
+        return H, h
+    factor, d = _factored(H[np.ix_(others, others)], precision[others])
+    right = np.column_stack([H[np.ix_(others, kept)], h[others]]) * d[:, None]
+    Y, _ = _trtrs(factor, right, lower=1)
+    return H[np.ix_(kept, kept)] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
+
+
+def _trace(stack: Stack, kind: str, Q: Array, u: Array) -> float:
+    """Return tr(Q K) - u'K u for one part K of the covariance."""
+    if kind == "joint":
+        T = stack.joint
+        return float(np.sum(T * (Q @ T)) - np.sum((T.transpose(0, 2, 1) @ u[:, :, None]) ** 2))
+    if kind == "instrument":
+        V = stack.instrument
+        return float(np.sum(Q * V) - np.einsum("nk,nkl,nl->", u, V, u))
+    mask = stack.length
+    if kind == "orientation":
+        mask = stack.angle
+    diagonal = np.diagonal(Q, axis1=1, axis2=2)
+    return float(np.sum(diagonal * mask) - np.sum(u**2 * mask))

@@ -1,0 +1,267 @@
+"""Evidence of sizes: against the textbook's dense likelihood, quadrature, differences, and what must not change it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import dblquad
+from scipy.stats import multivariate_normal
+
+import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.evidence import CENTRES, NOISE_SD, Believed, Evidence, Linearized
+from rpim_opt.problem.scatter import Stack
+
+NOISE = ("position", "orientation", "joint")
+
+
+def believed(group: list[int], heavy: list[bool], names: tuple[str, ...], tails: float = 3.0) -> Believed:
+    """Return beliefs without statements."""
+    p = len(group)
+    none = np.zeros((0, p))
+    return Believed(
+        np.array(group), np.array(heavy), names, np.full(len(names), 1.5), tails, np.zeros(p, bool), none, np.zeros(0)
+    )
+
+
+def linearized(seed: int, configurations: int, p: int, k: int = 6) -> Linearized:
+    """Return random equations of poses, in units in which noise is about 1e-4."""
+    rng = np.random.default_rng(seed)
+    m = configurations * k
+    X = 1e-4 * rng.normal(size=(m, p))
+    y = X @ rng.normal(size=p) + 1e-4 * rng.normal(size=m)
+    index = rng.permutation(m).reshape(configurations, k)
+    B = 2e-5 * rng.normal(size=(configurations, k, k))
+    V = B @ B.transpose(0, 2, 1) + 1e-10 * np.eye(k)
+    length = np.tile(np.arange(k) < (k + 1) // 2, (configurations, 1))
+    joint = rng.normal(size=(configurations, k, 2))
+    return Linearized(X, y, [Stack(index, V, length, ~length, joint)])
+
+
+def dense(evidence: Evidence, logs: Array) -> tuple[Array, Array]:
+    """Return the covariance (m, m) of the data apart from the deviations, and the data in its order."""
+    scatter = evidence.scatter(logs)
+    m = len(evidence.data.y)
+    R = np.zeros((m, m))
+    for stack in evidence.data.stacks:
+        for index, block in zip(stack.index, stack.covariance(scatter), strict=True):
+            R[np.ix_(index, index)] = block
+    return R, evidence.data.y
+
+
+def hyperprior(evidence: Evidence, logs: Array) -> float:
+    return float(np.sum(((logs - evidence.centre) / evidence.sd) ** 2))
+
+
+def test_normal_deviations_give_the_textbooks_likelihood() -> None:
+    data = linearized(0, 5, 4)
+    evidence = Evidence(data, believed([0, 0, 1, -1], [False] * 4, ("a", "b")), NOISE)
+    rng = np.random.default_rng(1)
+    values = []
+    for _ in range(4):
+        logs = evidence.centre + 0.5 * rng.normal(size=5)
+        R, y = dense(evidence, logs)
+        size2 = np.array([np.exp(2 * logs[0])] * 2 + [np.exp(2 * logs[1]), 1.0])
+        want = -2 * multivariate_normal(np.zeros(len(y)), R + (data.X * size2) @ data.X.T).logpdf(y)
+        values.append(evidence.at(logs).value - hyperprior(evidence, logs) - want)
+    # the constant m ln 2 pi is left out
+    assert np.allclose(values, -len(data.y) * np.log(2 * np.pi), rtol=1e-9)
+
+
+def test_mean_and_covariance_are_the_posteriors() -> None:
+    data = linearized(2, 6, 3)
+    evidence = Evidence(data, believed([0, 0, -1], [False] * 3, ("a",)), NOISE)
+    logs = evidence.centre + 0.3
+    R, y = dense(evidence, logs)
+    M = data.X.T @ np.linalg.solve(R, data.X) + np.diag([np.exp(-0.6)] * 2 + [1.0])
+    point = evidence.at(logs)
+    assert np.allclose(point.C, np.linalg.inv(M), rtol=1e-8)
+    assert np.allclose(point.z, np.linalg.solve(M, data.X.T @ np.linalg.solve(R, y)), rtol=1e-8)
+
+
+@pytest.mark.parametrize("tails", [3.0, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_gradients_are_differences(seed: int, tails: float) -> None:
+    data = linearized(seed, 6, 5)
+    heavy = [True, True, False, False, False]
+    evidence = Evidence(data, believed([0, 0, 1, 1, -1], heavy, ("a", "b"), tails), (*NOISE, "instrument"))
+    logs = evidence.centre + 0.4 * np.random.default_rng(seed).normal(size=6)
+    steps = 1e-5 * np.eye(6)
+    want = [(evidence.at(logs + s).value - evidence.at(logs - s).value) / 2e-5 for s in steps]
+    found = evidence.at(logs).gradient
+    assert np.abs(found - want).max() <= 1e-6 * np.abs(found).max()
+
+
+def test_heavy_tails_of_infinite_freedom_are_normal() -> None:
+    data = linearized(3, 6, 4)
+    normal = Evidence(data, believed([0, 0, 0, -1], [False] * 4, ("a",)), ("position",))
+    heavy = replace(normal, believed=believed([0, 0, 0, -1], [True] * 3 + [False], ("a",), 1e9))
+    logs = normal.centre + 0.2
+    assert normal.at(logs).value == pytest.approx(heavy.at(logs).value, abs=1e-5)
+    assert np.allclose(normal.at(logs).z, heavy.at(logs).z, rtol=1e-6)
+
+
+def test_a_deviation_that_nothing_decides_adds_nothing() -> None:
+    data = linearized(4, 6, 3)
+    evidence = Evidence(data, believed([0, 0, 0], [True] * 3, ("a",)), NOISE)
+    wider = Evidence(
+        replace(data, X=np.column_stack([data.X, np.zeros(len(data.y))])), believed([0] * 4, [True] * 4, ("a",)), NOISE
+    )
+    for shift in (-1.0, 0.0, 2.0):
+        logs = evidence.centre + shift
+        assert wider.at(logs).value == pytest.approx(evidence.at(logs).value, abs=1e-8)
+
+
+def test_local_variances_are_a_fixed_point_and_bound_student_t() -> None:
+    data = linearized(5, 8, 4)
+    evidence = Evidence(data, believed([0] * 4, [True] * 4, ("a",)), ("position",))
+    point = evidence.at(evidence.centre - 0.7)
+    size2 = np.exp(2 * point.logs[0])
+    assert np.allclose(point.v, (3 * size2 + point.z**2 + np.diag(point.C)) / 4, rtol=1e-7)
+
+
+def test_statements_are_measurements_without_scatter() -> None:
+    data = linearized(6, 5, 3)
+    rows = np.array([[1.0, -1.0, 0.0], [0.0, 3.0, 1.0]])
+    values = np.array([0.4, -0.2])
+    plain = believed([0, 0, 0], [False] * 3, ("a",))
+    stated = Evidence(data, replace(plain, rows=rows, values=values), ("position",))
+    stack = data.stacks[0]
+    # the same as two more configurations, each of one equation of unit noise that no scatter reaches
+    one = np.zeros((2, 1), dtype=bool)
+    more = Stack(np.array([[30], [31]]), np.ones((2, 1, 1)), one, one, np.zeros((2, 1, 2)))
+    longer = Linearized(np.vstack([data.X, rows]), np.concatenate([data.y, values]), [stack, more])
+    want = Evidence(longer, plain, ("position",))
+    logs = stated.centre + 0.1
+    assert stated.at(logs).value == pytest.approx(want.at(logs).value, rel=1e-12)
+    assert np.allclose(stated.at(logs).gradient, want.at(logs).gradient, rtol=1e-9)
+
+
+def test_a_replaced_deviation_has_no_size() -> None:
+    data = linearized(7, 5, 3)
+    plain = believed([0, 0, 0], [True] * 3, ("a",))
+    rows = np.array([[0.0, 0.0, 2.0]])
+    stated = replace(plain, rows=rows, values=np.array([1.0]), replaced=np.array([False, False, True]))
+    evidence = Evidence(data, stated, ("position",))
+    logs = evidence.centre
+    R, _ = dense(evidence, logs)
+    own = 1 / evidence.at(logs).v
+    M = data.X.T @ np.linalg.solve(R, data.X) + np.diag([own[0], own[1], 4.0])
+    assert np.allclose(evidence.at(logs).C, np.linalg.inv(M), rtol=1e-7)
+    step = np.array([1e-5, 0.0])
+    slope = (evidence.at(logs + step).value - evidence.at(logs - step).value) / 2e-5
+    assert evidence.at(logs).gradient[0] == pytest.approx(slope, rel=1e-6)
+
+
+def test_evidence_is_the_integral_over_deviations() -> None:
+    """One deviation with a normal prior and one size: the likelihood by quadrature."""
+    data = linearized(8, 2, 2, k=2)
+    evidence = Evidence(data, believed([0, 0], [False] * 2, ("a",)), ("position", "orientation"))
+    logs = evidence.centre + np.array([0.3, 0.5, -0.2])
+    R, y = dense(evidence, logs)
+    size = np.exp(logs[0])
+    density = multivariate_normal(np.zeros(len(y)), R)
+
+    def integrand(a: float, b: float) -> float:
+        z = np.array([a, b])
+        return float(density.pdf(y - data.X @ z) * np.exp(-z @ z / (2 * size**2)) / (2 * np.pi * size**2))
+
+    far = 8 * size
+    integral, _ = dblquad(integrand, -far, far, -far, far, epsrel=1e-9)
+    want = -2 * np.log(integral) - len(y) * np.log(2 * np.pi)
+    assert evidence.at(logs).value - hyperprior(evidence, logs) == pytest.approx(want, abs=1e-5)
+
+
+def test_units_of_the_scales_do_not_matter() -> None:
+    """Deviations in other units and their scales with them: the same posterior in SI."""
+    data = linearized(9, 6, 3)
+    plain = believed([0, 0, 0], [True] * 3, ("a",))
+    one = Evidence(data, plain, NOISE)
+    logs = one.centre
+    tenfold = Evidence(replace(data, X=10 * data.X), plain, NOISE)
+    smaller = logs - np.array([np.log(10), 0, 0, 0])
+    assert np.allclose(one.at(logs).z, 10 * tenfold.at(smaller).z, rtol=1e-7)
+
+
+def test_several_starts_find_both_optima_of_few_data() -> None:
+    """Few equations: little noise and large deviations, or all of it noise."""
+    found = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        X = 1e-3 * rng.normal(size=(9, 6))
+        y = X @ (5 * rng.standard_t(3, size=6))
+        stack = Stack(np.arange(9).reshape(3, 3), np.full((3, 1, 1), 1e-12) * np.eye(3), np.ones((3, 3), bool),
+                      np.zeros((3, 3), bool), np.zeros((3, 3, 0)))  # fmt: skip
+        evidence = Evidence(Linearized(X, y, [stack]), believed([0] * 6, [True] * 6, ("a",)), ("position",))
+        points = evidence.mode(evidence.starts())
+        assert [p.value for p in points] == sorted(p.value for p in points)
+        found.append(points[0].value <= evidence.mode([evidence.centre])[0].value + 1e-9)
+        assert np.abs(points[0].gradient).max() < 1e-2
+    assert all(found)
+
+
+def test_sizes_of_simulated_data_are_found() -> None:
+    """Many deviations and configurations: sizes within their spread of the truth."""
+    rng = np.random.default_rng(10)
+    N, p = 400, 60
+    T = rng.normal(size=(N, 3, 4))
+    X = rng.normal(size=(3 * N, p))
+    z = 0.3e-3 * rng.normal(size=p)
+    noise = 5e-5 * rng.normal(size=(N, 3)) + 2e-5 * rng.normal(size=(N, 3))
+    noise += np.einsum("nkd,nd->nk", T, 8e-5 * rng.normal(size=(N, 4)))
+    stack = Stack(np.arange(3 * N).reshape(N, 3), np.full((N, 1, 1), 4e-10) * np.eye(3), np.ones((N, 3), bool),
+                  np.zeros((N, 3), bool), T)  # fmt: skip
+    data = Linearized(1e-3 * X, 1e-3 * X @ (z / 1e-3) + noise.ravel(), [stack])
+    evidence = Evidence(data, believed([0] * p, [False] * p, ("a",)), ("position", "joint"))
+    point = evidence.mode(evidence.starts())[0]
+    assert np.abs(point.logs - np.log([0.3, 5e-5, 8e-5])).max() < 0.25
+
+
+def test_nothing_is_believed_of_noise_but_its_order() -> None:
+    data = linearized(11, 4, 2)
+    evidence = Evidence(data, believed([0, 0], [False] * 2, ("a",)), NOISE)
+    assert np.allclose(np.exp(evidence.centre[1:]), [CENTRES[kind] for kind in NOISE])
+    assert (evidence.sd[1:] == NOISE_SD).all()
+    found = evidence.scatter(evidence.centre)
+    assert [found.position, found.orientation, found.joint] == pytest.approx(np.exp(evidence.centre[1:]))
+
+
+@pytest.mark.slow
+def test_a_gibbs_sampler_agrees() -> None:
+    """Student's t as a scale mixture, sampled for long at the sizes found: means and deviations within its error."""
+    problem = ro.load("position").problem
+    few = problem.on(problem.data.configurations(15, 0))
+    result = ro.calibrate(few)
+    free = few.parameters.free
+    stated = ro.convex.Prior().stated(few.parameters)
+    unit = free.scale * stated.scale
+    J = result.problem.jacobian(result.x) * unit
+    y = few.residual(result.x) + result.problem.jacobian(result.x) @ result.x
+    R = np.zeros((len(y), len(y)))
+    for stack in result.problem.stacks(False):
+        for index, block in zip(stack.index, stack.covariance(result.problem.scatter), strict=True):
+            R[np.ix_(index, index)] = block
+    size = result.learned.sizes["geometry"].value
+    W = np.linalg.inv(np.linalg.cholesky(R))
+    A, b = W @ J, W @ y
+    rng = np.random.default_rng(0)
+    v = np.where(stated.heavy, size**2, 1.0)
+    draws = []
+    for k in range(6000):
+        L = np.linalg.cholesky(A.T @ A + np.diag(1 / v))
+        mean = np.linalg.solve(L.T, np.linalg.solve(L, A.T @ b))
+        z = mean + np.linalg.solve(L.T, rng.normal(size=len(v)))
+        v = np.where(stated.heavy, (3 * size**2 + z**2) / rng.chisquare(4, size=len(v)), 1.0)
+        if k >= 1000:
+            draws.append(z)
+    z = np.array(draws)
+    batches = z.reshape(50, 100, -1).mean(axis=1)
+    error = batches.std(axis=0) / np.sqrt(50)
+    spread = z.std(axis=0)
+    found = result.x / unit
+    # the mean field is an approximation: a fifth of a standard deviation is allowed beside the sampler's own error
+    assert np.abs(found - z.mean(axis=0)).max() < np.max(4 * error + 0.35 * spread)
+    stated_spread = np.sqrt(np.diag(result.covariance)) / unit
+    assert 0.75 < np.exp(np.mean(np.log(stated_spread / spread))) < 1.2
