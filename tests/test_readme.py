@@ -75,6 +75,24 @@ def test_the_main_table_is_the_studys() -> None:
         assert float(stated[4]) == pytest.approx(np.median(clean), rel=0.05), name
 
 
+def test_the_table_of_real_arms_is_the_studys() -> None:
+    from pyarrow import parquet
+
+    path = ROOT / "studies" / "results" / "real_data" / "replicates.parquet"
+    rows = parquet.read_table(path).to_pylist()
+    lines = re.findall(r"^\| (10|20|all) \| (.*) %? \|$", README, flags=re.MULTILINE)
+    assert len(lines) == 3
+    for count, cells in lines:
+        own = [row for row in rows if str(row["count"] or "all") == count]
+        stated = [cell.strip(" %") for cell in cells.split("|")]
+        ours = np.array([row["learned, model auto"] for row in own])
+        for other, figure in zip(("least squares", "reml"), stated, strict=False):
+            ratios = ours / [row[other] for row in own]
+            assert f"{np.exp(np.mean(np.log(ratios))):.2f}" == figure, (count, other)
+        assert f"{max(row['learned, model auto'] / row['reml'] for row in own):.2f}" == stated[2]
+        assert f"{100 * np.mean([row['learned, model auto, covers'] for row in own]):.0f}" == stated[3]
+
+
 def test_every_name_that_texts_say_is_there() -> None:
     import rpim_opt as ro
 

@@ -14,6 +14,8 @@ SPREAD = {"length_mm": 0.3, "angle_mrad": 1.0, "tool_mm": 0.5}
 GENERIC = {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 1.0}
 NOISE = 5e-5  # [m], declared
 METHODS = {
+    "learned": (GENERIC, "tikhonov", None),
+    "learned, model auto": (GENERIC, "tikhonov", None),
     "Tikhonov": (GENERIC, "tikhonov", "reml"),
     "Tikhonov, spread declared": (SPREAD, "tikhonov", 1.0),
     "Tikhonov, spread declared, REML": (SPREAD, "tikhonov", "reml"),
@@ -36,18 +38,21 @@ def main(folder: Path, method: str) -> None:
     parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
     problem = problem_of(robot, parameters, ro.Dataset.of(calib[:, 3:], calib[:, :3], NOISE))
     rule = getattr(ro, weight) if isinstance(weight, str) else weight
-    found = calibrate(problem, form, rule)
+    model = "geometry"
+    if method.endswith("model auto"):
+        model = "auto"
+    found = calibrate(problem, form, rule, model=model)
     if method.endswith("refitted"):
         found = calibrate(found.without_flagged().problem, ro.tikhonov, ro.reml)
     seconds = time.perf_counter() - start
-    angles = np.array([d == "angle" for d in found.problem.parameters.free.dimensions])
-    predicted = problem.on(ro.Dataset.of(valid[:, 3:], valid[:, :3], NOISE)).modelled(found.x)[0]
+    of = np.array(found.problem.parameters.free.dimensions)
+    predicted = found.problem.on(ro.Dataset.of(valid[:, 3:], valid[:, :3], NOISE)).modelled(found.x)[0]
     print(
         json.dumps(
             {
                 "seconds": seconds,
-                "largest_mm": 1e3 * np.abs(found.x[~angles]).max(),
-                "largest_mrad": 1e3 * np.abs(found.x[angles]).max(),
+                "largest_mm": 1e3 * np.abs(found.x[of == "length"]).max(),
+                "largest_mrad": 1e3 * np.abs(found.x[of == "angle"]).max(),
                 "predicted_mm": (1e3 * predicted).tolist(),
                 "versions": f"rpim_opt {version('rpim-opt')}, NumPy {version('numpy')}",
             }

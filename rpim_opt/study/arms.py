@@ -1,0 +1,131 @@
+"""Simulated arms with errors in all six directions after every link, of sizes that differ from arm to arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.mdh import Robot, read_robot
+from rpim_opt.robot.model import model_parameters
+
+KINDS = {"ur10e": ["beta[23]"], "irb120": ["beta2"], "iiwa7": []}
+"""Ready robots that arms are made of, with Hayati's parameter where neighbouring axes are parallel."""
+SCALES = {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 10.0, "base_mm": 100.0, "base_mrad": 100.0}
+"""What is stated of every arm, as a folder states it that knows nothing."""
+BASE = (1.5, -0.8, 0.3, 0.0, 0.0, 0.6)
+TOOL = (0.04, -0.02, 0.11, 0.0, 0.0, 0.0)
+REACH = np.radians(120)
+UNSEEN = 200
+"""Configurations that an arm is judged at."""
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedArm:
+    """What a tracker saw of an arm whose truth is known.
+
+    Parameters
+    ----------
+    problem
+        Identification data, with generic scales.
+    true
+        Positions of unseen configurations as they are [m].
+    read
+        The same as the tracker reads them.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.study.simulated_arm(seed=0, count=10)
+    >>> len(arm.problem.data), len(arm.read), arm.problem.robot.name
+    (10, 200, 'Universal Robots UR10e')
+    """
+
+    problem: CalibrationProblem
+    true: Dataset
+    read: Dataset
+
+
+def simulated_arm(seed: int, count: int, noise: float = 3e-5, offset: float = 0.0) -> SimulatedArm:
+    """Return a simulated arm; the seeds 0, 1, 2, ... take turns between three robots.
+
+    Behind every link there is a small transform. Its lengths are normal with a standard deviation of 0.05 to 1 mm
+    (log-uniform, one an arm), its angles with 1 to 30 mrad a mm of that (at most 5 mrad), each times exp(N(0, 1)) of
+    its own; joints are off by three such angles more. The base is known to 2 mm and 2 mrad, the reflector to 3 mm.
+
+    Parameters
+    ----------
+    seed
+        Of the arm; the number of configurations changes neither its truth nor those it shares with a smaller one.
+    count
+        Configurations to identify from.
+    noise
+        Standard deviation of a coordinate [m], declared as it is.
+    offset
+        Angle [rad] by which one joint, neither the first nor the last, is off besides.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.study.simulated_arm(seed=1, count=25, offset=0.017)
+    >>> result = ro.calibrate(arm.problem)
+    >>> len(arm.true), bool(result.errors(arm.true).mean() < 1e-4)
+    (200, True)
+    """
+    name = list(KINDS)[seed % len(KINDS)]
+    robot = read_robot(find_robot(name))
+    rng = np.random.default_rng([seed, 77])
+    errors = _errors(robot.dof, rng)
+    errors[rng.integers(1, robot.dof - 1), 5] += offset * rng.choice([-1.0, 1.0])
+    base = _small(np.array(BASE)) @ _small(2e-3 * rng.standard_normal(6))
+    tool = np.array(TOOL[:3]) + 3e-3 * rng.standard_normal(3)
+    limits = np.clip(robot.limits, -REACH, REACH)
+    there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (UNSEEN, robot.dof))
+    q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
+
+    def seen(joints: Array, level: float, stream: int) -> Dataset:
+        T = base @ flange(robot, joints, errors)
+        points = T[:, :3, :3] @ tool + T[:, :3, 3]
+        drawn = np.random.default_rng([seed, stream]).standard_normal(points.shape)
+        return Dataset.of(joints, points + level * drawn, noise)
+
+    parameters = model_parameters(robot, base=list(BASE), tools={"": list(TOOL)}).scaled(SCALES)
+    identified = ["alpha?", "a?", "d?", "theta?", *KINDS[name], "base_*", "tool_[xyz]"]
+    problem = CalibrationProblem(robot, parameters.identify(identified), seen(q, noise, 2))
+    return SimulatedArm(problem, seen(there, 0.0, 4), seen(there, noise, 4))
+
+
+def flange(robot: Robot, q: Array, errors: Array) -> Array:
+    """Return flanges (N, 4, 4) of an arm of revolute joints with a small transform, a row of (dof, 6), behind each."""
+    turned = q @ robot.joint_map.T
+    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, turned.T, errors, strict=True):
+        before = _small(np.array([a, 0, 0, alpha, 0, 0]))
+        turn = np.tile(np.eye(4), (len(q), 1, 1))
+        turn[:, :3, :3] = Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+        behind = _small(np.array([0, 0, d, 0, beta, 0]))
+        T = T @ before @ turn @ behind @ _small(error)
+    return T
+
+
+def _errors(dof: int, rng: np.random.Generator) -> Array:
+    """Return small transforms (dof, 6): lengths [m], rotation vectors [rad]."""
+    length = np.exp(rng.uniform(np.log(5e-5), np.log(1e-3)))
+    angle = min(length * np.exp(rng.uniform(0, np.log(30))), 5e-3)
+    local = np.exp(rng.standard_normal((dof, 6)))
+    errors = rng.standard_normal((dof, 6)) * local * np.repeat([length, angle], 3)
+    errors[:, 5] += 3 * angle * rng.standard_normal(dof)
+    return errors
+
+
+def _small(numbers: Array) -> Array:
+    """Return the transform (4, 4) of a translation and a rotation vector."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(numbers[3:]).as_matrix()
+    T[:3, 3] = numbers[:3]
+    return T
