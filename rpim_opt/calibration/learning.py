@@ -69,9 +69,8 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
     noise
         Parts of the scatter that are looked for.
     """
-    learning = Learning(prior, tuple(noise))
     every = sampled(problem)
-    whole = learning.fitted(every, _begin(every, start), None, ROUNDS)
+    learning, whole, doubt = _believed(every, prior, tuple(noise), _begin(every, start))
     blunders = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = _explained(learning, whole, blunders, model)
     if trials and trials[0].families:  # what they explain stood before the smaller blunders
@@ -92,7 +91,23 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
         laid = laid.without(blunders)
     worst = tuple(LeftOut(*item) for item in sorted(blunders.items(), key=lambda item: -item[1]))
     added = tuple(set(fit.problem.parameters.free.names) - set(every.parameters.free.names))
-    return Found(laid, _learned(fit, added, trials, worst), learning.inside(fit.problem, fit.point), fit.x)
+    return Found(laid, _learned(fit, added, trials, worst, doubt), learning.inside(fit.problem, fit.point), fit.x)
+
+
+def _believed(
+    every: CalibrationProblem, prior: Prior, noise: tuple[str, ...], x: Array
+) -> tuple[Learning, Fit, tuple[str, ...]]:
+    """Return how sizes are found and what they are; a doubted prior is left out where the evidence is against it."""
+    learning = Learning(prior, noise)
+    whole = learning.fitted(every, x, None, ROUNDS)
+    if not prior.doubted:
+        return learning, whole, ()
+    plain = Learning(prior.without_centre(), noise)
+    without = plain.fitted(every, x, None, ROUNDS)
+    gain = whole.point.value - without.point.value
+    if gain <= 0:
+        return learning, whole, ()
+    return plain, without, (f"What other arms say was left out: -2 ln L is smaller by {gain:.1f} without it.",)
 
 
 def _explained(
@@ -144,7 +159,13 @@ def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
     return problem.on(problem.data.configurations(most, seed=0))
 
 
-def _learned(fit: Fit, added: tuple[str, ...], trials: tuple[Trial, ...], left_out: tuple[LeftOut, ...]) -> Learned:
+def _learned(
+    fit: Fit,
+    added: tuple[str, ...],
+    trials: tuple[Trial, ...],
+    left_out: tuple[LeftOut, ...],
+    notes: tuple[str, ...],
+) -> Learned:
     """Return the sizes with what is not known of them."""
     evidence, point = fit.evidence, fit.point
     covariance, slopes, growth = _curvature(evidence, point)
@@ -165,7 +186,7 @@ def _learned(fit: Fit, added: tuple[str, ...], trials: tuple[Trial, ...], left_o
         stated=fit.problem.parameters.free.scale,
         drift=_drift(fit, covariance, slopes),
         added=added,
-        notes=tuple(doubts(evidence, point, fit.others, spread)),
+        notes=(*notes, *doubts(evidence, point, fit.others, spread)),
     )
 
 

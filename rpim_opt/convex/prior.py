@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -53,6 +53,8 @@ class Prior:
         By how much the scales of frames (base, reflectors, anchors) are multiplied.
     statements
         What is known of linear combinations: `known`, `gaussian`, `from_result`.
+    doubted
+        Whether centre and scale are left out where the evidence of the data is against them: `from_fleet`.
 
     Raises
     ------
@@ -76,6 +78,7 @@ class Prior:
     joint_offset: float = JOINT_OFFSET
     frames: float = FRAMES
     statements: tuple[Statement, ...] = ()
+    doubted: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre", dict(self.centre))
@@ -200,7 +203,8 @@ class Prior:
         """Return the prior of another arm of the type of several that were calibrated: their centre and spread.
 
         Both are learned by empirical Bayes, and are shrunken towards the generic widths where arms or data are few
-        (`Fleet` has the evidence). Tails stay heavy: a different arm is believed when it differs.
+        (`Fleet` has the evidence). Tails stay heavy, and where the evidence of another arm's data is against it, this
+        prior is left out (``doubted``).
 
         Parameters
         ----------
@@ -222,7 +226,7 @@ class Prior:
         (True, True, 0)
         """
         centre, width = Fleet.of(results).tables()
-        return cls(centre=centre, scale=width)
+        return cls(centre=centre, scale=width, doubted=True)
 
     def __and__(self, other: Prior) -> Prior:
         """Return both together; InputError where they contradict each other on a key."""
@@ -241,6 +245,16 @@ class Prior:
             else:
                 both[key] = theirs if mine == default else mine
         return Prior(**both)
+
+    def without_centre(self) -> Prior:
+        """Return the same without centre and scale.
+
+        >>> import rpim_opt as ro
+        >>> prior = ro.convex.Prior(centre={"d5_mm": 0.5}, tails=5.0)
+        >>> prior.without_centre() == ro.convex.Prior(tails=5.0)
+        True
+        """
+        return replace(self, centre={}, scale={}, doubted=False)
 
     def stated(self, parameters: Parameters, *, widened: bool = True) -> Stated:
         """Return what it says of the identified parameters of a problem, in units of their scales.

@@ -41,6 +41,7 @@ class PriorFile(Part):
     joint_offset: float
     frames: float
     statements: list[StatementPart]
+    doubted: bool = False
 
 
 def save_prior(prior: Prior, path: str | Path) -> None:
@@ -69,6 +70,7 @@ def save_prior(prior: Prior, path: str | Path) -> None:
         "tails": finite(prior.tails),
         "groups": [list(group) for group in prior.groups],
         "joint_offset": prior.joint_offset,
+        "doubted": prior.doubted,
         "frames": prior.frames,
         "statements": [vars(each) for each in prior.statements],
     }
@@ -118,6 +120,7 @@ def prior_of(stored: dict[str, Any], path: Path) -> Prior:
             tails=np.inf if file.tails is None else file.tails,
             groups=tuple(tuple(group) for group in file.groups),
             joint_offset=file.joint_offset,
+            doubted=file.doubted,
             frames=file.frames,
             statements=tuple(_statement(part, i) for i, part in enumerate(file.statements, start=1)),
         )

@@ -177,6 +177,32 @@ def test_a_known_combination_holds() -> None:
     assert result.converged
 
 
+def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> None:
+    x = drawn(0)
+    few = measured(POSITION, x, 0).without(set(POSITION.labels[12:]))
+    free = POSITION.parameters.free
+    robot = ~free.of_frames
+
+    def told(deviations: Array) -> ro.convex.Prior:
+        unit = {"length": ("_m", 1.0), "angle": ("_rad", 1.0)}
+        names = [name + unit[d][0] for name, d in zip(free.names, free.dimensions, strict=True)]
+        centre = {name: float(v) for name, v, own in zip(names, deviations, robot, strict=True) if own}
+        width = {name: 0.2 * float(v) for name, v, own in zip(names, free.scale, robot, strict=True) if own}
+        return ro.convex.Prior(centre=centre, scale=width, doubted=True)
+
+    right, wrong = (ro.calibrate(few, prior=told(each)) for each in (x, -3 * x))
+    plain = ro.calibrate(few)
+    assert right.learned is not None
+    assert wrong.learned is not None
+    assert "What other arms say" not in right.weight_sentence()
+    assert "What other arms say was left out" in wrong.weight_sentence()
+    assert np.abs(wrong.x - plain.x).max() < 1e-7
+    errors = [
+        np.sqrt(np.mean((POSITION.on(POSITION.data).errors(r.x) - POSITION.errors(x)) ** 2)) for r in (right, plain)
+    ]
+    assert errors[0] < errors[1]
+
+
 def test_many_configurations_are_sampled() -> None:
     block = POSITION.data.blocks[0]
     times = MOST // len(POSITION.data) + 1
