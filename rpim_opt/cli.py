@@ -314,9 +314,10 @@ def export(
         from rpim_opt.robot.ur_kinematics import write_ur_kinematics
         from rpim_opt.store.result_file import load_result
         from rpim_opt.use.export import export_ur_calibration, export_urdf, found_by, write_all
+        from rpim_opt.use.geometry import geometry_alone
 
         say("reading the result")
-        loaded = load_result(result)
+        loaded, without = geometry_alone(load_result(result))
         robot = found_by(loaded, marker)[0].robot
         options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
         corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
@@ -329,7 +330,7 @@ def export(
         if not writers:
             accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, one or several"
             raise InputError("export", "nothing to write", accepted)
-        notes = write_all(writers)
+        notes = [*without, *write_all(writers)]
     written = [target for target, _ in writers]
     text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
     show(text, {"written": written, "notes": notes}, as_json)

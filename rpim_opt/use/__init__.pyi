@@ -2,6 +2,7 @@ from .compensated import Compensation as Compensation
 from .compensation import compensate as compensate
 from .compensation import compensate_file as compensate_file
 from .export import export_urdf as export_urdf
+from .geometry import geometry_alone as geometry_alone
 from .identified import identified as identified
 from .targets import read_targets as read_targets
 from .validation import Validation as Validation
