@@ -112,7 +112,10 @@ def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTe
     if probability >= UNLIKELY:
         return NoiseTest(ratio, probability, f"The data scatter as declared ({ratio:.2f} times).")
     if upper >= 0.5:
-        return NoiseTest(ratio, probability, f"{said}: the noise is stated too large.")
+        remedy = ""
+        if learned:
+            remedy = ' (noise = "free" learns it)'
+        return NoiseTest(ratio, probability, f"{said}: the noise is stated too large{remedy}.")
     cause = "noise is larger, rows are wrong, or the model lacks something (backlash, elasticity)"
     if learned:
         cause = "what the robot's own scatter stands for"
