@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.stated import Stated
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter
+from rpim_opt.robot.parameters import Parameters
 
 FEW = 60
 """Configurations up to which the evidence may have several optima, and is climbed from several sides."""
@@ -81,10 +83,21 @@ class Learning:
     prior: Prior
     noise: tuple[str, ...]
 
+    @cached_property
+    def _told(self) -> dict[int, tuple[Parameters, Stated]]:
+        return {}
+
+    def stated(self, problem: CalibrationProblem) -> Stated:
+        """Return what the prior says of a problem's parameters, in units of their stated scales; asked once a table."""
+        table = problem.parameters
+        if id(table) not in self._told:
+            self._told[id(table)] = (table, self.prior.stated(table))  # the table is kept, so that its id is its own
+        return self._told[id(table)][1]
+
     def evidence(self, problem: CalibrationProblem, x: Array) -> Evidence:
         """Return the evidence of a linearization at x (n,) [SI]."""
         free = problem.parameters.free
-        stated = self.prior.stated(problem.parameters)
+        stated = self.stated(problem)
         J = problem.jacobian(x)
         y = problem.residual(x) + J @ x
         unit = free.scale * stated.scale
@@ -151,11 +164,11 @@ class Learning:
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:
         """Return by what the scales of the identified parameters are multiplied, (n,)."""
-        return self.prior.stated(problem.parameters).scale * np.sqrt(point.v)
+        return self.stated(problem).scale * np.sqrt(point.v)
 
     def inside(self, problem: CalibrationProblem, point: Point) -> Stated:
         """Return what the prior says of the parameters at the scales that were learned."""
-        return self.prior.stated(problem.parameters).inside(self.widths(problem, point))
+        return self.stated(problem).inside(self.widths(problem, point))
 
     def laid(self, problem: CalibrationProblem, evidence: Evidence, point: Point, x: Array) -> CalibrationProblem:
         """Return the problem with what was learned in it: local scales, and the robot's scatter."""
