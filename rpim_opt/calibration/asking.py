@@ -12,6 +12,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.calibration.group_weights import grouped
 from rpim_opt.calibration.learning import learn, with_families
+from rpim_opt.calibration.loop import require_finite
 from rpim_opt.calibration.outcome import Iteration
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.weighed import calibrated, require_passes
@@ -127,6 +128,7 @@ def calibrate(
     given = {**how, "prior": prior, "model": model, "noise": noise, "progress": None}
     asked = partial(calibrate, formulation=formulation, weight=weight, **given)
     require_passes(max_iterations)
+    require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
     if start is None:
         elsewhere = relocated(problem)

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.blunders import beyond, suspected, unbelievable
 from rpim_opt.calibration.doubts import doubts
 from rpim_opt.calibration.learned import Learned, LeftOut, Size, Trial
+from rpim_opt.calibration.loop import require_start
 from rpim_opt.calibration.models import modelled
 from rpim_opt.calibration.sizing import Fit, Learning
 from rpim_opt.convex.evidence import Evidence, Point
@@ -69,8 +71,16 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
     noise
         Parts of the scatter that are looked for.
     """
+    try:
+        return _found(problem, prior, model, start, tuple(noise))
+    except np.linalg.LinAlgError:
+        found = "equations, scales and noise too far apart for sizes to be learned"
+        raise InputError("data", found, "their units looked at, or a weight") from None
+
+
+def _found(problem: Source, prior: Prior, model: str, start: Array | None, noise: tuple[str, ...]) -> Found:
     every = sampled(problem)
-    learning, whole, doubt = _believed(every, prior, tuple(noise), _begin(every, start))
+    learning, whole, doubt = _believed(every, prior, noise, _begin(every, start))
     blunders = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = _explained(learning, whole, blunders, model)
     if trials and trials[0].families:  # what they explain stood before the smaller blunders
@@ -90,7 +100,8 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
     if blunders:
         laid = laid.without(blunders)
     worst = tuple(LeftOut(*item) for item in sorted(blunders.items(), key=lambda item: -item[1]))
-    added = tuple(set(fit.problem.parameters.free.names) - set(every.parameters.free.names))
+    stated = set(every.parameters.free.names)
+    added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
     return Found(laid, _learned(fit, added, trials, worst, doubt), learning.inside(fit.problem, fit.point), fit.x)
 
 
@@ -134,7 +145,7 @@ def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
     """Return where to linearize first: frames where the data put them, the robot as on its drawing."""
     p = problem.parameters
     if start is not None:
-        return start
+        return require_start(start, len(p.free))
     x = np.zeros(len(p.free))
     fitted, frames = fitted_frames(problem)
     moved = fitted.parameters.of_frames & fitted.parameters.identified

@@ -337,25 +337,36 @@ def _equations(source: Source) -> int:
     return sum(len(b.row) * len(b.measurement.components) for part in source.rows() for b in part.data.blocks)
 
 
+def require_start(start: Array, count: int) -> Array:
+    """Return deviations (n,) to begin with, or refuse them."""
+    accepted = f"{count} deviations, finite, one a parameter"
+    try:
+        x = np.asarray(start, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("start", f"a {type(start).__name__}", accepted) from None
+    if x.shape != (count,):
+        raise InputError("start", f"shape {x.shape}", accepted)
+    if not np.isfinite(x).all():
+        raise InputError("start", "a value that is not finite", accepted)
+    return x
+
+
+def require_finite(*arrays: Array) -> None:
+    """Refuse residuals or slopes that are no numbers."""
+    if not all(np.isfinite(values).all() for values in arrays):
+        raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
+
+
 def _begun(loop: Loop, formulation: Formulation, choice: Choosing, start: Array | None) -> State:
     """Return the state before the first pass, at a point that meets the constraints."""
     parameters = loop.source.parameters
     scale = parameters.free.scale
     x = np.zeros(len(scale))
-    accepted = f"{len(scale)} deviations, finite, one a parameter"
     if start is not None:
-        try:
-            x = np.asarray(start, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError("start", f"a {type(start).__name__}", accepted) from None
-    if x.shape != scale.shape:
-        raise InputError("start", f"shape {x.shape}", accepted)
-    if not np.isfinite(x).all():
-        raise InputError("start", "a value that is not finite", accepted)
+        x = require_start(start, len(scale))
     z = parameters.free.wrapped(x) / scale
     model = loop.linearized(z)
-    if not (np.isfinite(model.A).all() and np.isfinite(model.b).all()):
-        raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
+    require_finite(model.A, model.b)
     unpenalized = formulation.penalty is None or (choice.settled and choice.weight == 0)
     if model.equations < len(z) and unpenalized:
         found = f"{model.equations} equations for {len(z)} parameters"

@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
-from rpim_opt.calibration.loop import run
+from rpim_opt.calibration.loop import require_finite, run
 from rpim_opt.convex.evidence import FAMILY_SD, GEOMETRY_SD, Believed, Evidence, Linearized, Point
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.prior import Prior
@@ -100,6 +100,7 @@ class Learning:
         stated = self.stated(problem)
         J = problem.jacobian(x)
         y = problem.residual(x) + J @ x
+        require_finite(J, y)
         unit = free.scale * stated.scale
         stacks = problem.stacks(joints="joint" in self.noise, at=_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)

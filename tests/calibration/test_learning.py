@@ -95,6 +95,19 @@ def test_unknown_words_are_refused(word: str, value: str) -> None:
         ro.calibrate(POSITION, **{word: value})
 
 
+@pytest.mark.parametrize(("start", "found"), [([0.0], "shape"), (np.full(34, np.nan), "not finite"), ("here", "str")])
+def test_a_start_that_does_not_fit_is_refused(start: object, found: str) -> None:
+    with pytest.raises(ro.InputError, match=f"start: found .*{found}"):
+        ro.calibrate(POSITION, start=start)
+
+
+def test_data_that_are_no_numbers_are_refused() -> None:
+    block = POSITION.data.blocks[0]
+    broken = POSITION.on(replace(POSITION.data, blocks=(replace(block, y=np.where(block.y > 1, np.nan, block.y)),)))
+    with pytest.raises(ro.InputError, match="not finite"):
+        ro.calibrate(broken)
+
+
 # --- sizes -------------------------------------------------------------------------------------------------------
 
 
