@@ -23,8 +23,8 @@ FARTHEST = 7.0
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 """Local variances are a fixed point when their logarithms change by no more, and on the way to an optimum; rounds that
 they may take."""
-FURTHER = 1.4
-"""Local variances go this much further than their fixed point says: those that nothing decides are there at once."""
+STEEPEST = 0.8
+"""Local variances are taken to follow themselves by no more: steps are at most five times what the fixed point says."""
 RIDGE = 1e-13
 """Added to the scaled information: rounding in directions that nothing decides."""
 
@@ -217,14 +217,20 @@ class Evidence:
         return *_posterior(H, h, own / v), v
 
     def _local(self, S: Array, g: Array, size2: Array, v: Array, settled: float) -> Array:
-        """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g."""
+        """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g.
+
+        By Newton's steps for ln v, each for itself: d C_jj / d v_j = C_jj^2 / v_j^2, d z_j / d v_j = C_jj z_j / v_j^2.
+        """
         tails = self.believed.tails
         for _ in range(MOST_ROUNDS):
             z, C, _ = _posterior(S, g, 1 / v)
-            change = np.log((tails * size2 + z**2 + C.diagonal()) / ((tails + 1) * v))
+            own = C.diagonal()
+            weighed = tails * size2 + z**2 + own
+            change = np.log(weighed / ((tails + 1) * v))
             if np.abs(change).max() <= settled:
                 break
-            v = v * np.exp(FURTHER * change)
+            slope = own * (own + 2 * z**2) / (v * weighed)
+            v = v * np.exp(change / (1 - np.minimum(slope, STEEPEST)))
         return v
 
     def _tails(self, e2: Array, size2: Array, v: Array) -> float:
