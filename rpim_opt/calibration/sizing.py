@@ -23,6 +23,8 @@ FEW = 60
 """Configurations up to which the evidence may have several optima, and is climbed from several sides."""
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Sizes are found when their logarithms change by no more, and deviations by no more of their scales (RMS)."""
+NEAR = 1e-3
+"""Tolerance of the fits in between: the last one is exact."""
 DISTINCT = 0.3
 """Logarithms of sizes by which two optima differ."""
 
@@ -161,7 +163,7 @@ class Learning:
             point, *others = evidence.mode(starts or evidence.starts()[:1])
         laid = self.laid(problem, evidence, point, x)
         penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-        return Fit(problem, evidence, point, others, laid, run(laid, penalized, 1.0, start=x).x)
+        return Fit(problem, evidence, point, others, laid, run(laid, penalized, 1.0, x, tolerance=NEAR).x)
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:
         """Return by what the scales of the identified parameters are multiplied, (n,)."""
