@@ -118,11 +118,7 @@ def _joined(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
     joints = _stacked(moving)
     values = _stacked(seen)
     how, left, right = _keys(moving, seen, joints.columns, values.columns, key)
-    place: dict[str, int] = {}
-    for i, name in enumerate(left):
-        if name in place:
-            raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
-        place[name] = i
+    place = _places(left, f"the key {how}", moving[0].file)
     rows = [i for i, name in enumerate(right) if name in place]
     if not rows:
         found = f"none that {moving[0].file} and {seen[0].file} share"
@@ -135,11 +131,24 @@ def _joined(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
     own = {name: cells for name, cells in joints.columns.items() if name not in values.columns and name != "label"}
     whole: dict[str, Sequence[Any]] = {name: [cells[place[right[i]]] for i in rows] for name, cells in own.items()}
     whole |= {name: [cells[i] for i in rows] for name, cells in values.columns.items() if name != "label"}
-    named = [right[i] for i in rows]
-    if len(set(named)) == len(named):
-        return Whole({"label": named, **whole}, tuple(notes))
-    whole.setdefault("configuration", named)
-    return Whole(whole, tuple(notes))
+    return Whole(_named(whole, [right[i] for i in rows]), tuple(notes))
+
+
+def _places(names: Sequence[str], where: str, file: object) -> dict[str, int]:
+    """Return where every name of a key stands, each of which stands once."""
+    place: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if name in place:
+            raise InputError(where, f"'{name}' twice in {file}", "every configuration once")
+        place[name] = i
+    return place
+
+
+def _named(columns: dict[str, Sequence[Any]], names: list[str]) -> dict[str, Sequence[Any]]:
+    """Return columns with the names of their rows: labels where each is another, otherwise configurations."""
+    if len(set(names)) == len(names):
+        return {"label": names, **columns}
+    return {**columns, "configuration": columns.get("configuration", names)}
 
 
 def _keys(

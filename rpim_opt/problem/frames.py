@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
@@ -67,11 +67,7 @@ def starting_parameters(
     """
     tools = tools or {"": (0.0,) * 6}
     place: Place = (0.0,) * 6 if base is None else base
-    for block in data.blocks:
-        for marker in set(block.markers) - set(tools):
-            where = f"row {data.label[block.row[0]]}, column marker"
-            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
-            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
+    _require_reflectors(data, tools)
     places: dict[str, Place] = dict(tools)
     if base is None:
         place, located = locate(robot, data, tools)
@@ -81,17 +77,32 @@ def starting_parameters(
     for block in data.blocks:
         kind = block.measurement
         own_frames |= dict.fromkeys(of_fixture(name + "_", block.fixture) for name in kind.frames)
-        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-        given = {name: (own or {})[names[name]] for name in names if names[name] in (own or {})}
-        if names and not given and kind.start is not None:
-            T = (
-                numeric_frame(place)
-                @ forward_kinematics(robot, block.q[:, 0])
-                @ numeric_frame(places[block.markers[0]])
-            )
-            given = kind.start(T[:, :3, 3], block.y)
-        entries |= {names[name]: (d, float(given.get(name, 0.0))) for name, d in kind.parameters.items()}
+        given = _own_values(robot, block, place, places[block.markers[0]], own or {})
+        for name, dimension in kind.parameters.items():
+            entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
     return model_parameters(robot, place, tools, entries, tuple(own_frames))
+
+
+def _require_reflectors(data: Dataset, tools: Mapping[str, Place]) -> None:
+    """Refuse rows of a reflector that nobody has stated."""
+    for block in data.blocks:
+        for marker in set(block.markers) - set(tools):
+            where = f"row {data.label[block.row[0]]}, column marker"
+            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
+
+
+def _own_values(
+    robot: Robot, block: Block, base: Place, tool: Place, stated: Mapping[str, float]
+) -> Mapping[str, float]:
+    """Return what is stated of a measurement's own parameters, or where the nominal robot puts its fixture."""
+    kind = block.measurement
+    names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+    given = {name: stated[full] for name, full in names.items() if full in stated}
+    if given or not names or kind.start is None:
+        return given
+    T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ numeric_frame(tool)
+    return kind.start(T[:, :3, 3], block.y)
 
 
 def relocated(problem: Source) -> Source | None:

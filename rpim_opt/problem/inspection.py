@@ -20,7 +20,10 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.readings import better_reading
 from rpim_opt.problem.source import Source
 from rpim_opt.problem.suspects import exchanged_rows, moved, moved_far, rows_without_values, shared_rows
+from rpim_opt.robot.mdh import Robot
 
+LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
+"""A joint that moves less [rad, m] is hardly seen."""
 STANDS_OUT = 5.0
 """Rows further than this many robust standard deviations above the median residual are listed."""
 
@@ -277,22 +280,39 @@ def _copies(data: Dataset) -> Iterable[str]:
 
 
 def _ranges(problem: CalibrationProblem) -> Iterable[str]:
-    robot, data = problem.robot, problem.data
-    q = _all_q(data)
+    q = _all_q(problem.data)
+    for i in range(problem.robot.dof):
+        yield from _range(problem.robot, i, q[:, i])
+    yield from _angle_units(problem.robot, q)
+    yield from _length_units(problem)
+
+
+def _range(robot: Robot, i: int, q: Array) -> Iterable[str]:
+    """Say whether a joint leaves its limits, or hardly moves."""
+    unit, si = display(robot.joint_dimensions[i])
+    low, high = robot.limits[i]
+    if q.min() < low - 1e-9 or q.max() > high + 1e-9:
+        yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
+    if np.ptp(q) < LEAST_TRAVEL[robot.joint_types[i]]:
+        yield f"joint {i + 1} moves only {np.ptp(q) / si:.2f} {unit}: its parameters are hardly seen."
+
+
+def _angle_units(robot: Robot, q: Array) -> Iterable[str]:
+    """Say whether degrees and radians may have been exchanged."""
     turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
-    for i, kind in enumerate(robot.joint_types):
-        unit, si = display(robot.joint_dimensions[i])
-        low, high = robot.limits[i]
-        if (q[:, i] < low - 1e-9).any() or (q[:, i] > high + 1e-9).any():
-            yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
-        if np.ptp(q[:, i]) < (np.radians(10) if kind == "revolute" else 0.01):
-            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are hardly seen."
-    if turning and np.abs(q[:, turning]).max() > 4 * np.pi:
-        yield f"joints reach {np.degrees(np.abs(q[:, turning]).max()):.0f} deg: degrees given as radians?"
-    if turning and np.abs(q[:, turning]).max() < np.radians(2 * np.pi):
+    if not turning:
+        return
+    largest = np.abs(q[:, turning]).max()
+    if largest > 4 * np.pi:
+        yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
+    if largest < np.radians(2 * np.pi):
         yield "no joint leaves 6.3 deg: radians given as degrees?"
-    reach = float(np.sum(np.abs(robot.mdh[:, [1, 3]])))
-    for block in data.blocks:
+
+
+def _length_units(problem: CalibrationProblem) -> Iterable[str]:
+    """Say whether millimetres and metres may have been exchanged."""
+    reach = float(np.sum(np.abs(problem.robot.mdh[:, [1, 3]])))
+    for block in problem.data.blocks:
         lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
         if not lengths or len(block.row) < 2:
             continue

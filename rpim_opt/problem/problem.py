@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -501,19 +501,18 @@ class CalibrationProblem:
             slopes = self.joint_slopes(scatter.at)
         # each row as a configuration of its own
         alone = replace(self.data, configuration=np.arange(len(self.data)))
-        found: dict[int, Array] = {}
+        count = len(self.groups)
+        found = {}
         for stack in stacked(alone, slopes):
-            found |= dict(zip(stack.index[:, 0].tolist(), stack.covariance(scatter, reading), strict=True))
-        return self._by_block(found)
-
-    def _by_block(self, found: Mapping[int, Array]) -> list[Array]:
-        """Return what stands under the number of every row's first equation, block by block."""
+            place = np.full(count, -1)
+            place[stack.index[:, 0]] = np.arange(len(stack.index))
+            found[stack.index.shape[1]] = (place, stack.covariance(scatter, reading))
         blocks = []
         begin = 0
         for block in self.data.blocks:
             k = len(block.measurement.components)
-            numbers = begin + k * np.arange(len(block.row))
-            blocks.append(np.array([found[i] for i in numbers.tolist()]))
+            place, covariance = found[k]
+            blocks.append(covariance[place[begin + k * np.arange(len(block.row))]])
             begin += k * len(block.row)
         return blocks
 
