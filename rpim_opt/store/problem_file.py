@@ -30,7 +30,7 @@ from rpim_opt.store.proposal import proposed
 
 Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
-Noise = Literal["robot", "free", "level", "declared"]
+LEARNED_NOISE = ("robot", "free", "level", "declared")
 
 
 class FrameTable(Table):
@@ -101,7 +101,7 @@ class ProblemTable(Table):
     formulation: str = "tikhonov"
     selector: str = "learned"
     model: Model = "geometry"
-    scatter: Noise | dict[str, Any] = "robot"
+    scatter: str | dict[str, Any] = "robot"
     noise: dict[str, Any] = Field(default_factory=dict)
     scale: dict[Name, Any] = Field(default_factory=dict)
     tolerance: dict[Name, Any] = Field(default_factory=dict)
@@ -249,6 +249,9 @@ def _base(table: ProblemTable, arm: Described, path: Path) -> tuple[float, ...] 
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
     """Return the robot's scatter that a file states, or None."""
     if isinstance(table.scatter, str):
+        if table.scatter not in LEARNED_NOISE:
+            accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"
+            raise InputError("key scatter", f"'{table.scatter}'", accepted, path)
         return None
     found = validate(ScatterTable, table.scatter, path)
     for name, value in found.model_dump().items():

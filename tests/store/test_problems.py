@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -210,3 +211,20 @@ def test_a_curved_valley_is_walked_to_its_end(
     assert result.converged, result.message
     assert result.history[-1].objective == pytest.approx(objective, rel=within)
     assert len(calls) <= most
+
+
+def test_scatter_is_a_word_or_a_table(tmp_path: Path) -> None:
+    folder = tmp_path / "arm"
+    shutil.copytree(problems_folder() / "position", folder)
+    file = folder / "problem.toml"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(f'scatter = "level"\n{text}', encoding="utf-8")
+    assert ro.load(folder).noise == "level"
+    file.write_text(f'scatter = "some"\n{text}', encoding="utf-8")
+    with pytest.raises(ro.InputError, match="key scatter: found 'some', accepted: robot"):
+        ro.load(folder)
+    file.write_text(f"{text}\n[scatter]\nposition_mm = 0.04\njoint_mrad = 0.02\n", encoding="utf-8")
+    instance = ro.load(folder)
+    assert instance.noise == "declared"
+    assert instance.problem.scatter is not None
+    assert (instance.problem.scatter.position, instance.problem.scatter.joint) == (4e-5, 2e-5)
