@@ -17,6 +17,8 @@ GAIN = 6.0
 """By how much -2 ln L must fall for a model with families: of 306 simulated arms without them one gained more."""
 LARGE = 3.0
 """By how much larger, in their logarithms, families are expected in another start."""
+COMPARED = 1e-6
+"""Of -2 ln L, to which models are compared: hundredths, of some thousands."""
 ROUNDS = 3
 """Linearizations at which the sizes of the chosen model are looked for."""
 
@@ -52,7 +54,7 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
     for candidate in candidates(fit.problem, families):
         used = own.union(*(families[family] for family in candidate))
         evidence = restricted(columns, np.array([name in used for name in names]))
-        point = evidence.mode(_starts(evidence, fit))[0]
+        point = evidence.mode(_starts(evidence, fit), COMPARED)[0]
         trials.append((point.value + GAIN * bool(candidate), candidate, point))
     trials.sort(key=lambda trial: trial[0])
     _, best, point = trials[0]

@@ -23,6 +23,8 @@ FEW = 60
 """Configurations up to which the evidence may have several optima, and is climbed from several sides."""
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Sizes are found when their logarithms change by no more, and deviations by no more of their scales (RMS)."""
+CLOSE = 0.1
+"""Scales (RMS) up to which the mean at one linearization stands for a fit."""
 NEAR = 1e-3
 """Tolerance of the fits in between: the last one is exact."""
 DISTINCT = 0.3
@@ -145,7 +147,7 @@ class Learning:
         fit = self._once(problem, x, before, several=before is None)
         for _ in range(rounds - 1):
             again = self._once(problem, fit.x, fit.point.logs, several=before is None and fit.several)
-            moved = np.sqrt(np.mean(((again.x - fit.x) / again.laid.parameters.free.scale) ** 2))
+            moved = _moved(again.x, fit.x, again.laid)
             resized = np.abs(again.point.logs - fit.point.logs).max()
             before = fit.point.logs  # other sides were tried twice
             fit = replace(again, others=again.others or fit.others)
@@ -162,8 +164,12 @@ class Learning:
         with phase("selection"):
             point, *others = evidence.mode(starts or evidence.starts()[:1])
         laid = self.laid(problem, evidence, point, x)
-        penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-        return Fit(problem, evidence, point, others, laid, run(laid, penalized, 1.0, x, tolerance=NEAR).x)
+        stated = self.stated(problem)
+        mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
+        if _moved(mean, x, laid) > CLOSE:  # too far for one linearization
+            penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
+            mean = run(laid, penalized, 1.0, x, tolerance=NEAR).x
+        return Fit(problem, evidence, point, others, laid, mean)
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:
         """Return by what the scales of the identified parameters are multiplied, (n,)."""
@@ -180,6 +186,11 @@ class Learning:
         scale[p.identified] *= self.widths(problem, point)
         scatter = replace(evidence.scatter(point.logs), at=_values(problem, x))
         return replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
+
+
+def _moved(x: Array, before: Array, laid: CalibrationProblem) -> float:
+    """Return by how many of their scales deviations (n,) moved, RMS."""
+    return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
 def few(problem: CalibrationProblem) -> bool:

@@ -25,6 +25,10 @@ SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 they may take."""
 STEEPEST = 0.8
 """Local variances are taken to follow themselves by no more: steps are at most five times what the fixed point says."""
+TOGETHER = 0.3
+"""Changes of their logarithms below which their steps are Newton's, coupled."""
+FARTHEST_STEP = 1.0
+"""Of the logarithms, that such a step may go."""
 RIDGE = 1e-13
 """Added to the scaled information: rounding in directions that nothing decides."""
 
@@ -196,6 +200,11 @@ class Evidence:
         return parts
 
     @cached_property
+    def _light(self) -> np.ndarray:
+        """Which deviations keep the variance that their size says."""
+        return np.flatnonzero(~self.believed.heavy | self.believed.replaced)
+
+    @cached_property
     def _stacked(self) -> list[tuple[Stack, Array, Array]]:
         return [(stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None]) for stack in self.data.stacks]
 
@@ -212,25 +221,29 @@ class Evidence:
         own = np.where(b.replaced, 0.0, 1.0)
         if len(heavy):
             # the others' variances stay: their share of the information is taken out once
-            S, g = _without(H, h, own / v, heavy)
+            S, g = _without(H, h, own / v, heavy, self._light)
             v[heavy] = self._local(S, g, size2[heavy], v[heavy], settled)
         return *_posterior(H, h, own / v), v
 
     def _local(self, S: Array, g: Array, size2: Array, v: Array, settled: float) -> Array:
         """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g.
 
-        By Newton's steps for ln v, each for itself: d C_jj / d v_j = C_jj^2 / v_j^2, d z_j / d v_j = C_jj z_j / v_j^2.
+        By Newton's steps for ln v: d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
         """
         tails = self.believed.tails
+        before = np.inf
         for _ in range(MOST_ROUNDS):
             z, C, _ = _posterior(S, g, 1 / v)
-            own = C.diagonal()
-            weighed = tails * size2 + z**2 + own
+            weighed = tails * size2 + z**2 + C.diagonal()
             change = np.log(weighed / ((tails + 1) * v))
-            if np.abs(change).max() <= settled:
+            largest = np.abs(change).max()
+            if largest <= settled:
                 break
-            slope = own * (own + 2 * z**2) / (v * weighed)
-            v = v * np.exp(change / (1 - np.minimum(slope, STEEPEST)))
+            step = change  # which always leads downhill, slowly
+            if largest < before:
+                step = _step(change, C * (C + 2 * np.outer(z, z)), weighed, v)
+            v = v * np.exp(step)
+            before = min(before, largest)
         return v
 
     def _tails(self, e2: Array, size2: Array, v: Array) -> float:
@@ -299,18 +312,16 @@ class Evidence:
 
 _potrf: Any = get_lapack_funcs("potrf", dtype=float)
 _potri: Any = get_lapack_funcs("potri", dtype=float)
-
-
+_posv: Any = get_lapack_funcs("posv", dtype=float)
 _trtrs: Any = get_lapack_funcs("trtrs", dtype=float)
 
 
 def _factored(H: Array, precision: Array) -> tuple[Array, Array]:
     """Return L and d with L L' = M scaled by d to a diagonal of ones, M = H + diag(precision)."""
-    M = H.copy()
-    M[np.diag_indices(len(precision))] += precision
-    d = 1 / np.sqrt(M.diagonal())
-    scaled = M * d[:, None] * d
-    scaled[np.diag_indices(len(d))] += RIDGE
+    n = len(precision)
+    d = 1 / np.sqrt(H.diagonal() + precision)
+    scaled = H * d[:, None] * d
+    scaled.flat[:: n + 1] = 1 + RIDGE
     factor, failed = _potrf(scaled, lower=1)
     if failed:
         raise np.linalg.LinAlgError("information matrix is not positive definite")
@@ -323,18 +334,37 @@ def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, floa
     logdet = 2 * float(np.sum(np.log(factor.diagonal() / d)))
     lower, _ = _potri(factor, lower=1)  # its upper half is zero, as potrf left it
     C = lower + lower.T
-    C[np.diag_indices(len(d))] /= 2
+    C.flat[:: len(d) + 1] /= 2
     C *= d[:, None] * d
     return C @ h, C, logdet
 
 
-def _without(H: Array, h: Array, precision: Array, kept: np.ndarray) -> tuple[Array, Array]:
+def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
+    """Return a step in ln v (n,) to where the changes that the map asks for are zero; they follow v by M / weighed / v.
+
+    Newton's where the map draws near to a fixed point (the system is positive definite), else each for itself.
+    """
+    largest = np.abs(change).max()
+    if largest <= TOGETHER:
+        root = np.sqrt(weighed * v)
+        system = -M / np.outer(root, root)
+        system.flat[:: len(v) + 1] += 1
+        ratio = np.sqrt(weighed / v)
+        _, step, failed = _posv(system, change * ratio)
+        step = np.asarray(step, dtype=float) / ratio
+        if not failed and np.abs(step).max() <= FARTHEST_STEP:
+            return step
+    return change / (1 - np.minimum(M.diagonal() / (weighed * v), STEEPEST))
+
+
+def _without(
+    H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.ndarray
+) -> tuple[Array, Array]:
     """Return the information on some deviations, and its product with their mean, where the others are integrated.
 
     By Cholesky's factor, which loses no more than one of the whole matrix would: an inverse loses all digits where
     frames are nearly free.
     """
-    others = np.setdiff1d(np.arange(len(h)), kept)
     if not len(others):
         return H, h
     factor, d = _factored(H[np.ix_(others, others)], precision[others])
