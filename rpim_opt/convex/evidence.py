@@ -357,9 +357,7 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
     return change / (1 - np.minimum(M.diagonal() / (weighed * v), STEEPEST))
 
 
-def _without(
-    H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.ndarray
-) -> tuple[Array, Array]:
+def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.ndarray) -> tuple[Array, Array]:
     """Return the information on some deviations, and its product with their mean, where the others are integrated.
 
     By Cholesky's factor, which loses no more than one of the whole matrix would: an inverse loses all digits where
