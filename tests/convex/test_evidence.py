@@ -11,7 +11,9 @@ from scipy.stats import multivariate_normal
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.sizing import Learning
 from rpim_opt.convex.evidence import CENTRES, NOISE_SD, Believed, Evidence, Linearized
+from rpim_opt.convex.prior import Prior
 from rpim_opt.problem.scatter import Stack
 
 NOISE = ("position", "orientation", "joint")
@@ -120,6 +122,27 @@ def test_local_variances_are_a_fixed_point_and_bound_student_t() -> None:
     point = evidence.at(evidence.centre - 0.7)
     size2 = np.exp(2 * point.logs[0])
     assert np.allclose(point.v, (3 * size2 + point.z**2 + np.diag(point.C)) / 4, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "off"),
+    [
+        ("paper_arm", 0, [-1.64, -3.5, -0.5]),
+        ("paper_arm", 2, [-1.64, -3.5, -0.5]),
+        ("pose", 2, [-0.95, -3.01, -4.09, 0.8]),
+    ],
+)
+def test_local_variances_settle_where_steps_each_for_itself_run_in_circles(
+    name: str, seed: int, off: list[float]
+) -> None:
+    problem = ro.load(name).problem
+    few = problem.on(problem.data.configurations(6, seed))
+    evidence = Learning(Prior(), NOISE).evidence(few, np.zeros(len(few.parameters.free)))
+    point = evidence.at(evidence.centre + off)
+    heavy = evidence.believed.heavy
+    e2 = point.z**2 + np.diag(point.C)
+    size2 = np.exp(2 * point.logs[0])
+    np.testing.assert_allclose(point.v[heavy], (3 * size2 + e2[heavy]) / 4, rtol=1e-7)
 
 
 def test_statements_are_measurements_without_scatter() -> None:
