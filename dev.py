@@ -1,4 +1,4 @@
-"""Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``.
+"""Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``, ``docs``.
 
 Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet. That
 file has the hashes of all that may be downloaded, and is made by ``uv pip compile --universal --python-version 3.11
@@ -45,11 +45,19 @@ def run(*command: str | Path) -> int:
     return subprocess.run([BIN / command[0], *command[1:]], check=False).returncode
 
 
+def docs(folder: str = "docs") -> int:
+    """Write the reference of every public name as HTML pages that need no server."""
+    os.environ["PYTHONWARNINGS"] = "ignore"  # names of types that only checkers import
+    folders = sorted(path.parent.name for path in (ROOT / "rpim_opt").glob("*/__init__.pyi"))
+    modules = ["rpim_opt", *(f"rpim_opt.{name}" for name in folders)]
+    return run("pdoc", *modules, "--docformat", "numpy", "--no-show-source", "--output-directory", folder)
+
+
 def main(arguments: list[str]) -> int:
     """Carry out one command line."""
     what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check"):
-        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
+    if what not in ("run", "test", "check", "docs"):
+        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check | docs [FOLDER]")
         return 2
     environment()
     if what == "run":
@@ -57,6 +65,8 @@ def main(arguments: list[str]) -> int:
     os.chdir(ROOT)
     if what == "test":
         return run("pytest", *rest)
+    if what == "docs":
+        return docs(*rest)
     failed = [name for name, command in CHECKS.items() if run(*command)]
     print(f"checks failed: {', '.join(failed)}" if failed else "all checks passed")
     return len(failed)

@@ -1,4 +1,4 @@
-"""Every snippet of the README runs, and prints what the README says it prints."""
+"""Every snippet of the README and of the guides runs, and prints what they say it prints."""
 
 from __future__ import annotations
 
@@ -16,24 +16,31 @@ from tests.test_cli import run
 from tests.test_commands import write_cell
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"```(\w+)\n(.*?)```(?:\n+```text\n(.*?)```)?", README, flags=re.DOTALL)
-PYTHON = [(code, printed) for language, code, printed in BLOCKS if language == "python"]
-SHELL = [code.splitlines() for language, code, _ in BLOCKS if language == "sh"]
+PAGES = {"README": README} | {
+    path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies" / "gallery").glob("*.md"))
+}
+BLOCKS = [
+    (page, *found)
+    for page, text in PAGES.items()
+    for found in re.findall(r"```(\w+)\n(.*?)```(?:\n+```text\n(.*?)```)?", text, flags=re.DOTALL)
+]
+PYTHON = [(page, code, printed) for page, language, code, printed in BLOCKS if language == "python"]
+SHELL = [(page, code.splitlines()) for page, language, code, _ in BLOCKS if language == "sh"]
 
 
 def test_there_are_snippets() -> None:
-    assert PYTHON
-    lines = [line for block in SHELL for line in block]
+    assert {page for page, *_ in PYTHON} >= {"README", "formulations", "weights", "results"}
+    lines = [line for _, block in SHELL for line in block]
     assert any(line.startswith("python3 dev.py run calibrate") for line in lines)
     assert "python3 dev.py test" in lines
 
 
-@pytest.mark.parametrize(("code", "printed"), PYTHON)
-def test_python(code: str, printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("page", "code", "printed"), PYTHON, ids=lambda value: value.strip()[:30])
+def test_python(page: str, code: str, printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        exec(compile(code, "README.md", "exec"), {})
+        exec(compile(code, page, "exec"), {})
     for line in printed.splitlines():
         assert line.strip() in out.getvalue()
 
@@ -42,7 +49,7 @@ def runs(line: str) -> bool:
     return "rpim-opt" in line.split("#")[0] or "dev.py run" in line
 
 
-@pytest.mark.parametrize("block", [b for b in SHELL if any(map(runs, b))], ids=lambda block: block[0][:40])
+@pytest.mark.parametrize("block", [b for _, b in SHELL if any(map(runs, b))], ids=lambda block: block[0][:40])
 def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     write_cell(tmp_path)  # what the reader has: arm.urdf and measured.csv
     monkeypatch.chdir(tmp_path)
@@ -59,7 +66,7 @@ def test_the_main_table_is_the_studys() -> None:
 
     path = ROOT / "studies" / "results" / "peers" / "replicates.parquet"
     rows = parquet.read_table(path).to_pylist()
-    lines = re.findall(r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("##")[0].replace("**", ""), flags=re.MULTILINE)
+    lines = re.findall(r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("## Beside other tools")[1].replace("**", ""), flags=re.MULTILINE)
     assert len(lines) == 5
     for name, cells in lines:
         tool, _, method = name.partition(", ")
@@ -93,10 +100,30 @@ def test_the_table_of_real_arms_is_the_studys() -> None:
         assert f"{100 * np.mean([row['learned, model auto, covers'] for row in own]):.0f}" == stated[3]
 
 
+LINKED = ["README.md", ".github/CONTRIBUTING.md", *(f"studies/gallery/{page}.md" for page in PAGES if page != "README")]
+
+
+@pytest.mark.parametrize("page", [Path(name) for name in LINKED])
+def test_every_link_leads_somewhere(page: Path) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    for target in targets:
+        name, _, anchor = target.partition("#")
+        if "://" in name:
+            continue
+        there = (ROOT / page.parent / name) if name else ROOT / page
+        assert there.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", there.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}, (
+                target
+            )
+
+
 def test_every_name_that_texts_say_is_there() -> None:
     import rpim_opt as ro
 
-    said = [README, *(path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies").glob("*.py")))]
+    said = [*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies").glob("*.py")))]
     names = {name for text in said for name in re.findall(r"\bro\.(\w+(?:\.\w+)?)", text)}
     assert len(names) > 40
     for name in sorted(names):

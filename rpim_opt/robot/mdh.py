@@ -164,7 +164,7 @@ class _RobotTable(Table):
 
 
 def read_robot(path: str | Path) -> Robot:
-    """Return the robot of a ``robot.toml`` file (its format: README, "Your own robot").
+    """Return the robot of a ``robot.toml`` file (its format: the guide "Your own robot").
 
     Raises
     ------

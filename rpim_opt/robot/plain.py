@@ -31,7 +31,7 @@ WITHOUT_COLUMN = {
 def read_mdh(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
 
-    JSON has the keys of ``robot.toml`` (README, "Your own robot"). CSV has a row a joint and the keys of a
+    JSON has the keys of ``robot.toml`` (the guide "Your own robot"). CSV has a row a joint and the keys of a
     ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
     cell is left out.

@@ -35,7 +35,7 @@ class Simulated:
 
 
 def simulate(name: str | Path, seed: int | None = None) -> Simulated:
-    """Make the tables of a problem folder that has a ``[simulation]`` table (README, "Simulated problems").
+    """Make the tables of a problem folder that has a ``[simulation]`` table (the guide "The command line").
 
     True deviations are normal with the scales as standard deviations, times ``spread``, for every identified
     parameter; those of ``[simulation.truth]`` are fixed instead. Joint values are uniform in ``joint_share`` of
