@@ -38,7 +38,7 @@ UNITS = {"m and rad": (1.0, 1.0), "mm and degrees": (1e-3, np.pi / 180)}
 PRINTED_AS = {"Eq. (11) once": "RPIM"}
 PRINTED_AXES = {"x": (0.671, 39.404), "y": (1.244, 88.489), "z": (2.815, 99.796)}
 """Mean errors before calibration [mm] and their reductions [%], in the text to Fig. 12."""
-METHODS = ("NC", "LSM", "GD", "GN", "Eq. (11) once", "rpim_opt")
+METHODS = ("NC", "LSM", "GD", "GN", "GN, cut-off 1e-12", "Eq. (11) once", "rpim_opt")
 SIGMA = float(np.hypot(0.03, 0.015)) * 1e-3
 TOOL = (-3.04154e-3, 15.2929157e-3, 49.35572e-3)
 """The target ball, Eq. (23). The text above that equation says -3.402 mm instead of -3.04154."""
@@ -94,6 +94,7 @@ def _identified(problem: CalibrationProblem, weight: Any) -> dict[str, Array]:
         "LSM": linear_least_squares(problem).x,
         "GD": gradient_descent(problem).x,
         "GN": gauss_newton(problem).x,
+        "GN, cut-off 1e-12": gauss_newton(problem, cutoff=1e-12).x,
         "Eq. (11) once": raw_path(problem, np.array([3.063e-14]), UNITS["m and rad"])[0],
         "rpim_opt": ro.calibrate(problem, ro.tikhonov, weight).x,
     }
@@ -265,9 +266,10 @@ EXPERIMENT = """\
 ## Tables 9 and 10, Figs. 4 to 6 and 11: 52 points, simulated [mm]
 
 Medians over {count} simulations; the last columns are the true mean error at the eighteen configurations of Table 8,
-and its worst case. Gauss-Newton that nothing holds runs away in {lost} of them. Every other method that minimizes the
-squared residual to its end reaches the noise: that LSM stays at 1.4 mm and RPIM at 0.47 mm in the paper cannot be
-noise, and can be a model that leaves parameters out.
+and its worst case. Gauss-Newton is as good as anything where singular values below 1e-8 of the largest count as zero
+(GN), and runs away in {lost} of them with a cut-off of 1e-12, which takes redundant directions for ones that the data
+see. Every method that minimizes the squared residual to its end reaches the noise: that LSM stays at 1.4 mm and RPIM at
+0.47 mm in the paper cannot be noise, and can be a model that leaves parameters out.
 
 {table}
 
@@ -284,6 +286,12 @@ CONTRADICTIONS = """\
 - Table 10 says 62.261 % for GN where the text says 63.261 %; 1 - 0.956/2.533 is 62.26 %.
 - Errors are said to be "reduced to" the percentages by which Table 10 reduces them.
 - The tool offset is -3.402 mm in the text and -3.04154 mm in Eq. (23).
+- Eq. (2), third row: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta) has sin(alpha) sin(theta)
+  cos(beta) - cos(alpha) sin(beta), then sin(alpha) cos(theta), and d cos(alpha) at the end; printed are
+  cos(beta), cos(theta) cos(alpha) and d sin(alpha) in their places.
+- Eq. (6) sums transforms that are to be multiplied; Eq. (13) has U'(lambda I)'(lambda I)U for x'(lambda I)'(lambda I)x,
+  and Eq. (14) lacks its x.
+- Eq. (11) weighs the penalty by lambda, Eqs. (13) and (14) by its square.
 - The smallest residual cannot pick a weight: the residual falls with the weight, so the smallest weight always wins.
 """
 
@@ -377,7 +385,8 @@ def _experiment(many: list[dict[str, Any]]) -> str:
     for name in METHODS:
         errors = np.array([row[f"errors: {name}"] for row in many])
         true = np.array([row[f"verification: {name}"] for row in many]).mean(axis=1)
-        lost += int(np.sum(true > nominal))
+        if "cut-off" in name:
+            lost = int(np.sum(true > nominal))
         figures = [*(np.median(f(errors, axis=1)) for f in (np.max, np.mean, np.std)), np.median(true), true.max()]
         said = [paper[index].get(PRINTED_AS.get(name, name), "-") for index in ("MAX", "MAE", "SD")]
         lines.append([name, *said, *(f"{v:.4f}" for v in figures)])

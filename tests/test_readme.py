@@ -66,7 +66,9 @@ def test_the_main_table_is_the_studys() -> None:
 
     path = ROOT / "studies" / "results" / "peers" / "replicates.parquet"
     rows = parquet.read_table(path).to_pylist()
-    lines = re.findall(r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("## Beside other tools")[1].replace("**", ""), flags=re.MULTILINE)
+    lines = re.findall(
+        r"^\| (\S+, \S.*?) \| (.*) \|$", README.split("## Beside other tools")[1].replace("**", ""), flags=re.MULTILINE
+    )
     assert len(lines) == 5
     for name, cells in lines:
         tool, _, method = name.partition(", ")

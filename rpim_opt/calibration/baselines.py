@@ -42,10 +42,14 @@ def linear_least_squares(problem: CalibrationProblem) -> Baseline:
     return Baseline(scale * np.linalg.lstsq(model.A, model.b, rcond=1e-12)[0], 1, "linear least squares")
 
 
-def gauss_newton(problem: CalibrationProblem, iterations: int = 20, tolerance: float = 1e-10) -> Baseline:
+def gauss_newton(
+    problem: CalibrationProblem, iterations: int = 20, tolerance: float = 1e-10, cutoff: float = 1e-8
+) -> Baseline:
     """Gauss-Newton: least-squares steps of smallest norm, repeated until they are shorter than ``tolerance`` scales.
 
-    Nothing holds back directions that the data do not see well: they wander where noise sends them.
+    Nothing holds back directions that the data do not see well: they wander where noise sends them. Where parameters
+    are redundant, the cut-off decides: a direction that no data see has a singular value of rounding at nominal, and a
+    larger one where deviations are not exact; with a cut-off of 1e-12 it is taken for one that is seen, and runs away.
 
     Parameters
     ----------
@@ -53,6 +57,8 @@ def gauss_newton(problem: CalibrationProblem, iterations: int = 20, tolerance: f
         What was measured, and what is to be identified.
     iterations, tolerance
         When to stop.
+    cutoff
+        Singular values below so much of the largest are taken for zero.
 
     Examples
     --------
@@ -66,7 +72,7 @@ def gauss_newton(problem: CalibrationProblem, iterations: int = 20, tolerance: f
     while k < iterations:
         k += 1
         model = problem.linearize(scale * z)
-        step = np.linalg.lstsq(model.A, model.b - model.A @ z, rcond=1e-12)[0]
+        step = np.linalg.lstsq(model.A, model.b - model.A @ z, rcond=cutoff)[0]
         z = z + step
         if np.linalg.norm(step) <= tolerance * (1 + np.linalg.norm(z)):
             break

@@ -117,8 +117,8 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
     Parameters
     ----------
     name
-        A folder with ``problem.toml`` (its format: the guide "Your own robot"), that file, or the name of one that comes
-        with the package.
+        A folder with ``problem.toml`` (its format: the guide "Your own robot"), that file, or the name of one that
+        comes with the package.
     variant
         One of the file's ``[variant.NAME]`` tables, laid over the other keys.
     measurements
