@@ -51,7 +51,9 @@ class SimulatedArm:
     read: Dataset
 
 
-def simulated_arm(seed: int, count: int, noise: float = 3e-5, offset: float = 0.0) -> SimulatedArm:
+def simulated_arm(
+    seed: int, count: int, noise: float = 3e-5, offset: float = 0.0, physics: float = 0.0
+) -> SimulatedArm:
     """Return a simulated arm; the seeds 0, 1, 2, ... take turns between three robots.
 
     Behind every link there is a small transform. Its lengths are normal with a standard deviation of 0.05 to 1 mm
@@ -68,6 +70,10 @@ def simulated_arm(seed: int, count: int, noise: float = 3e-5, offset: float = 0.
         Standard deviation of a coordinate [m], declared as it is.
     offset
         Angle [rad] by which one joint, neither the first nor the last, is off besides.
+    physics
+        Angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
+        their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as
+        much as the one behind it or more, by a factor that nobody is told.
 
     Examples
     --------
@@ -88,8 +94,10 @@ def simulated_arm(seed: int, count: int, noise: float = 3e-5, offset: float = 0.
     there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (UNSEEN, robot.dof))
     q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
 
+    moved = _Moved(robot, physics, np.random.default_rng([seed, 5]))
+
     def seen(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ flange(robot, joints, errors)
+        T = base @ flange(robot, moved.joints(joints), errors)
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
         drawn = np.random.default_rng([seed, stream]).standard_normal(points.shape)
         return Dataset.of(joints, points + level * drawn, noise)
@@ -111,6 +119,46 @@ def flange(robot: Robot, q: Array, errors: Array) -> Array:
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ before @ turn @ behind @ _small(error)
     return T
+
+
+class _Moved:
+    """Where joints are when encoders say something else: sag under gravity, and eccentric encoders."""
+
+    def __init__(self, robot: Robot, size: float, rng: np.random.Generator) -> None:
+        self.robot = robot
+        self.size = size
+        self.mass = np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1]
+        self.phase = rng.uniform(0, 2 * np.pi, robot.dof)
+        self.give = rng.uniform(0.3, 1.0, robot.dof)
+        often = rng.uniform(-np.pi, np.pi, (200, robot.dof))
+        self.most = np.abs(self._torque(often)).max(axis=0)
+
+    def joints(self, q: Array) -> Array:
+        """Return joint values (N, dof) [rad] of encoder values."""
+        if not self.size:
+            return q
+        sag = self.give * self._torque(q) / np.maximum(self.most, 1e-9 * self.most.max())
+        moved = q @ self.robot.joint_map.T
+        off = self.size * (sag + np.cos(moved + self.phase) / 3)
+        return q + off @ np.linalg.inv(self.robot.joint_map).T
+
+    def _torque(self, q: Array) -> Array:
+        """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
+        frames = []
+        T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+        for (alpha, a, theta, d, beta), angle in zip(self.robot.mdh, (q @ self.robot.joint_map.T).T, strict=True):
+            turn = np.tile(np.eye(4), (len(q), 1, 1))
+            turn[:, :3, :3] = Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+            T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ _small(np.array([0, 0, d, 0, beta, 0]))
+            frames.append(T)
+        places = [frame[:, :3, 3] for frame in frames]
+        centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
+        down = np.array([0.0, 0.0, -1.0])
+        found = np.zeros(q.shape)
+        for i, frame in enumerate(frames):
+            for mass, centre in zip(self.mass[i:], centres[i:], strict=True):
+                found[:, i] += mass * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
+        return found
 
 
 def _errors(dof: int, rng: np.random.Generator) -> Array:

@@ -1,8 +1,11 @@
 """Calibrate one benchmark problem with figaroh; called by ``studies/peers.py`` in the peer's own environment.
 
 As documented: a class with the cost function of the package's guide, a configuration file with the method of
-estimation, data as CSV, the tool's frame unknown. m and rad. ``threshold`` sets its limit for outliers by hand.
+estimation, data as CSV, frames of base and tool unknown. m and rad. ``map`` is told the noise, ``threshold`` sets its
+limit for outliers by hand.
 """
+
+from common import answer  # first: it starts the clock
 
 import contextlib
 import json
@@ -19,7 +22,7 @@ from figaroh.calibration.base_calibration import BaseCalibration
 from figaroh.calibration.calibration_tools import calc_updated_fkm
 from figaroh.tools.load_robot import load_robot
 
-THRESHOLDS = {"structural, threshold": 1.5e-3}
+THRESHOLD = 1.5e-3
 
 
 class Calibration(BaseCalibration):
@@ -31,11 +34,17 @@ class Calibration(BaseCalibration):
         return self.apply_measurement_weighting(self._compute_logmap_residuals(self.PEE_measured, modelled))
 
 
-def main(folder: Path, method: str) -> None:
-    """Print what the method finds as JSON."""
+def configured(folder: Path, method: str) -> dict:
+    """Return the package's configuration."""
     name = method.partition(",")[0]
-    configuration = {
-        "robot": {"name": "rpim6"},
+    estimation = {"method": name}
+    if name == "map":
+        estimation["noise_std"] = json.loads((folder / "robot.json").read_text())["noise"]
+    threshold = 0.05
+    if method.endswith("threshold"):
+        threshold = THRESHOLD
+    return {
+        "robot": {"name": "arm"},
         "tasks": {
             "calibration": {
                 "enabled": True,
@@ -43,8 +52,8 @@ def main(folder: Path, method: str) -> None:
                 "kinematics": {"base_frame": "universe", "tool_frame": "smr"},
                 "parameters": {
                     "calibration_level": "full_params",
-                    "outlier_threshold": THRESHOLDS.get(method, 0.05),
-                    "estimation": {"method": name},
+                    "outlier_threshold": threshold,
+                    "estimation": estimation,
                 },
                 "measurements": {
                     "markers": [{"measurable_dof": [True, True, True, False, False, False]}],
@@ -57,6 +66,11 @@ def main(folder: Path, method: str) -> None:
             }
         },
     }
+
+
+def run(folder: Path, method: str) -> dict:
+    """Return what the method finds."""
+    configuration = configured(folder, method)
     path = folder / f"{method}.yaml"
     path.write_text(yaml.safe_dump(configuration))
     valid = np.loadtxt(folder / "valid.csv", delimiter=",", skiprows=1)
@@ -65,7 +79,7 @@ def main(folder: Path, method: str) -> None:
         robot = load_robot(str((folder / "robot.urdf").resolve()), load_by_urdf=True)
         start = time.perf_counter()
         calibration = Calibration(robot, str(path))
-        calibration.calib_config["known_baseframe"] = True
+        calibration.calib_config["known_baseframe"] = False
         calibration.calib_config["known_tipframe"] = False
         calibration.initialize()
         found = calibration.solve(enable_logging=False)
@@ -74,21 +88,8 @@ def main(folder: Path, method: str) -> None:
         q = np.array([pin.neutral(calibration.model)] * len(valid))
         q[:, calibration.calib_config["config_idx"]] = valid[:, 3:]
         predicted = calc_updated_fkm(calibration.model, calibration.data, found.x, q, configuration)
-    names = calibration.calib_config["param_name"]
-    angle = np.array(["phi" in n or "offset" in n for n in names])
-    change = np.abs(found.x)
-    print(
-        json.dumps(
-            {
-                "seconds": seconds,
-                "largest_mm": 1e3 * change[~angle].max(),
-                "largest_mrad": 1e3 * change[angle].max(),
-                "predicted_mm": (1e3 * np.reshape(predicted, (3, -1)).T).tolist(),
-                "versions": f"figaroh {version('figaroh')}, Pinocchio {pin.__version__}, NumPy {version('numpy')}",
-            }
-        )
-    )
+    return {"seconds": seconds, "predicted_mm": (1e3 * np.reshape(predicted, (3, -1)).T).tolist()}
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    answer(run, {"figaroh": version("figaroh"), "Pinocchio": pin.__version__, "NumPy": version("numpy")})

@@ -4,8 +4,9 @@ The package has one way: iterated least squares on screw axes, m and rad; ``docu
 positions. A second limit of iterations or another step changes nothing, so there are no best settings apart.
 """
 
+from common import answer  # first: it starts the clock
+
 import contextlib
-import json
 import sys
 import time
 from importlib.metadata import version
@@ -16,8 +17,8 @@ import roboticstoolbox as rtb
 from robotkinecal import SerialRobotKineCal
 
 
-def main(folder: Path, method: str) -> None:
-    """Print what the method finds as JSON."""
+def run(folder: Path, method: str) -> dict:
+    """Return what the method finds."""
     calib, valid = (np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in ("calib", "valid"))
     with contextlib.redirect_stdout(sys.stderr):
         robot = rtb.ERobot.URDF(str((folder / "robot.urdf").resolve()))
@@ -28,10 +29,9 @@ def main(folder: Path, method: str) -> None:
         seconds = time.perf_counter() - start
         last = calibration.N_JOINTS + 1
         predicted = [1e3 * calibration.forward_kinematics(last, row).t for row in valid[:, 3:]]
-    packages = {"robotkinecal": "robotkinecal", "roboticstoolbox-python": "roboticstoolbox", "numpy": "NumPy"}
-    versions = ", ".join(f"{label} {version(package)}" for package, label in packages.items())
-    print(json.dumps({"seconds": seconds, "predicted_mm": np.array(predicted).tolist(), "versions": versions}))
+    return {"seconds": seconds, "predicted_mm": np.array(predicted).tolist()}
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    packages = {"robotkinecal": "robotkinecal", "roboticstoolbox": "roboticstoolbox-python", "NumPy": "numpy"}
+    answer(run, {label: version(package) for label, package in packages.items()})

@@ -1,22 +1,27 @@
-"""Calibrate one benchmark problem with SciPy alone: Levenberg-Marquardt on a vectorised forward model, mm and rad."""
+"""Calibrate one benchmark problem with SciPy alone: least squares on a vectorised forward model, mm and rad."""
+
+from common import answer  # first: it starts the clock
 
 import json
-import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-SETTINGS = {"lm": {"method": "lm"}, "soft_l1": {"loss": "soft_l1", "f_scale": 0.05}}
 
-
-def positions(x: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the tool's positions (N, 3) for parameters alpha, a, theta, d of every joint and the tool's x, y, z."""
-    alpha, a, theta, d = x[:-3].reshape(-1, 4).T
-    R, p = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
-    for i in range(len(alpha)):
+def positions(x: np.ndarray, q: np.ndarray, parallel: list) -> np.ndarray:
+    """Return the tool's positions (N, 3) for alpha, a, theta, d of every joint, base, tool, Hayati's angles."""
+    dof = q.shape[1]
+    alpha, a, theta, d = x[: 4 * dof].reshape(-1, 4).T
+    base, tool = x[4 * dof : 4 * dof + 6], x[4 * dof + 6 : 4 * dof + 9]
+    beta = np.zeros(dof)
+    beta[parallel] = x[4 * dof + 9 :]
+    R = np.broadcast_to(Rotation.from_euler("xyz", base[3:]).as_matrix(), (len(q), 3, 3))
+    p = np.broadcast_to(base[:3], (len(q), 3))
+    for i in range(dof):
         ca, sa = np.cos(alpha[i]), np.sin(alpha[i])
         c, s = np.cos(q[:, i] + theta[i]), np.sin(q[:, i] + theta[i])
         link = np.empty((len(q), 3, 3))
@@ -24,33 +29,31 @@ def positions(x: np.ndarray, q: np.ndarray) -> np.ndarray:
         link[:, 1, 0], link[:, 1, 1], link[:, 1, 2] = s * ca, c * ca, -sa
         link[:, 2, 0], link[:, 2, 1], link[:, 2, 2] = s * sa, c * sa, ca
         p = p + R @ np.array([a[i], -sa * d[i], ca * d[i]])
-        R = R @ link
-    return p + R @ x[-3:]
+        R = R @ link @ Rotation.from_euler("y", beta[i]).as_matrix()
+    return p + R @ tool
 
 
-def main(folder: Path, method: str) -> None:
-    """Print what the method finds as JSON."""
+def run(folder: Path, method: str) -> dict:
+    """Return what the method finds."""
     table = json.loads((folder / "robot.json").read_text())
     calib, valid = (np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in ("calib", "valid"))
-    x0 = np.append(np.array(table["alpha_a_theta_d"]) * [1, 1e3, 1, 1e3], 1e3 * np.array(table["tool"]))
+    base = np.array(table["base"]) * [1e3, 1e3, 1e3, 1, 1, 1]
+    rows = np.array(table["alpha_a_theta_d"]) * [1, 1e3, 1, 1e3]
+    parallel = [int(name[4:]) - 1 for name in table["parallel"]]
+    x0 = np.concatenate([rows.ravel(), base, 1e3 * np.array(table["tool"]), np.zeros(len(parallel))])
     q, p = calib[:, 3:], 1e3 * calib[:, :3]
+    settings = {}
+    if method == "soft_l1":
+        settings = {"loss": "soft_l1", "f_scale": 1e3 * table["noise"]}
+    elif p.size >= len(x0):
+        settings = {"method": "lm"}  # it refuses fewer equations than parameters; SciPy's default does not
     start = time.perf_counter()
-    found = least_squares(lambda x: (positions(x, q) - p).ravel(), x0, **SETTINGS[method])
-    seconds = time.perf_counter() - start
-    change = np.abs(found.x - x0)
-    angles = np.append(np.tile([True, False, True, False], (len(x0) - 3) // 4), [False] * 3)
-    print(
-        json.dumps(
-            {
-                "seconds": seconds,
-                "largest_mm": change[~angles].max(),
-                "largest_mrad": 1e3 * change[angles].max(),
-                "predicted_mm": positions(found.x, valid[:, 3:]).tolist(),
-                "versions": f"SciPy {version('scipy')}, NumPy {version('numpy')}",
-            }
-        )
-    )
+    found = least_squares(lambda x: (positions(x, q, parallel) - p).ravel(), x0, **settings)
+    return {
+        "seconds": time.perf_counter() - start,
+        "predicted_mm": positions(found.x, valid[:, 3:], parallel).tolist(),
+    }
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    answer(run, {"SciPy": version("scipy"), "NumPy": version("numpy")})

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
 from rpim_opt.study import grid, provenance, report
 from rpim_opt.study.runner import run_study
-from tests import SHARED
 from tests.test_cli import run
 
 TOY = """
@@ -147,19 +147,39 @@ def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
     assert "no 'METRICS'" in capsys.readouterr().err
 
 
-BENCH = SHARED / "bench"
-
-
-@pytest.mark.skipif(not BENCH.is_dir(), reason="the peers' benchmark ../shared/bench is not here")
-@pytest.mark.parametrize("situation", ["clean52", "few10", "blunders52"])
-def test_peers_study_draws_the_shared_benchmark(situation: str, tmp_path: Path):
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
+def test_peers_study_gives_every_tool_the_same_arm(seed: int, tmp_path: Path):
     peers = grid.load_study(grid.find_study("peers"))
-    peers.write_problem(tmp_path, situation, 0)
-    for name in ("calib", "valid"):
-        ours, theirs = (folder / f"{name}.csv" for folder in (tmp_path, BENCH / situation))
-        assert ours.read_text().splitlines()[0] == theirs.read_text().splitlines()[0]
-        rows = [np.loadtxt(path, delimiter=",", skiprows=1) for path in (ours, theirs)]
-        np.testing.assert_allclose(*rows, rtol=0, atol=1.5e-9)  # nine decimals, the last one rounded
+    peers.write_problem(tmp_path, "clean10", seed)
+    known = json.loads((tmp_path / "robot.json").read_text())
+    rows = np.array(known["alpha_a_theta_d"])
+    robot = ro.robot.Robot("rows", np.column_stack([rows, np.zeros(len(rows))]))
+    calib = np.loadtxt(tmp_path / "calib.csv", delimiter=",", skiprows=1)
+    data = ro.Dataset.of(calib[:, 3:], calib[:, :3], known["noise"])
+
+    def seen(arm: ro.robot.Robot, base: list[float], tool: list[float]) -> Array:
+        parameters = ro.robot.model_parameters(arm, base=base, tools={"": tool}).identify(["base_x"])
+        return ro.CalibrationProblem(arm, parameters, data).modelled(np.zeros(1))[0]
+
+    of_rows = seen(robot, known["base"], [*known["tool"], 0.0, 0.0, 0.0])
+    described = ro.read_urdf(tmp_path / "robot.urdf", "instrument", "smr")
+    of_urdf = seen(described.robot, list(described.base), list(described.tool))
+    np.testing.assert_allclose(of_urdf, of_rows, rtol=0, atol=1e-11)
+    assert np.linalg.norm(calib[:, :3] - of_rows, axis=1).max() < 0.1  # a degree of one joint, and millimetres
+
+
+def test_peers_study_adds_errors_to_so_many_rows_as_it_says(tmp_path: Path):
+    peers = grid.load_study(grid.find_study("peers"))
+    points = {}
+    for situation in ("clean52", "blunders52"):
+        folder = tmp_path / situation
+        folder.mkdir()
+        peers.write_problem(folder, situation, 3)
+        points[situation] = np.loadtxt(folder / "calib.csv", delimiter=",", skiprows=1)
+    off = np.linalg.norm((points["blunders52"] - points["clean52"])[:, :3], axis=1)
+    assert np.sum(off > 0) == 3
+    np.testing.assert_allclose(off[off > 0], 3e-3, atol=2e-9)  # nine decimals
+    np.testing.assert_array_equal(points["blunders52"][:, 3:], points["clean52"][:, 3:])
 
 
 def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
