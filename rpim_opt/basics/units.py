@@ -36,6 +36,17 @@ UNITS = {
     "ppm": Unit("ratio", 1e-6),
     "rad_per_Nm": Unit("compliance", 1.0),
     "mrad_per_Nm": Unit("compliance", 1e-3),
+    "K": Unit("temperature", 1.0),
+    "ppm_per_K": Unit("ratio per temperature", 1e-6),
+    "m_per_K": Unit("length per temperature", 1.0),
+    "mm_per_K": Unit("length per temperature", 1e-3),
+    "um_per_K": Unit("length per temperature", 1e-6),
+    "rad_per_K": Unit("angle per temperature", 1.0),
+    "mrad_per_K": Unit("angle per temperature", 1e-3),
+    "urad_per_K": Unit("angle per temperature", 1e-6),
+    "m_per_N": Unit("length per force", 1.0),
+    "mm_per_N": Unit("length per force", 1e-3),
+    "um_per_N": Unit("length per force", 1e-6),
 }
 
 LARGEST = 1e7
@@ -51,6 +62,11 @@ DISPLAY = {
     "mass": "kg",
     "ratio": "ppm",
     "compliance": "mrad_per_Nm",
+    "temperature": "K",
+    "ratio per temperature": "ppm_per_K",
+    "length per temperature": "um_per_K",
+    "angle per temperature": "urad_per_K",
+    "length per force": "um_per_N",
 }
 """The unit in which a dimension is shown and written."""
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -158,7 +159,12 @@ class Outcome:
         return replace(self.problem.robot, mdh=mdh)
 
     def forward(
-        self, q: Array, marker: str = "", torque: Array | None = None, payload: float | Array | None = None
+        self,
+        q: Array,
+        marker: str = "",
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        columns: Mapping[str, Array] = MappingProxyType({}),
     ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
@@ -175,11 +181,13 @@ class Outcome:
             (N, dof) joint torques [Nm], where the compliance of joints was identified from measured ones.
         payload
             Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
+        columns
+            What terms of your own see, by name, (N,) each [SI].
 
         Raises
         ------
         InputError
-            For torques that are missing, or given where compliances multiply the torques of gravity.
+            For torques and columns that are missing, torques given where compliances multiply the torques of gravity.
 
         Examples
         --------
@@ -188,7 +196,7 @@ class Outcome:
         >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
         array([ 0.822, -0.026,  0.197])
         """
-        return self._at(q, transform, marker, torque, payload).modelled(self.x)[0].reshape(-1, 4, 4)
+        return self._at(q, transform, marker, torque, payload, columns).modelled(self.x)[0].reshape(-1, 4, 4)
 
     def predict(
         self,
@@ -197,6 +205,7 @@ class Outcome:
         torque: Array | None = None,
         payload: float | Array | None = None,
         of: Interval = "reached",
+        columns: Mapping[str, Array] = MappingProxyType({}),
     ) -> Prediction:
         """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
 
@@ -205,7 +214,7 @@ class Outcome:
 
         Parameters
         ----------
-        q, marker, torque
+        q, marker, torque, payload, columns
             As for `forward`.
         of
             ``"mean"``: of what the model says, J C J'. ``"reached"``: of the position that the robot will reach, with
@@ -229,7 +238,7 @@ class Outcome:
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
-        problem = self._at(q, position, marker, torque, payload)
+        problem = self._at(q, position, marker, torque, payload, columns)
         noise = position_noise(self.problem)[None]
         problem = problem.on(replace(problem.data, blocks=(replace(problem.data.blocks[0], covariance=noise),)))
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
@@ -263,11 +272,12 @@ class Outcome:
         marker: str,
         torque: Array | None,
         payload: float | Array | None = None,
+        columns: Mapping[str, Array] = MappingProxyType({}),
     ) -> CalibrationProblem:
         """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
         q = np.atleast_2d(np.asarray(q, dtype=float))
         data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
-        data = bearing(data, self.problem.data, torque, payload)
+        data = bearing(data, self.problem.data, torque, payload, columns)
         return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,)),)))
 
     # --- errors ------------------------------------------------------------------------------------------------
@@ -317,7 +327,8 @@ class Outcome:
             torque = None
             if block.torque is not None:
                 torque = block.torque[:, 0]
-            points[block.row] = self.forward(block.q[:, 0], block.markers[0], torque, block.payload)[:, :3, 3]
+            found = self.forward(block.q[:, 0], block.markers[0], torque, block.payload, block.columns)
+            points[block.row] = found[:, :3, 3]
             if {"x", "y", "z"} <= set(names):
                 points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
         return points

@@ -14,7 +14,6 @@ from scipy.linalg import solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
-from rpim_opt.robot.parameter_names import group_of
 from rpim_opt.robot.parameters import Parameters
 
 OTHERS = "others"
@@ -259,8 +258,9 @@ def _places(key: Any, free: Parameters) -> list[int]:
     if not isinstance(key, str) or not key.split():
         raise InputError("weight", f"key {key!r}", "patterns of parameters, 'a? d?'")
     places: list[int] = []
+    groups = free.groups
     for token in key.split():
-        met = [i for i, name in enumerate(free.names) if _meant(token, name, free.dimensions[i])]
+        met = [i for i, name in enumerate(free.names) if _meant(token, name, groups[i])]
         if not met:
             known = [*dict.fromkeys(map(_kind, free.names)), *free.names]
             raise InputError("weight", f"'{token}'", "kinds, names or patterns: " + choices(token, known))
@@ -268,5 +268,5 @@ def _places(key: Any, free: Parameters) -> list[int]:
     return places
 
 
-def _meant(token: str, name: str, dimension: str) -> bool:
-    return fnmatchcase(name, token) or token in (_kind(name), _link(name), group_of(name, dimension))
+def _meant(token: str, name: str, group: str) -> bool:
+    return fnmatchcase(name, token) or token in (_kind(name), _link(name), group)

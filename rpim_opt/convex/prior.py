@@ -283,7 +283,7 @@ class Prior:
         """
         free = parameters.free
         identified = parameters.identified
-        table = Overlay(parameters.names, parameters.dimensions)
+        table = Overlay(parameters.names, parameters.dimensions, parameters.groups)
         centre = table.on(np.zeros(len(parameters)), self.centre, "prior, table centre", signed=True)
         widths = parameters.scale
         if widened:

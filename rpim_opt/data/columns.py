@@ -33,13 +33,18 @@ def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
     torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
     sides = {f"approach{i}": "" for i in range(1, robot.dof + 1)}
-    plain = {**joints, **kind.columns, **torques, **sides, "payload": "mass"}
+    plain = {**further_columns(robot, kind), **joints, **kind.columns, **torques, **sides, "payload": "mass"}
     for form, _ in kind.forms:
         plain |= form
     if kind.points == 2:
         plain |= {f"to_{stem}": dimension for stem, dimension in {**joints, **torques, **sides}.items()}
     known = {stem: [dimension] for stem, dimension in plain.items()}
     return known | _spread_columns(kind)
+
+
+def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
+    """Return the columns that a user's own terms and measurement see, name to dimension."""
+    return {**robot.model.columns, **kind.extra}
 
 
 def _spread_columns(kind: Measurement) -> dict[str, list[str]]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -39,6 +41,8 @@ class Block:
         (N,) mass at the flange [kg], or None: that of the robot's `Gravity`.
     approach
         (N, p, dof) direction in which the controller's joints moved last, -1, 0 or +1, or None.
+    columns
+        Further columns by name, (N,) each [SI], which terms and measurements of a user's own see.
     """
 
     measurement: Measurement
@@ -51,6 +55,7 @@ class Block:
     torque: Array | None = None
     payload: Array | None = None
     approach: Array | None = None
+    columns: Mapping[str, Array] = field(default_factory=dict)
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
@@ -68,6 +73,7 @@ class Block:
             torque=rows(self.torque),
             payload=rows(self.payload),
             approach=rows(self.approach),
+            columns={name: values[index] for name, values in self.columns.items()},
         )
 
 
@@ -159,7 +165,17 @@ class Dataset:
 
     @classmethod
     def of(
-        cls, q: Array, y: Array, sigma: float | Array, label: tuple[str, ...] = (), measurement: Measurement = position
+        cls,
+        q: Array,
+        y: Array,
+        sigma: float | Array,
+        label: tuple[str, ...] = (),
+        measurement: Measurement = position,
+        *,
+        torque: Array | None = None,
+        payload: Array | None = None,
+        approach: Array | None = None,
+        columns: Mapping[str, ArrayLike] = MappingProxyType({}),
     ) -> Dataset:
         """Return a dataset from arrays.
 
@@ -175,6 +191,12 @@ class Dataset:
             N row labels; numbers from 1 by default.
         measurement
             What the instrument sees.
+        torque, approach
+            Joint torques [Nm], and directions in which the joints moved last (-1, 0 or +1), of the shape of q.
+        payload
+            (N,) mass at the flange [kg].
+        columns
+            Further columns by name, (N,) each [SI], which terms and measurements of your own see.
 
         Raises
         ------
@@ -197,7 +219,18 @@ class Dataset:
         N = len(q)
         rows = np.arange(N)
         covariance = _covariance(sigma, N, len(measurement.components))
-        block = Block(measurement, q, y, covariance, rows, ("",) * measurement.points)
+        block = Block(
+            measurement,
+            q,
+            y,
+            covariance,
+            rows,
+            ("",) * measurement.points,
+            torque=_beside(torque, "torque", q),
+            payload=_beside(payload, "payload", q[:, 0, 0]),
+            approach=_beside(approach, "approach", q),
+            columns={name: _column(values, f"column {name}", N) for name, values in columns.items()},
+        )
         return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
 
     @classmethod
@@ -244,6 +277,23 @@ def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:
     largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
     if largest > LARGEST:
         raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
+
+
+def _beside(values: Array | None, what: str, like: Array) -> Array | None:
+    """Return what a row states besides, in the shape of the joint values or with one number a row."""
+    if values is None:
+        return None
+    found = np.asarray(values, dtype=float)
+    if found.size != like.size or not np.isfinite(found).all():
+        raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {like.shape}")
+    return found.reshape(like.shape)
+
+
+def _column(values: ArrayLike, what: str, N: int) -> Array:
+    found = np.asarray(values, dtype=float)
+    if found.shape != (N,) or not np.isfinite(found).all():
+        raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {(N,)}")
+    return found
 
 
 def _covariance(sigma: float | Array, N: int, k: int) -> Array:

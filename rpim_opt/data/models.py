@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.rotations import (
     from_angles,
     from_matrices,
@@ -19,6 +20,7 @@ from rpim_opt.data.rotations import (
 )
 from rpim_opt.data.starts import anchor_start, plane_start, sphere_start
 from rpim_opt.robot.kinematics import FRAME_DIMENSION
+from rpim_opt.robot.terms import require_columns
 
 
 def _difference(y: Any, modelled: Any) -> Any:
@@ -66,6 +68,11 @@ class Measurement:
         Other columns in which a table may state the values, each with the function to y (N, c).
     prepare
         Checks and normalizes y (N, c); raises `RowError` for a row that is wrong.
+    sees
+        What the model gets besides, by keyword: ``"q"`` for the joint values of the model, (dof, 1), of two points
+        (dof, 2); ``"torque"`` for the measured joint torques in the same shape; and columns of the data by name.
+    extra
+        Those columns, name to dimension.
 
     Examples
     --------
@@ -78,6 +85,23 @@ class Measurement:
     >>> probed = arm.on(ro.Dataset.of(arm.data.q, z[:, None], sigma=1e-5, measurement=height))
     >>> bool(abs(probed.residual(0 * arm.parameters.free.nominal)).max() < 1e-12)
     True
+
+    The same probe on a column that grows with its temperature, which a column ``temperature_K`` of the data states:
+
+    >>> def grown(T, growth, temperature):
+    ...     return T[2, 3] - growth * temperature
+    >>> warm = ro.data.Measurement(
+    ...     "warm height",
+    ...     grown,
+    ...     {"z": "length"},
+    ...     parameters={"growth": "length per temperature"},
+    ...     sees=("temperature",),
+    ...     extra={"temperature": "temperature"},
+    ... )
+    >>> data = ro.Dataset.of(arm.data.q, z[:, None], 1e-5, measurement=warm, columns={"temperature": [3.0] * 9})
+    >>> parameters = ro.problem.starting_parameters(arm.robot, data).identify(["d2", "growth"])
+    >>> ro.CalibrationProblem(arm.robot, parameters, data).jacobian([0, 0])[0].round(9)  # [m/m], [m/(m/K)]
+    array([ 0., -3.])
     """
 
     name: str
@@ -93,8 +117,15 @@ class Measurement:
     start: Callable[[Array, Array], Mapping[str, float]] | None = None
     forms: tuple[tuple[Mapping[str, str], Callable[[Array], Array]], ...] = ()
     prepare: Callable[[Array], Array] = lambda y: y
+    sees: tuple[str, ...] = ()
+    extra: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_columns(self.extra, f"measurement {self.name}")
+        for name in self.sees:
+            if name not in ("q", "torque", *self.extra):
+                accepted = "'q', 'torque', or a column of its extra"
+                raise InputError(f"measurement {self.name}, sees", f"'{name}'", accepted)
         if not self.components:
             object.__setattr__(self, "components", self.columns)
         if not self.noise:

@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
-from rpim_opt.data.columns import Numbers, labels, numeric, values_form
+from rpim_opt.data.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.data.spread import covariances, declared_noise
@@ -32,6 +32,7 @@ def read_data(
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
     - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
       joint moved last, -1 or 1, 0 where it is not known);
+    - what terms (`Model`) of the robot and a measurement of your own name as their columns;
     - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``, ``to_approach1``.
 
     Parameters
@@ -83,6 +84,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         torque=_of_joints("tau", columns, robot, kind, N),
         payload=_payload(columns, label),
         approach=_approach(columns, robot, kind, label),
+        columns=_further(columns, robot, kind),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     _require_two_points(whole, markers, label)
@@ -91,6 +93,11 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         return Dataset((replace(whole, markers=("",) * kind.points),), label, configuration)
     blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
     return Dataset(blocks, label, configuration)
+
+
+def _further(columns: Numbers, robot: Robot, kind: Measurement) -> dict[str, Array]:
+    """Return the columns that a user's own terms and measurement see, as far as the table has them."""
+    return {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
 
 
 def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:

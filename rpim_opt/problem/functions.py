@@ -15,7 +15,8 @@ from rpim_opt.data.models import MEASUREMENTS, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads
 from rpim_opt.robot.kinematics import FRAME, chain, frame
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.terms import Posture
+from rpim_opt.robot.posture import Posture, Symbol
+from rpim_opt.robot.terms import Term
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian`` and ``modelled`` of one row; inputs are deviations, nominal values and the row."""
@@ -33,7 +34,8 @@ class Structure(NamedTuple):
     """What decides the functions of a block's rows besides the measurement.
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
-    ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see.
+    ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
+    user's own.
     """
 
     joint_types: tuple[str, ...]
@@ -43,6 +45,7 @@ class Structure(NamedTuple):
     markers: tuple[str, ...]
     fixture: str
     loads: Loads
+    terms: tuple[Term, ...] = ()
 
 
 class Row(NamedTuple):
@@ -72,15 +75,15 @@ class Kept:
 def asked(structure: Structure, measurement: Measurement) -> Functions:
     """Return the functions of a row.
 
-    Ready measurements are pure, and built once. A user's model may read a variable that has changed: it is asked
-    anew, and what was built before is taken only when it answers the same expression.
+    Ready measurements are pure, and built once. A user's model or term may read a variable that has changed: it is
+    asked anew, and what was built before is taken only when it answers the same expression.
 
     Raises
     ------
     InputError
         For a residual with more or fewer components than the measurement declares.
     """
-    if measurement in _READY:
+    if measurement in _READY and not structure.terms:
         return _ready(structure, measurement)
     with _lock:
         expressions = _expressions(structure, measurement)
@@ -124,6 +127,7 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     tau = ca.SX.sym("tau", dof * points if loads.torques else 0)
     payload = ca.SX.sym("payload", 1 if loads.payload else 0)
     approach = ca.SX.sym("approach", dof * points if loads.approach else 0)
+    columns = ca.SX.sym("columns", len(loads.columns))
     y = ca.SX.sym("y", len(measurement.columns))
     start = {name: ca.SX(0) if zero[i] else nominal[i] for i, name in enumerate(of.names)}
     deviation = dict.fromkeys(of.names, ca.SX(0))
@@ -138,10 +142,10 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     def posture(point: int) -> Posture:
         at = slice(point * dof, (point + 1) * dof)
         joints = ca.vertsplit(q[at])
-        return loads.posture(of.joint_types, joints, start.__getitem__, tau, payload, approach, point)
+        return loads.posture(of.joint_types, joints, start.__getitem__, tau, payload, approach, columns, point)
 
     def reflector(point: int, marker: str) -> ca.SX:
-        flange = chain(of.joint_types, posture(point), value)
+        flange = chain(of.joint_types, posture(point), value, of.terms)
         return place("base_") @ flange @ place(tool_prefix(marker))
 
     own = {name: place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
@@ -149,10 +153,28 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     for name in measurement.parameters:
         if not name.startswith(in_frames):
             own[name] = value(of_fixture(name, of.fixture))
+    own |= _seen(measurement, loads.named(columns) | _of_joints(q, tau, points))
     transforms = [reflector(point, marker) for point, marker in enumerate(of.markers)]
     modelled = ca.densify(measurement.model(*transforms, **own))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
     if residual.numel() != len(measurement.components):
         found = f"{residual.numel()} components of the residual"
         raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
-    return Row(x, nominal, ca.vertcat(q, tau, payload, approach, y), residual, modelled)
+    return Row(x, nominal, ca.vertcat(q, tau, payload, approach, columns, y), residual, modelled)
+
+
+def _of_joints(q: ca.SX, tau: ca.SX, points: int) -> dict[str, Symbol]:
+    """Return joint values and measured torques, one column a point."""
+    found = {"q": ca.reshape(q, -1, points)}
+    if tau.numel():
+        found["torque"] = ca.reshape(tau, -1, points)
+    return found
+
+
+def _seen(measurement: Measurement, known: Mapping[str, Symbol]) -> dict[str, Symbol]:
+    """Return what a measurement sees besides transforms and parameters, by keyword."""
+    for name in measurement.sees:
+        if name not in known:
+            where = f"measurement {measurement.name}"
+            raise InputError(where, f"data without '{name}', which it sees", "data that state it in every row")
+    return {name: known[name] for name in measurement.sees}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import casadi as ca
@@ -17,13 +18,14 @@ from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import of_term
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Posture, Symbol
+from rpim_opt.robot.posture import Posture, Symbol
 
 
 class Loads(NamedTuple):
     """What the rows of a block state of their joints, which decides the functions that evaluate them.
 
-    ``gravity`` is None where no parameter asks for it; ``weighs`` tells that its torques stand for measured ones.
+    ``gravity`` is None where no parameter asks for it; ``weighs`` tells that its torques stand for measured ones;
+    ``columns`` are those that a user's own terms and measurement see.
     """
 
     torques: bool = False
@@ -31,6 +33,7 @@ class Loads(NamedTuple):
     approach: bool = False
     gravity: Gravity | None = None
     weighs: bool = False
+    columns: tuple[str, ...] = ()
 
     def posture(
         self,
@@ -40,6 +43,7 @@ class Loads(NamedTuple):
         tau: ca.SX,
         payload: ca.SX,
         approach: ca.SX,
+        columns: ca.SX,
         point: int = 0,
     ) -> Posture:
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
@@ -55,7 +59,11 @@ class Loads(NamedTuple):
         directions = None
         if self.approach:
             directions = ca.vertsplit(approach[at])
-        return Posture(q, torque, directions, weight)
+        return Posture(q, torque, directions, weight, self.named(columns))
+
+    def named(self, columns: ca.SX) -> dict[str, Symbol]:
+        """Return the symbols of columns (c, 1) by name."""
+        return {name: columns[i] for i, name in enumerate(self.columns)}
 
 
 class Needs(NamedTuple):
@@ -63,15 +71,19 @@ class Needs(NamedTuple):
 
     torques: bool
     moments: bool
+    columns: frozenset[str]
 
     @classmethod
-    def of(cls, parameters: Parameters) -> Needs:
-        """Return what a table of parameters needs."""
+    def of(cls, robot: Robot, parameters: Parameters) -> Needs:
+        """Return what a robot with a table of parameters needs."""
         used = parameters.identified | (parameters.nominal != 0)
-        terms = [parameters.names[i] for i in np.flatnonzero(used) if of_term(parameters.names[i])]
+        names = {parameters.names[i] for i in np.flatnonzero(used)}
+        terms = [name for name in names if of_term(name)]
+        asked = robot.model.asks(robot.joint_types, names.__contains__)
         return cls(
-            torques=any(name.startswith("compliance") for name in terms),
-            moments=any(name.startswith("bend") for name in terms),
+            torques=asked.torques or any(name.startswith("compliance") for name in terms),
+            moments=asked.gravity or any(name.startswith("bend") for name in terms),
+            columns=asked.columns,
         )
 
 
@@ -89,12 +101,16 @@ def loads_of(robot: Robot, needs: Needs, data: Dataset, block: Block) -> Loads:
         approach=block.approach is not None,
         gravity=robot.gravity if weighs or needs.moments else None,
         weighs=weighs,
+        columns=tuple(block.columns),
     )
 
 
 def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:
     """Return what commands state that are to be compensated: torques, or a payload where those of gravity count."""
-    needs = Needs.of(parameters)
+    needs = Needs.of(robot, parameters)
+    if needs.columns:
+        accepted = "a calibration without it: nothing says what it will be where commands are to be corrected"
+        raise InputError("compensation", f"a term that sees column '{min(needs.columns)}'", accepted)
     weighs = needs.torques and not measured_torques(data)
     gravity = robot.gravity if weighs or needs.moments else None
     return Loads(torques=torques, payload=weighs, gravity=gravity, weighs=weighs)
@@ -110,24 +126,35 @@ def columns(robot: Robot, block: Block, part: slice) -> list[Array]:
         found.append(block.payload[part].reshape(N, 1))
     if block.approach is not None:
         found.append(np.sign(block.approach[part] @ robot.joint_map.T).reshape(N, -1))
-    return found
+    return [*found, *(values[part].reshape(N, 1) for values in block.columns.values())]
 
 
-def require_loads(parameters: Parameters, data: Dataset) -> None:
-    """Refuse to identify backlash from data that do not state from which side joints came."""
-    free = [parameters.names[i] for i in np.flatnonzero(parameters.identified)]
-    backlash = [name for name in free if name.startswith("backlash") and of_term(name)]
-    if backlash and all(block.approach is None for block in data.blocks):
-        found = f"'{backlash[0]}' without directions of approach"
+def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
+    """Refuse to identify from data what needs columns that they do not have."""
+    free = parameters.free.names
+    sided = [name for name in free if (name.startswith("backlash") and of_term(name)) or _sees_approach(robot, name)]
+    if sided and all(block.approach is None for block in data.blocks):
+        found = f"'{sided[0]}' without directions of approach"
         raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
+    needed = Needs.of(robot, parameters).columns
+    for block in data.blocks:
+        for name in sorted({*needed, *block.measurement.extra} - {*block.columns}):
+            accepted = f"a column '{name}' of the table, or Dataset.of(..., columns={{'{name}': ...}})"
+            raise InputError("data", f"no column '{name}', which a term or a measurement sees", accepted)
 
 
-def require_same_torques(parameters: Parameters, data: Dataset, measured: bool) -> None:
+def _sees_approach(robot: Robot, name: str) -> bool:
+    if not robot.model.terms:
+        return False
+    return robot.model.asks(robot.joint_types, lambda other: other == name).approach
+
+
+def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:
     """Refuse torques of another kind than those of a problem's data, ``measured`` or not, where compliances need them.
 
     Without measured torques a compliance multiplies those of gravity, on masses that may be a guess.
     """
-    if not Needs.of(parameters).torques or measured_torques(data) == measured:
+    if not Needs.of(robot, parameters).torques or measured_torques(data) == measured:
         return
     where = "compliances"
     if measured:
@@ -136,7 +163,13 @@ def require_same_torques(parameters: Parameters, data: Dataset, measured: bool) 
     raise InputError(where, "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
 
 
-def bearing(data: Dataset, like: Dataset, torque: Array | None = None, payload: float | Array | None = None) -> Dataset:
+def bearing(
+    data: Dataset,
+    like: Dataset,
+    torque: Array | None = None,
+    payload: float | Array | None = None,
+    columns: Mapping[str, Array] = MappingProxyType({}),
+) -> Dataset:
     """Return rows of one point in one block with what their joints bear.
 
     Directions of approach are not known, 0, where the data of a problem ``like`` these state them: the joints are in
@@ -152,6 +185,8 @@ def bearing(data: Dataset, like: Dataset, torque: Array | None = None, payload: 
         (N, dof) joint torques [Nm].
     payload
         Mass at the flange [kg], one or (N,).
+    columns
+        Further columns by name [SI], one number or (N,).
     """
     (block,) = data.blocks
     if torque is not None:
@@ -161,5 +196,6 @@ def bearing(data: Dataset, like: Dataset, torque: Array | None = None, payload: 
     approach = None
     if any(each.approach is not None for each in like.blocks):
         approach = np.zeros(block.q.shape)
-    block = replace(block, torque=torque, payload=payload, approach=approach)
+    known = {name: np.broadcast_to(np.asarray(values, dtype=float), len(data)) for name, values in columns.items()}
+    block = replace(block, torque=torque, payload=payload, approach=approach, columns=known)
     return replace(data, blocks=(block,))

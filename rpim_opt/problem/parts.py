@@ -21,6 +21,7 @@ from rpim_opt.problem.scatter import Scatter
 from rpim_opt.problem.source import Source
 from rpim_opt.problem.triangles import joined, reduced
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameters import Parameters
 
 KEPT = 200_000
@@ -125,6 +126,13 @@ class PartitionedProblem:
     def with_parameters(self, parameters: Parameters) -> PartitionedProblem:
         """Return the same problem with another table of parameters."""
         return self._with(self._first.with_parameters(parameters))
+
+    def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> PartitionedProblem:
+        """Return the same problem on an arm that moves by the terms of a model, too; as `CalibrationProblem` has it.
+
+        What reads the parts has to read the columns that the terms see: give it `robot` of the result.
+        """
+        return self._with(self._first.with_model(model, identify))
 
     @property
     def scatter(self) -> Scatter | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -28,6 +28,8 @@ from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.robot.compiled import compiled
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.model import with_terms
+from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
@@ -96,7 +98,7 @@ class CalibrationProblem:
                 if of_fixture(name, block.fixture) not in p.names:
                     where = f"measurement {block.measurement.name}"
                     raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
-        require_loads(p, self.data)
+        require_loads(self.robot, p, self.data)
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
@@ -106,7 +108,7 @@ class CalibrationProblem:
         InputError
             When data and parameters do not fit, or compliances have measured torques here and not there.
         """
-        require_same_torques(self.parameters, self.data, measured_torques(data))
+        require_same_torques(self.robot, self.parameters, self.data, measured_torques(data))
         return replace(self, data=data)
 
     def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
@@ -118,6 +120,38 @@ class CalibrationProblem:
         6
         """
         return replace(self, parameters=parameters)
+
+    def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> CalibrationProblem:
+        """Return the same problem on an arm that moves by the terms of a model, too.
+
+        Parameters
+        ----------
+        model
+            The terms, beside those that the robot has.
+        identify
+            Patterns of the terms' parameters that are identified besides what is; all of them by default.
+
+        Raises
+        ------
+        InputError
+            For a name that the problem has, a pattern that matches none of the new ones, and data without a column
+            that an identified term sees.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
+        >>> problem = ro.load("position").problem.with_model(ro.Model([wave]), identify=["bow[23]"])
+        >>> problem.parameters.free.names[-2:], problem.parameters.names[-1]
+        (('bow2', 'bow3'), 'bow6')
+        """
+        robot = replace(self.robot, model=self.robot.model.beside(model))
+        p = self.parameters
+        whole = with_terms(p, model, robot.joint_types)
+        added = np.arange(len(whole)) >= len(p)
+        if added.any():
+            added[len(p) :] = whole.take(np.flatnonzero(added)).identify(identify).identified
+        return replace(self, robot=robot, parameters=replace(whole, identified=whole.identified | added))
 
     def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
         """Return the same problem with other noise of the robot's own, or none.
@@ -528,13 +562,13 @@ class CalibrationProblem:
         absent = (p.nominal == 0) & ~p.identified
         structure = Structure(
             self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
-            block.markers, block.fixture, self._loads(block),
+            block.markers, block.fixture, self._loads(block), tuple(self.robot.model.terms),
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 
     @cached_property
     def _needs(self) -> Needs:
-        return Needs.of(self.parameters)
+        return Needs.of(self.robot, self.parameters)
 
     def _loads(self, block: Block) -> Loads:
         return loads_of(self.robot, self._needs, self.data, block)

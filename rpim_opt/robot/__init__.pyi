@@ -12,10 +12,14 @@ from .library import robots as robots
 from .mdh import Robot as Robot
 from .mdh import read_robot as read_robot
 from .model import model_parameters as model_parameters
+from .open_model import Model as Model
 from .parameters import Parameters as Parameters
 from .plain import read_mdh as read_mdh
 from .plain import write_robodk as write_robodk
 from .plain import write_robot as write_robot
+from .posture import Joint as Joint
+from .posture import Posture as Posture
+from .terms import Term as Term
 from .ur_calibration import read_ur_calibration as read_ur_calibration
 from .ur_calibration import write_ur_calibration as write_ur_calibration
 from .ur_kinematics import read_ur_kinematics as read_ur_kinematics

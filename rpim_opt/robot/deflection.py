@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.robot.gravity import STANDARD, Gravity
 from rpim_opt.robot.kinematics import call_rows, transforms
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import Posture, Symbol
+from rpim_opt.robot.posture import Posture, Symbol
 
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
@@ -65,6 +65,10 @@ class Statics:
             return 0.0
         along = self._frames[k - 1][:3, AXES.index(axis)]
         return ca.dot(self._axis(i), ca.cross(along, self.direction))
+
+    def down(self, k: int) -> Symbol:
+        """Return R_k' g_hat (3, 1)."""
+        return self._frames[k - 1][:3, :3].T @ self.direction
 
     @cached_property
     def _frames(self) -> list[ca.SX]:

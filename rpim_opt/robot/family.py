@@ -165,5 +165,5 @@ def family_scales(robot: Robot, names: Iterable[str]) -> Array:
         if largest > 1e-9:
             scales.append(EXPECTED / largest)
         else:
-            scales.append(term.scale)
+            scales.append(term.entries[0].scale)
     return np.array(scales)

@@ -13,8 +13,10 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.robot.joint_terms import displacement, motion
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import Posture, Symbol, motion
+from rpim_opt.robot.posture import Posture, Symbol
+from rpim_opt.robot.terms import Term
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -107,26 +109,40 @@ def frame_numbers(T: Array) -> Array:
     return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
-def transforms(joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol]) -> list[ca.SX]:
+def transforms(
+    joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
 
-    ``value("alpha2")`` gives the parameters; joints move by `motion`.
+    ``value("alpha2")`` gives the parameters; joints move by `motion`, and ``terms`` may displace links besides.
     """
     T = ca.SX.eye(4)
     after = []
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
-        moved = motion(kind, i, posture, value)
+        moved = motion(joint_types, i, posture, value, terms)
         T = T @ (
             link(alpha, a, theta + moved, d, beta) if kind == "revolute" else link(alpha, a, theta, d + moved, beta)
         )
+        displaced = displacement("link", joint_types, i, posture, value, terms)
+        if displaced is not None:
+            T = T @ frame((0,) * 6, ca.vertsplit(displaced))
         after.append(T)
     return after
 
 
-def chain(joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol]) -> ca.SX:
-    """Return the transform from the robot's base to its flange; arguments as for `transforms`."""
-    return transforms(joint_types, posture, value)[-1]
+def chain(
+    joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+) -> ca.SX:
+    """Return the transform from the robot's base to its flange; arguments as for `transforms`.
+
+    Where a term displaces the tool, that is part of it.
+    """
+    T = transforms(joint_types, posture, value, terms)[-1]
+    displaced = displacement("tool", joint_types, len(joint_types), posture, value, terms)
+    if displaced is None:
+        return T
+    return T @ frame((0,) * 6, ca.vertsplit(displaced))
 
 
 @lru_cache(maxsize=32)

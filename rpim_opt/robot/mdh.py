@@ -16,6 +16,7 @@ from rpim_opt.basics.files import Angle, Length, Misfit, Table, read_toml, valid
 from rpim_opt.basics.units import LARGEST, UNITS, accepted_units
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mounting import Mounting, PayloadTable, of_links, stated_gravity
+from rpim_opt.robot.open_model import Model
 
 MDH = ("alpha", "a", "theta", "d", "beta")
 """Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
@@ -52,6 +53,8 @@ class Robot:
         Where the table comes from.
     gravity
         Where gravity points in the robot's base, and the masses that it pulls at.
+    model
+        Terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone.
 
     Raises
     ------
@@ -76,6 +79,7 @@ class Robot:
     limits: Array = field(default_factory=lambda: np.empty((0, 0)))
     source: str = ""
     gravity: Gravity = field(default_factory=Gravity)
+    model: Model = field(default_factory=Model)
 
     def __post_init__(self) -> None:
         mdh = _frozen(self.mdh)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.family import bend_names
+from rpim_opt.robot.joint_terms import BEND_SCALE, JOINT_TERMS
 from rpim_opt.robot.kinematics import FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, tool_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS
 
 Entry = tuple[str, str, float, float]
 """Name, dimension, nominal value and usual size of its deviation [SI]."""
@@ -66,7 +69,7 @@ def model_parameters(
     if own is not None:
         entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
     names, dimensions, nominal, scale = zip(*entries, strict=True)
-    return Parameters(
+    parameters = Parameters(
         names,
         dimensions,
         np.array(nominal, dtype=float),
@@ -74,6 +77,34 @@ def model_parameters(
         np.full(len(names), np.inf),
         np.zeros(len(names), dtype=bool),
         own_frames,
+    )
+    return with_terms(parameters, robot.model, robot.joint_types)
+
+
+def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
+    """Return a table with the parameters of a model's terms behind its own, none of them identified yet.
+
+    Raises
+    ------
+    InputError
+        For a name that the table has.
+    """
+    entries = dict(model.entries(joint_types))
+    for name in entries:
+        if name in parameters.names:
+            raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")
+    if not entries:
+        return parameters
+    count = len(entries)
+    return replace(
+        parameters,
+        names=(*parameters.names, *entries),
+        dimensions=(*parameters.dimensions, *(entry.dimension for entry in entries.values())),
+        nominal=np.append(parameters.nominal, [entry.nominal for entry in entries.values()]),
+        scale=np.append(parameters.scale, [entry.scale for entry in entries.values()]),
+        tolerance=np.append(parameters.tolerance, np.full(count, np.inf)),
+        identified=np.append(parameters.identified, np.zeros(count, dtype=bool)),
+        terms=(*parameters.terms, *entries),
     )
 
 
@@ -89,10 +120,11 @@ def _of_joints(robot: Robot) -> Iterator[Entry]:
             name = f"{column}{i}"
             dimension = MDH_DIMENSION[column]
             yield name, dimension, value, _usual(name, dimension)
-    for i, kind in enumerate(robot.joint_types, start=1):
+    for i in range(1, robot.dof + 1):
         for term in JOINT_TERMS:
-            if kind in term.joints:
-                yield term.parameter(i), term.dimension, 0.0, term.scale
+            if i in term.places(robot.joint_types):
+                for name, entry in zip(term.names(i), term.entries, strict=True):
+                    yield name, entry.dimension, entry.nominal, entry.scale
     for name in bend_names(robot):
         yield name, "angle", 0.0, BEND_SCALE
 

@@ -9,7 +9,6 @@ from fnmatch import fnmatchcase
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, split_unit
-from rpim_opt.robot.parameter_names import group_of
 
 PATTERN = re.compile(r"[*?\[]")
 JOINT_OFFSET = "joint_offset"
@@ -26,14 +25,14 @@ class Overlay:
 
     Parameters
     ----------
-    names, dimensions
+    names, dimensions, groups
         Of the parameters, one each.
     """
 
-    def __init__(self, names: Sequence[str], dimensions: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], dimensions: Sequence[str], groups: Sequence[str]) -> None:
         self.names = names
         self.dimensions = dimensions
-        self.groups = [group_of(name, dimension) for name, dimension in zip(names, dimensions, strict=True)]
+        self.groups = groups
 
     def on(self, values: Array, table: Mapping[str, float], where: str, signed: bool = False) -> Array:
         """Return values (P,) [SI] with those of a table in their places; what names fewer parameters goes before.

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable, Sequence
 
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.robot.joint_terms import JOINT_TERMS, terms_of
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.robot.terms import JOINT_TERMS, JointTerm, terms_of
+from rpim_opt.robot.terms import Term
 
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
@@ -24,7 +25,7 @@ def of_term(name: str) -> bool:
     return _TERM.fullmatch(name) is not None
 
 
-def term_of(name: str, dof: int) -> tuple[JointTerm, int]:
+def term_of(name: str, dof: int) -> tuple[Term, int]:
     """Return the term of a parameter, and the joint (from 1) whose parameter it is.
 
     Raises
@@ -34,7 +35,7 @@ def term_of(name: str, dof: int) -> tuple[JointTerm, int]:
     """
     for i in range(1, dof + 1):
         for term in terms_of(dof):
-            if term.parameter(i) == name:
+            if name in term.names(i):
                 return term, i
     raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
 

@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import roll_pitch_yaw, rotation_rpy
 from rpim_opt.robot.overlay import Overlay
-from rpim_opt.robot.parameter_names import known_patterns, of_joint
+from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,8 @@ class Parameters:
         (P,) which parameters a calibration may change.
     own_frames
         Prefixes of the frames of measurements, ``plane_``: their rotations are angles as those of base and tool are.
+    terms
+        Names of the parameters of a user's own terms (`Model`), which are the robot's as those of the table are.
 
     Examples
     --------
@@ -60,6 +62,7 @@ class Parameters:
     tolerance: Array
     identified: np.ndarray
     own_frames: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -74,6 +77,7 @@ class Parameters:
             self.tolerance[index],
             self.identified[index],
             self.own_frames,
+            self.terms,
         )
 
     @cached_property
@@ -84,7 +88,20 @@ class Parameters:
     @property
     def of_frames(self) -> np.ndarray:
         """(P,) which parameters place something (base, reflectors, anchors, ...) and are not the robot's own."""
-        return np.array([not of_joint(name) for name in self.names])
+        return np.array([not of_joint(name) and name not in self.terms for name in self.names])
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The P groups whose scales they have: ``base``, ``tool``, or their dimension.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("position").problem.parameters.identify(["d2", "ecc_sin2", "tool_x"]).free.groups
+        ('length', 'angle', 'tool')
+        """
+        return tuple(
+            dimension if name in self.terms else group_of(name, dimension)
+            for name, dimension in zip(self.names, self.dimensions, strict=True)
+        )
 
     @property
     def periodic(self) -> np.ndarray:
@@ -216,6 +233,6 @@ class Parameters:
 
     def _overlaid(self, values: Array, table: Mapping[str, float], where: str, file: object) -> Array:
         try:
-            return Overlay(self.names, self.dimensions).on(values, table, f"table {where}")
+            return Overlay(self.names, self.dimensions, self.groups).on(values, table, f"table {where}")
         except InputError as error:
             raise error.within(file) from None

@@ -1,185 +1,188 @@
-"""What a joint does besides its drawing: terms, each a parameter times something that the joint sees."""
+"""What moves an arm besides its joint values: terms, functions of what they see and of parameters with names."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache, partial
-from typing import Any, Protocol
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, NamedTuple
 
 import casadi as ca
 
-Symbol = Any  # ca.SX or a number: CasADi ships no types
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import DISPLAY, SMALLEST, UNITS, number, split_unit
+from rpim_opt.robot.posture import Joint, Symbol
+
+Place = Literal["joint", "link", "tool"]
+_STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
+_FRAME = re.compile(r"\w*_r[xyz]")
+SIZES: dict[Place, int] = {"joint": 1, "link": 6, "tool": 6}
+"""How many numbers a term returns."""
 
 
-class Weight(Protocol):
-    """What gravity does to an arm of nominal geometry, made when a term asks for it."""
+class Entry(NamedTuple):
+    """A parameter of a term: its name without a joint's number, its dimension, its expected size and nominal [SI]."""
 
-    def torque(self, i: int) -> Symbol:
-        """Return the torque of gravity about joint i [Nm]."""
-        ...
-
-    def moment(self, i: int, k: int, axis: str) -> Symbol:
-        """Return what a unit of first moment of link k along its x, y or z means to joint i, without unit."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Posture:
-    """What happens to an arm in one configuration, as the joints of the model see it.
-
-    Parameters
-    ----------
-    q
-        Joint values [rad or m].
-    torque
-        Measured joint torques [Nm]; None where those of gravity stand for them.
-    approach
-        Directions of the joints' last movement, -1, 0 or +1; None where they are not known.
-    weight
-        What gravity does; None where nothing asks.
-    """
-
-    q: Sequence[Symbol]
-    torque: Sequence[Symbol] | None = None
-    approach: Sequence[Symbol] | None = None
-    weight: Weight | None = None
+    stem: str
+    dimension: str
+    scale: float
+    nominal: float
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
-    """What a term sees of joint ``number`` (from 1)."""
-
-    number: int
-    posture: Posture
-
-    @property
-    def q(self) -> Symbol:
-        """Joint value of the model [rad or m]."""
-        return self.posture.q[self.number - 1]
-
-    @property
-    def every_q(self) -> Sequence[Symbol]:
-        """Joint values of all joints [rad or m]."""
-        return self.posture.q
-
-    @property
-    def torque(self) -> Symbol:
-        """Measured torque [Nm] where the data have torques, that of gravity elsewhere."""
-        if self.posture.torque is None:
-            return self.gravity
-        return self.posture.torque[self.number - 1]
-
-    @property
-    def gravity(self) -> Symbol:
-        """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint."""
-        if self.posture.weight is None:
-            return 0.0
-        return self.posture.weight.torque(self.number)
-
-    @property
-    def approach(self) -> Symbol:
-        """Direction of the joint's last movement, -1, 0 or +1; 0 where it is not known."""
-        if self.posture.approach is None:
-            return 0.0
-        return self.posture.approach[self.number - 1]
-
-    def moment(self, k: int, axis: str) -> Symbol:
-        """Return z_i . (R_k e_a x g_hat): what link k's first moment along its ``axis`` a means to this joint i."""
-        if self.posture.weight is None:
-            return 0.0
-        return self.posture.weight.moment(self.number, k, axis)
-
-
-@dataclass(frozen=True)
-class JointTerm:
-    """A way in which joints move besides their value: by parameter times effect [rad or m].
+class Term:
+    """A way in which an arm moves besides its joint values.
 
     Parameters
     ----------
-    name
-        The parameter of joint 3 is called ``{name}3{suffix}``.
-    dimension
-        Of the parameter: ``angle``, ``ratio``, ``compliance``.
-    scale
-        Its expected size [SI].
-    effect
-        What multiplies it, from what the joint sees, in CasADi.
-    suffix
-        What follows the joint's number in the parameter's name.
+    moves
+        ``moves(joint, *parameters)`` in CasADi, from what it sees (`Joint`) and the parameters in the order of
+        ``scales``. Of a joint: by how much it moves further [rad or m]. Of a link, or of the tool: six numbers x, y, z
+        [m], rx, ry, rz [rad], by which the frame behind the link, or the flange's, is displaced along and about its own
+        axes. Small terms of a link add up.
+    scales
+        The parameters by name, with their unit and expected size: ``{"play_mrad": 0.1}``. Every joint or link has its
+        own, ``play2``; ``{}`` in a name stands for the number.
+    at
+        ``"joint"``, ``"link"`` or ``"tool"``.
     joints
-        Types of the joints that have it.
+        Numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints or links that have it; by default the
+        revolute joints, and all links.
+    columns
+        Further columns of the data that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a
+        column ``temperature_K``, ``{"hours": ""}`` for one without unit.
+    nominal
+        Values of the parameters on the drawing, keys as in ``scales``; zero by default.
+
+    A term whose parameters are all zero must not move anything; it is not asked then.
+
+    Raises
+    ------
+    InputError
+        For names, units, scales, places and dimensions that cannot be.
 
     Examples
     --------
     >>> import casadi as ca
-    >>> from rpim_opt.robot.terms import Joint, JointTerm, Posture
-    >>> third = JointTerm("ecc3_cos", "angle", 1e-4, lambda joint: ca.cos(3 * joint.q))
-    >>> third.parameter(2), float(third.effect(Joint(2, Posture([0.0, ca.pi / 3]))))
-    ('ecc3_cos2', -1.0)
+    >>> import rpim_opt as ro
+    >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1})
+    >>> third.names(2), third.entries[0].dimension, third.entries[0].scale  # [rad]
+    (('third2',), 'angle', 0.0001)
+    >>> float(third.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, ca.pi / 3])), 2e-4))
+    -0.0002
+    >>> warm = ro.robot.Term(
+    ...     lambda link, rate: [0, 0, rate * link.column("temperature"), 0, 0, 0],
+    ...     {"warm_um_per_K": 10},
+    ...     at="link",
+    ...     joints=(2, 3),
+    ...     columns={"temperature": "temperature"},
+    ... )
+    >>> warm.places(("revolute",) * 6), warm.names(3)
+    ((2, 3), ('warm3',))
     """
 
-    name: str
-    dimension: str
-    scale: float
-    effect: Callable[[Joint], Symbol]
-    suffix: str = ""
-    joints: tuple[str, ...] = ("revolute",)
+    moves: Callable[..., Symbol]
+    scales: Mapping[str, float]
+    at: Place = "joint"
+    joints: Sequence[str | int] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+    nominal: Mapping[str, float] = field(default_factory=dict)
 
-    def parameter(self, i: int) -> str:
-        """Return the name of joint i's parameter."""
-        return f"{self.name}{i}{self.suffix}"
+    def __post_init__(self) -> None:
+        if self.at not in SIZES:
+            raise InputError("term, at", repr(self.at), ", ".join(map(repr, SIZES)))
+        require_columns(self.columns, "term")
+        for entry in self.entries:
+            _require_name(entry, self.at)
+        if len({entry.stem for entry in self.entries}) < len(self.entries):
+            raise InputError("term, scales", "one name in two units", "one of them")
+
+    @cached_property
+    def entries(self) -> tuple[Entry, ...]:
+        """The parameters, in the order in which ``moves`` takes them."""
+        nominal = {key: _quantity(key, value, "nominal")[2] for key, value in self.nominal.items()}
+        unknown = nominal.keys() - self.scales.keys()
+        if unknown:
+            raise InputError("term, nominal", f"'{min(unknown)}'", "a key of its scales")
+        found = [(key, *_quantity(key, value, "scales")) for key, value in self.scales.items()]
+        return tuple(Entry(stem, dimension, scale, nominal.get(key, 0.0)) for key, stem, dimension, scale in found)
+
+    @property
+    def name(self) -> str:
+        """The parameters' names without the joint's number."""
+        return ", ".join(entry.stem.partition("{}")[0] for entry in self.entries) or "without parameters"
+
+    def names(self, i: int) -> tuple[str, ...]:
+        """Return the names of joint or link i's parameters; of the tool's, which has no number."""
+        if self.at == "tool":
+            return tuple(entry.stem for entry in self.entries)
+        return tuple(_numbered(entry.stem, i) for entry in self.entries)
+
+    def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
+        """Return the numbers of the joints or links that have it; the last joint for the tool."""
+        if self.at == "tool":
+            return (len(joint_types),)
+        wanted = tuple(self.joints)
+        if not wanted:
+            wanted = ("revolute",) if self.at == "joint" else ("revolute", "prismatic")
+        return tuple(i for i, kind in enumerate(joint_types, start=1) if i in wanted or kind in wanted)
+
+    def moved(self, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
+        """Return by how much it moves, (1, 1) or (6, 1); None where its parameters are all zero.
+
+        Raises
+        ------
+        InputError
+            For a function that returns something else.
+        """
+        sizes = [value(name) for name in self.names(joint.number)]
+        # an effect may take a whole chain to write down: not for a parameter that is not there
+        if sizes and all(map(is_zero, sizes)):
+            return None
+        found = self.moves(joint, *sizes)
+        if isinstance(found, list | tuple):
+            found = ca.vertcat(*found)
+        found = ca.SX(found)
+        if found.numel() != SIZES[self.at]:
+            accepted = f"{SIZES[self.at]}, as a term of a {self.at} returns"
+            raise InputError(f"term '{self.name}'", f"{found.numel()} numbers", accepted)
+        return ca.vec(found)
 
 
-JOINT_TERMS = (
-    JointTerm("ratio", "ratio", 1e-3, lambda joint: joint.q, joints=("revolute", "prismatic")),
-    JointTerm("ecc_cos", "angle", 1e-3, lambda joint: ca.cos(joint.q)),
-    JointTerm("ecc_sin", "angle", 1e-3, lambda joint: ca.sin(joint.q)),
-    JointTerm("ecc2_cos", "angle", 1e-4, lambda joint: ca.cos(2 * joint.q)),
-    JointTerm("ecc2_sin", "angle", 1e-4, lambda joint: ca.sin(2 * joint.q)),
-    JointTerm("compliance", "compliance", 1e-5, lambda joint: joint.torque),
-    JointTerm("backlash", "angle", 1e-4, lambda joint: joint.approach),
-)
-"""What every joint has; all parameters are zero in a nominal robot."""
-BEND_SCALE = 1e-4
-"""Expected deflection of a joint by one component of one link's first moment [rad]."""
+def require_columns(columns: Mapping[str, str], where: str) -> None:
+    """Refuse columns of a dimension that is not known."""
+    for name, dimension in columns.items():
+        if dimension not in ("", *DISPLAY):
+            raise InputError(f"{where}, column {name}", repr(dimension), f"'' (no unit), {', '.join(DISPLAY)}")
 
 
-def _moment(k: int, axis: str, joint: Joint) -> Symbol:
-    return joint.moment(k, axis)
+def _quantity(key: str, value: float, where: str) -> tuple[str, str, float]:
+    """Return the name, dimension and value [SI] of a number whose key carries a unit."""
+    place = f"term, {where}, key {key}"
+    stem, unit = split_unit(key)
+    if unit is None or unit.dimension not in DISPLAY:
+        units = [name for name, each in UNITS.items() if each.dimension in DISPLAY]
+        raise InputError(place, "no unit that fits", f"a name with one of {', '.join(units)}")
+    return stem, unit.dimension, number(value, place) * unit.si
 
 
-@lru_cache
-def terms_of(dof: int) -> tuple[JointTerm, ...]:
-    """Return all terms of an arm: `JOINT_TERMS`, and what the first moment of every link does, ``bend{i}_{k}{axis}``.
-
-    Joint i has those of the links k that it carries, k >= i; a robot's table leaves out what says nothing.
-    """
-    bends = [
-        JointTerm("bend", "angle", BEND_SCALE, partial(_moment, k, axis), suffix=f"_{k}{axis}")
-        for k in range(1, dof + 1)
-        for axis in "xyz"
-    ]
-    return (*JOINT_TERMS, *bends)
+def _require_name(entry: Entry, at: Place) -> None:
+    """Refuse a parameter's name that would be read as another's, and a scale that is none."""
+    where = f"term, scales, parameter '{entry.stem}'"
+    if not _STEM.fullmatch(entry.stem) or _FRAME.fullmatch(entry.stem):
+        accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx, which are frames'"
+        raise InputError(where, "a name that is another's", accepted)
+    if at == "tool" and "{}" in entry.stem:
+        raise InputError(where, "a place for a number", "none: the tool has one parameter")
+    if not entry.scale >= SMALLEST:
+        raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
 
 
-def motion(kind: str, i: int, posture: Posture, value: Callable[[str], Symbol]) -> Symbol:
-    """Return by how much joint i has moved [rad or m].
-
-    ``value("ratio2")`` gives the parameters; all terms of the joint are added::
-
-        q + ratio q + ecc_cos cos q + ecc_sin sin q + compliance torque + ...        revolute
-        q + ratio q                                                                  prismatic
-    """
-    joint = Joint(i, posture)
-    moved = joint.q
-    for term in terms_of(len(posture.q)):
-        if kind in term.joints:
-            size = value(term.parameter(i))
-            # an effect may take a whole chain to write down: not for a parameter that is not there
-            if not is_zero(size):
-                moved = moved + size * term.effect(joint)
-    return moved
+def _numbered(stem: str, i: int) -> str:
+    if "{}" in stem:
+        return stem.format(i)
+    return f"{stem}{i}"
 
 
 def is_zero(value: Symbol) -> bool:

@@ -23,6 +23,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import starting_parameters
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.named import named_formulation, named_weight
@@ -111,7 +112,12 @@ class Instance:
         return Record(self.title, self.source, self.validation, self.files, self.excluded, bool(self.simulation))
 
 
-def load(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Instance:
+def load(
+    name: str | Path,
+    variant: str | None = None,
+    measurements: Sequence[Measurement] = (),
+    model: KinematicModel | None = None,
+) -> Instance:
     """Return a problem from its folder, or from the name of one that comes with the package.
 
     Parameters
@@ -123,6 +129,8 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
         One of the file's ``[variant.NAME]`` tables, laid over the other keys.
     measurements
         Measurement models of your own that the file may name.
+    model
+        Terms of your own: the file may identify and scale their parameters, its tables have the columns that they see.
 
     Raises
     ------
@@ -136,7 +144,7 @@ def load(name: str | Path, variant: str | None = None, measurements: Sequence[Me
     >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
     (16, 9, 'Tikhonov')
     """
-    stated = read_problem(name, variant, measurements)
+    stated = read_problem(name, variant, measurements, model)
     table = stated.table
     path = stated.path
     tables = read_tables(stated)

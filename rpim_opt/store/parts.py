@@ -5,7 +5,7 @@ Numbers are written with the fewest digits that read back to the same bits; null
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.schema import BlockPart, DataPart, ParameterPart, RobotPart, SelectionPart
 
@@ -36,16 +37,45 @@ def robot_part(robot: Robot) -> dict[str, Any]:
         "joint_map": robot.joint_map.tolist(),
         "limits": [[finite(value) for value in pair] for pair in robot.limits],
         "gravity": {key: list(value) if key != "payload" else value for key, value in vars(robot.gravity).items()},
+        "terms": terms_part(robot.model, robot.joint_types),
     }
 
 
-def robot_of(part: RobotPart) -> Robot:
-    """Return the robot that a file holds."""
+def terms_part(model: Model, joint_types: Sequence[str]) -> list[dict[str, Any]]:
+    """Return what a file says of a user's own terms: all but their functions."""
+    parts = []
+    for term in model.terms:
+        names = [name for i in term.places(joint_types) for name in term.names(i)]
+        parts.append({"at": term.at, "parameters": names, "columns": dict(term.columns)})
+    return parts
+
+
+def robot_of(part: RobotPart, model: Model) -> Robot:
+    """Return the robot that a file holds, with the terms that somebody gives again.
+
+    Raises
+    ------
+    InputError
+        For terms that the file has and nobody gives, and others than it has.
+    """
+    stated = [each.model_dump() for each in part.terms]
+    given = terms_part(model, part.joint_types)
+    if stated != given:
+        wanted = "; ".join(map(_in_words, stated)) or "none"
+        accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
+        raise InputError("key robot.terms", "; ".join(map(_in_words, given)) or "no term given", accepted)
     limits = [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in part.limits]
     mdh = _array(part.mdh, "key robot.mdh", -1, 5)
     joints = len(part.mdh)
     joint_map = _array(part.joint_map, "key robot.joint_map", joints, joints)
-    return Robot(part.name, mdh, tuple(part.joint_types), joint_map, np.array(limits), part.source, _gravity_of(part))
+    types = tuple(part.joint_types)
+    return Robot(part.name, mdh, types, joint_map, np.array(limits), part.source, _gravity_of(part), model)
+
+
+def _in_words(term: Mapping[str, Any]) -> str:
+    what = ", ".join(term["parameters"]) or "without parameters"
+    seen = "".join(f", column {name} ({dimension or 'no unit'})" for name, dimension in term["columns"].items())
+    return f"a term of the {term['at']} ({what}{seen})"
 
 
 def _gravity_of(part: RobotPart) -> Gravity:
@@ -82,8 +112,8 @@ def parameters_part(parameters: Parameters) -> list[dict[str, Any]]:
     ]
 
 
-def parameters_of(parts: list[ParameterPart]) -> Parameters:
-    """Return the model parameters that a file holds."""
+def parameters_of(parts: list[ParameterPart], terms: tuple[str, ...] = ()) -> Parameters:
+    """Return the model parameters that a file holds, some of them of a user's own terms."""
     return Parameters(
         tuple(p.name for p in parts),
         tuple(p.dimension for p in parts),
@@ -91,6 +121,7 @@ def parameters_of(parts: list[ParameterPart]) -> Parameters:
         np.array([p.scale for p in parts]),
         np.array([np.inf if p.tolerance is None else p.tolerance for p in parts]),
         np.array([p.identified for p in parts]),
+        terms=terms,
     )
 
 
@@ -115,6 +146,7 @@ def _block_part(block: Block) -> dict[str, Any]:
         "torque": _optional(block.torque),
         "payload": _optional(block.payload),
         "approach": _optional(block.approach),
+        "columns": {name: values.tolist() for name, values in block.columns.items()},
     }
 
 
@@ -160,6 +192,7 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         torque=torque,
         payload=payload,
         approach=approach,
+        columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
     )
 
 

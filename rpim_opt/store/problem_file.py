@@ -23,6 +23,7 @@ from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
+from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.named import find, named_formulation, named_weight, pick
 from rpim_opt.store.prior_table import PriorTable
@@ -141,7 +142,12 @@ class Stated:
         return parameters.identify(patterns)
 
 
-def read_problem(name: str | Path, variant: str | None = None, measurements: Sequence[Measurement] = ()) -> Stated:
+def read_problem(
+    name: str | Path,
+    variant: str | None = None,
+    measurements: Sequence[Measurement] = (),
+    model: KinematicModel | None = None,
+) -> Stated:
     """Return what a problem file states; arguments and errors as for `load`."""
     folder = find(name)
     path = inside(folder, "problem.toml", "the problem", folder)
@@ -154,6 +160,8 @@ def read_problem(name: str | Path, variant: str | None = None, measurements: Seq
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
+    if model is not None:
+        arm = replace(arm, robot=replace(arm.robot, model=model))
     return Stated(
         path=path,
         table=table,

@@ -27,6 +27,7 @@ from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.open_model import Model
 from rpim_opt.store.agreement import agreement
 from rpim_opt.store.content import content, derived, digest, sets
 from rpim_opt.store.definition import formulation_of, quadratic_of
@@ -71,7 +72,7 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
     write_json(_file(path), content(result))
 
 
-def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> Calibration:
+def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Model | None = None) -> Calibration:
     """Return the calibration that a file holds.
 
     Its figures are computed anew from the data in the file, and those that the file states are compared with them.
@@ -86,6 +87,9 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
         A file of `save_result`, or a folder with ``result.json``.
     measurements
         Measurement models of your own that the file names.
+    model
+        The terms of your own that the calibration had: a file holds their names and no functions. They are checked by
+        names, columns and the errors of all rows.
 
     Raises
     ------
@@ -108,7 +112,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = ()) -> C
     file = validate(File, stored, path)
     known = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     try:
-        result = _calibration(file, known)
+        result = _calibration(file, known, model or Model())
         _compare(file, result)
         if _same_formulas(file):
             agreement(stored, derived(result), "key")
@@ -141,10 +145,11 @@ def _require_format(stored: Any, path: Path) -> None:
         raise InputError("key version", repr(written)[:40], f"{VERSION}; a newer rpim-opt may read it", path)
 
 
-def _calibration(file: File, known: Mapping[str, Measurement]) -> Calibration:
+def _calibration(file: File, known: Mapping[str, Measurement], model: Model) -> Calibration:
+    robot = robot_of(file.robot, model)
     problem = CalibrationProblem(
-        robot_of(file.robot),
-        parameters_of(file.model),
+        robot,
+        parameters_of(file.model, model.names(robot.joint_types)),
         data_of(file.data.identification, known),
         scatter=scatter_of(file.scatter),
     )
@@ -252,7 +257,9 @@ def _compare(file: File, result: Calibration) -> None:
         off = float(np.max(np.abs(np.nan_to_num(stated) - np.nan_to_num(errors)), initial=0.0))
         if off > AGREEMENT_MM:
             found = f"errors up to {off:.2g} mm off those that the file's data give"
-            raise InputError(f"key rows.{name}", found, "the file as it was written, and the same measurement models")
+            raise InputError(
+                f"key rows.{name}", found, "the file as it was written, and the same terms and measurement models"
+            )
 
 
 def _same_formulas(file: File) -> bool:

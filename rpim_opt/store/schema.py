@@ -31,6 +31,14 @@ class GravityPart(Part):
     payload_centre: Vector
 
 
+class TermPart(Part):
+    """A term of a user's own, whose function only a script has: where it acts, its parameters and columns."""
+
+    at: str
+    parameters: list[str]
+    columns: dict[str, str]
+
+
 class RobotPart(Part):
     """The nominal robot."""
 
@@ -41,6 +49,7 @@ class RobotPart(Part):
     joint_map: Matrix
     limits: list[Annotated[list[float | None], Field(min_length=2, max_length=2)]]
     gravity: GravityPart | None = None
+    terms: list[TermPart] = Field(default_factory=list)
 
 
 class ParameterPart(Part):
@@ -67,6 +76,7 @@ class BlockPart(Part):
     torque: Cube | None
     payload: Vector | None = None
     approach: Cube | None = None
+    columns: dict[str, Vector] = Field(default_factory=dict)
 
 
 class DataPart(Part):

@@ -11,9 +11,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.models import Measurement
 from rpim_opt.problem.loads import Loads
-from rpim_opt.robot.kinematics import FRAME, call_rows, frame, transforms
+from rpim_opt.robot.joint_terms import motion
+from rpim_opt.robot.kinematics import FRAME, call_rows, chain, frame, transforms
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.terms import motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +50,14 @@ class Arm:
         def value(name: str) -> float:
             return values.get(name, 0.0)
 
-        posture = loads.posture(robot.joint_types, ca.vertsplit(q), stated.__getitem__, tau, payload, ca.SX())
-        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value)]
-        T = after[-1] @ frame([value(prefix + c) for c in FRAME])
+        posture = loads.posture(robot.joint_types, ca.vertsplit(q), stated.__getitem__, tau, payload, ca.SX(), ca.SX())
+        terms = robot.model.terms
+        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
+        flange = ca.DM(before) @ chain(robot.joint_types, posture, value, terms)
+        T = flange @ frame([value(prefix + c) for c in FRAME])
         joints = list(enumerate(robot.joint_types, start=1))
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
-        moved = ca.vertcat(*(motion(moves, i, posture, value) for i, moves in joints))
+        moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))
         # gravity bends a joint by the values of all of them
         J = (ca.horzcat(*twists) @ ca.jacobian(moved, q))[: len(kind.components), :]
         modelled = kind.model(T)

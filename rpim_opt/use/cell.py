@@ -159,7 +159,7 @@ class Cell(NamedTuple):
         if tool is not None and scatter is not None:
             scatter = replace(scatter, at=known.parameters.values(known.x))
         problem = CalibrationProblem(robot, known.parameters, result.problem.data, scatter=scatter)
-        require_same_torques(problem.parameters, problem.data, torques)
+        require_same_torques(robot, problem.parameters, problem.data, torques)
         loads = loads_on(robot, problem.parameters, problem.data, torques)
         return cls(
             robot,

@@ -27,8 +27,8 @@ def identified(result: Calibration, marker: str = "") -> Described:
     Raises
     ------
     InputError
-        Naming the identified parameters that no description of a robot holds: ratios, harmonics, backlash, and what
-        gravity does (compliances, bends); for a marker that is not known.
+        Naming the identified parameters that no description of a robot holds: ratios, harmonics, backlash, what
+        gravity does (compliances, bends), terms of a user's own; for a marker that is not known.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def identified(result: Calibration, marker: str = "") -> Described:
     values = p.nominal.copy()
     values[p.identified] = p.free.values(result.x)
     of = dict(zip(p.names, values, strict=True))
-    extras = [name for name, value in of.items() if value and of_term(name)]
+    extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
     if extras:
         found = ", ".join(extras[:SHOWN])
         if len(extras) > SHOWN:

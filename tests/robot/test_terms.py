@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.robot.joint_terms import JOINT_TERMS, motion, terms_of
 from rpim_opt.robot.parameter_names import known_patterns, of_joint, of_term, term_of
-from rpim_opt.robot.terms import JOINT_TERMS, Joint, Posture, motion, terms_of
+from rpim_opt.robot.posture import Joint, Posture
 from tests.simulate import ARM
 
 Q = np.random.default_rng(0).uniform(-2, 2, (7, 6))
@@ -109,7 +110,7 @@ def test_an_effect_that_is_not_needed_is_not_written_down() -> None:
             raise AssertionError(i, k, axis)
 
     values = {"ecc_cos1": 0.1, "compliance1": 0.0, "bend1_1x": ca.SX(0)}
-    moved = motion("revolute", 1, Posture([0.5], weight=Never()), lambda name: values.get(name, 0.0))
+    moved = motion(("revolute",), 1, Posture([0.5], weight=Never()), lambda name: values.get(name, 0.0))
     assert float(moved) == pytest.approx(0.5 + 0.1 * np.cos(0.5))
 
 
@@ -123,7 +124,7 @@ def test_what_a_joint_sees_is_what_its_posture_states() -> None:
 def test_names_say_what_a_parameter_belongs_to() -> None:
     for i in (1, 6):
         for term in terms_of(6):
-            name = term.parameter(i)
+            (name,) = term.names(i)
             assert of_term(name)
             assert of_joint(name)
             assert term_of(name, 6) == (term, i)
