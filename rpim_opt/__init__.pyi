@@ -40,6 +40,7 @@ from .convex import within_tolerance as within_tolerance
 from .data import Dataset as Dataset
 from .data import read_data as read_data
 from .problem import CalibrationProblem as CalibrationProblem
+from .problem import together as together
 from .robot import Model as Model
 from .robot import read_mdh as read_mdh
 from .robot import read_robot as read_robot

@@ -34,6 +34,7 @@ from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.parameter_names import own_name
 
 
 @dataclass(frozen=True)
@@ -150,13 +151,31 @@ class Outcome:
         >>> (1e3 * (result.robot.mdh - result.problem.robot.mdh)[:, 3]).round(2)  # deviations of d [mm]
         array([0.17, 0.45, 0.45, 0.45, 3.82, 0.7 ])
         """
-        mdh = self.problem.robot.mdh.copy()
+        name = "" if "" in self.problem.arms else self.problem.robot.name  # says which, where there are several
+        return self.robots[name]
+
+    @property
+    def robots(self) -> Mapping[str, Robot]:
+        """The robots with their identified MDH parameters by name, ``""`` for the only one, as of `robot`.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
+        >>> found = ro.calibrate(both, ro.tikhonov, weight=1.0).robots
+        >>> list(found), bool(abs(found["left"].mdh - found["right"].mdh).max() < 1e-9)
+        (['left', 'right'], True)
+        """
         free = self.problem.parameters.free
-        places = {f"{c}{i + 1}": (i, j) for i in range(len(mdh)) for j, c in enumerate(MDH)}
-        for name, deviation in zip(free.names, self.x, strict=True):
-            if name in places:
-                mdh[places[name]] += deviation
-        return replace(self.problem.robot, mdh=mdh)
+        found = {}
+        for robot, nominal in self.problem.arms.items():
+            mdh = nominal.mdh.copy()
+            places = {f"{c}{i + 1}": (i, j) for i in range(len(mdh)) for j, c in enumerate(MDH)}
+            for k in free.places_of(robot):
+                place = places.get(own_name(free.names[k]))
+                if place is not None:
+                    mdh[place] += self.x[k]
+            found[robot] = replace(nominal, mdh=mdh)
+        return found
 
     def forward(
         self,

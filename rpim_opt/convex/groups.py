@@ -14,6 +14,7 @@ from scipy.linalg import solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+from rpim_opt.robot.parameter_names import own_name
 from rpim_opt.robot.parameters import Parameters
 
 OTHERS = "others"
@@ -241,12 +242,14 @@ def _written_out(free: Parameters, weights: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _kind(name: str) -> str:
+    name = own_name(name)
     if name[-1].isdigit():
         return name.rstrip("0123456789")
     return name.split("_")[0]
 
 
 def _link(name: str) -> str:
+    name = own_name(name)
     stem = name.rstrip("0123456789")
     if stem == name:
         return name.split("_")[0]

@@ -20,6 +20,7 @@ from rpim_opt.convex.stated import FIXED, FRAMES, JOINT_OFFSET, Stated, default_
 from rpim_opt.convex.statement import Statement
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.overlay import Overlay
+from rpim_opt.robot.parameter_names import own_name
 from rpim_opt.robot.parameters import Parameters
 
 _FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
@@ -339,7 +340,7 @@ class Prior:
     # --- what is believed where nothing is said ----------------------------------------------------------------
 
     def _heavy(self, free: Parameters) -> np.ndarray:
-        geometry = np.array([_GEOMETRY.fullmatch(name) is not None for name in free.names])
+        geometry = np.array([_GEOMETRY.fullmatch(own_name(name)) is not None for name in free.names])
         return geometry & bool(np.isfinite(self.tails))
 
     def _grouped(self, parameters: Parameters) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -359,7 +360,7 @@ class Prior:
         for group in self.groups:
             if any(fnmatchcase(name, pattern) for pattern in group):
                 return " ".join(group)
-        if _GEOMETRY.fullmatch(name):
+        if _GEOMETRY.fullmatch(own_name(name)):
             return "geometry"
         return family_of(name)
 
@@ -371,9 +372,9 @@ def family_of(name: str) -> str:
     >>> [family_of(name) for name in ("compliance2", "ecc_sin3", "ecc2_cos1", "ratio6")]
     ['compliance', 'ecc', 'ecc2', 'ratio']
     """
-    found = _FAMILY.match(name)
+    found = _FAMILY.match(own_name(name))
     if found is None:
-        return name
+        return own_name(name)
     return found[1]
 
 

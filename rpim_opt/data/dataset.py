@@ -43,6 +43,8 @@ class Block:
         (N, p, dof) direction in which the controller's joints moved last, -1, 0 or +1, or None.
     columns
         Further columns by name, (N,) each [SI], which terms and measurements of a user's own see.
+    robot
+        Whose rows these are; ``""`` for the only robot.
     """
 
     measurement: Measurement
@@ -56,6 +58,7 @@ class Block:
     payload: Array | None = None
     approach: Array | None = None
     columns: Mapping[str, Array] = field(default_factory=dict)
+    robot: str = ""
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
@@ -110,11 +113,64 @@ class Dataset:
 
     @property
     def q(self) -> Array:
-        """Joint values of the controller at every row's first point, (N, dof) [rad or m]."""
-        q = np.empty((len(self), self.blocks[0].q.shape[2]))
+        """Joint values of the controller at every row's first point, (N, dof) [rad or m].
+
+        Zero for joints that a row's robot does not have, where there are several robots.
+        """
+        q = np.zeros((len(self), max(block.q.shape[2] for block in self.blocks)))
         for block in self.blocks:
-            q[block.row] = block.q[:, 0]
+            q[block.row, : block.q.shape[2]] = block.q[:, 0]
         return q
+
+    @property
+    def robot(self) -> tuple[str, ...]:
+        """Whose rows they are, N names; ``""`` for the only robot."""
+        names = [""] * len(self)
+        for block in self.blocks:
+            for row in block.row:
+                names[row] = block.robot
+        return tuple(names)
+
+    def of_robot(self, robot: str) -> Dataset:
+        """Return the rows of one of several robots, as that robot's own."""
+        rows = [i for i, name in enumerate(self.robot) if name == robot]
+        found = self.take(rows)
+        return replace(found, blocks=tuple(replace(block, robot="") for block in found.blocks))
+
+    @classmethod
+    def of_robots(cls, parts: Mapping[str, Dataset]) -> Dataset:
+        """Return the measurements of several robots as one, as a problem of `together` takes them.
+
+        Parameters
+        ----------
+        parts
+            The datasets by the robots' names, one or several of them.
+
+        Raises
+        ------
+        InputError
+            For data of several robots among them.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("paper_arm").problem.data
+        >>> both = ro.Dataset.of_robots({"left": data, "right": data})
+        >>> len(both), both.label[0], both.robot[-1], len(both.of_robot("right"))
+        (18, 'left:T2-1', 'right', 9)
+        """
+        blocks: list[Block] = []
+        configuration = []
+        rows = 0
+        count = 0
+        for name, part in parts.items():
+            if any(part.robot):
+                raise InputError(f"data of '{name}'", "rows of several robots", "those of one")
+            blocks += [replace(block, row=block.row + rows, robot=name) for block in part.blocks]
+            configuration.append(part.configuration + count)
+            rows += len(part)
+            count += int(part.configuration.max()) + 1
+        return cls(tuple(blocks), _unique_labels(list(parts.values()), list(parts)), np.concatenate(configuration))
 
     def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
         """Return the rows at ``index`` (K,), in that order; a row may be taken more than once."""

@@ -16,4 +16,5 @@ from .placing import register as register
 from .placing import tool_from_distances as tool_from_distances
 from .problem import CalibrationProblem as CalibrationProblem
 from .scatter import Scatter as Scatter
+from .several import together as together
 from .source import Source as Source

@@ -112,6 +112,8 @@ def relocated(problem: Source) -> Source | None:
     scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
     it was found. None when every frame is near enough, or the data do not tell.
     """
+    if len(problem.arms) > 1:
+        return _each_relocated(problem)
     p = problem.parameters
     index = {name: i for i, name in enumerate(p.names)}
     at = {"base_": [index[f"base_{c}"] for c in FRAME]}
@@ -136,6 +138,21 @@ def relocated(problem: Source) -> Source | None:
         if (far & free).any():
             nominal[k[free]], moved = place[free], True
     return problem.with_parameters(replace(p, nominal=nominal)) if moved else None
+
+
+def _each_relocated(problem: Source) -> Source | None:
+    """Return the problem of several robots, each relocated; of a frame that they share the first one's word counts."""
+    p = problem.parameters
+    nominal = p.nominal.copy()
+    for name in problem.arms:
+        found = relocated(problem.sample().alone(name))
+        if found is not None:
+            places = p.places_of(name)
+            untouched = nominal[places] == p.nominal[places]
+            nominal[places] = np.where(untouched, found.parameters.nominal, nominal[places])
+    if (nominal == p.nominal).all():
+        return None
+    return problem.with_parameters(replace(p, nominal=nominal))
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:

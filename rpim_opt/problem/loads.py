@@ -87,14 +87,14 @@ class Needs(NamedTuple):
         )
 
 
-def measured_torques(data: Dataset) -> bool:
-    """Return whether data state torques: then those of gravity stand for none of them."""
-    return any(block.torque is not None for block in data.blocks)
+def measured_torques(data: Dataset, robot: str = "") -> bool:
+    """Return whether data of a robot state torques: then those of gravity stand for none of them."""
+    return any(block.torque is not None for block in data.blocks if block.robot == robot)
 
 
 def loads_of(robot: Robot, needs: Needs, data: Dataset, block: Block) -> Loads:
     """Return what the rows of a block of some data state, and what they need of gravity."""
-    weighs = needs.torques and not measured_torques(data)
+    weighs = needs.torques and not measured_torques(data, block.robot)
     return Loads(
         torques=block.torque is not None,
         payload=block.payload is not None,
@@ -130,7 +130,7 @@ def columns(robot: Robot, block: Block, part: slice) -> list[Array]:
 
 
 def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
-    """Refuse to identify from data what needs columns that they do not have."""
+    """Refuse to identify from data of a robot what needs columns that they do not have."""
     free = parameters.free.names
     sided = [name for name in free if (name.startswith("backlash") and of_term(name)) or _sees_approach(robot, name)]
     if sided and all(block.approach is None for block in data.blocks):

@@ -80,7 +80,7 @@ class PartitionedProblem:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: Robot | Mapping[str, Robot],
         parameters: Parameters,
         data: Dataset,
         parts: Sequence[Part] = (),
@@ -99,6 +99,11 @@ class PartitionedProblem:
         return self._first.robot
 
     @property
+    def arms(self) -> Mapping[str, Robot]:
+        """The nominal robots by name; ``""`` for the only one."""
+        return self._first.arms
+
+    @property
     def parameters(self) -> Parameters:
         """All parameters of the model, some of them identified."""
         return self._first.parameters
@@ -114,7 +119,7 @@ class PartitionedProblem:
         return False
 
     def _with(self, first: CalibrationProblem) -> PartitionedProblem:
-        copy = PartitionedProblem(first.robot, first.parameters, first.data, self.parts, self.compute)
+        copy = PartitionedProblem(first.robots, first.parameters, first.data, self.parts, self.compute)
         copy._first = first
         copy._dropped = self._dropped
         return copy
@@ -239,7 +244,7 @@ def in_parts(problem: Source) -> Source:
     if sum(len(block.row) * len(block.measurement.components) for block in problem.data.blocks) <= KEPT:
         return problem
     parts = [partial(problem.data.take, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
-    return PartitionedProblem(problem.robot, problem.parameters, problem.data, parts)._with(problem)
+    return PartitionedProblem(problem.robots, problem.parameters, problem.data, parts)._with(problem)
 
 
 def sketch(problem: CalibrationProblem) -> CalibrationProblem:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -46,8 +46,8 @@ class CalibrationProblem:
 
     Parameters
     ----------
-    robot
-        The nominal robot.
+    robots
+        The nominal robot; or several by name, as `together` has them.
     parameters
         All parameters of the model, some of them identified.
     data
@@ -77,7 +77,7 @@ class CalibrationProblem:
     [2.096, 2.649]
     """
 
-    robot: Robot
+    robots: Robot | Mapping[str, Robot]
     parameters: Parameters
     data: Dataset
     asked: Kept | None = field(default=None, repr=False)
@@ -88,17 +88,72 @@ class CalibrationProblem:
         if not p.identified.any():
             raise InputError("key identify", "no parameter", "at least one")
         for block in self.data.blocks:
-            if block.q.shape[2] != self.robot.dof:
-                raise InputError("q", f"{block.q.shape[2]} columns", f"{self.robot.dof}, one a joint")
-            for marker in block.markers:
-                if tool_prefix(marker) + "x" not in p.names:
-                    known = sorted({n.split("_")[1] for n in p.names if n.startswith("tool_") and n.count("_") == 2})
-                    raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
-            for name in block.measurement.parameters:
-                if of_fixture(name, block.fixture) not in p.names:
-                    where = f"measurement {block.measurement.name}"
-                    raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
-        require_loads(self.robot, p, self.data)
+            if block.robot not in self.arms:
+                found = f"rows of robot '{block.robot}'" if block.robot else "rows that name no robot"
+                raise InputError("data", found, f"Dataset.of_robots of {choices(block.robot, self.arms)}")
+            self._require_fit(block)
+        for name, robot in self.arms.items():
+            if name in self._present:
+                require_loads(robot, p.of_robot(name), self._rows_of(name))
+
+    def _require_fit(self, block: Block) -> None:
+        """Refuse rows whose joints, reflectors or fixtures their robot does not have."""
+        dof = self.arms[block.robot].dof
+        if block.q.shape[2] != dof:
+            raise InputError("q", f"{block.q.shape[2]} columns", f"{dof}, one a joint")
+        names = self.parameters.of_robot(block.robot).names
+        for marker in block.markers:
+            if tool_prefix(marker) + "x" not in names:
+                known = sorted({n.split("_")[1] for n in names if n.startswith("tool_") and n.count("_") == 2})
+                raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
+        for name in block.measurement.parameters:
+            if of_fixture(name, block.fixture) not in names:
+                where = f"measurement {block.measurement.name}"
+                raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
+
+    @property
+    def arms(self) -> Mapping[str, Robot]:
+        """The nominal robots by name; ``""`` for the only one.
+
+        >>> import rpim_opt as ro
+        >>> {name: robot.dof for name, robot in ro.load("paper_arm").problem.arms.items()}
+        {'': 6}
+        """
+        if isinstance(self.robots, Robot):
+            return {"": self.robots}
+        return self.robots
+
+    @property
+    def robot(self) -> Robot:
+        """The nominal robot; InputError where there are several."""
+        if isinstance(self.robots, Robot):
+            return self.robots
+        names = ", ".join(self.robots)
+        raise InputError("robot", f"{len(self.robots)} in one problem ({names})", f"one: problem.alone('{min(self.robots)}')")
+
+    def alone(self, robot: str) -> CalibrationProblem:
+        """Return the problem of one of several robots: its parameters, as itself calls them, and its rows.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
+        >>> len(both.data), len(both.alone("left").data), both.alone("left").parameters.free.names[0]
+        (80, 40, 'alpha2')
+        """
+        if robot not in self.arms:
+            raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
+        scatter = self.scatter
+        if scatter is not None and scatter.at is not None and robot:
+            scatter = replace(scatter, at=scatter.at[self.parameters.places_of(robot)])
+        data = self.data.of_robot(robot)
+        return CalibrationProblem(self.arms[robot], self.parameters.of_robot(robot), data, scatter=scatter)
+
+    @cached_property
+    def _present(self) -> frozenset[str]:
+        return frozenset(block.robot for block in self.data.blocks)
+
+    def _rows_of(self, robot: str) -> Dataset:
+        return replace(self.data, blocks=tuple(block for block in self.data.blocks if block.robot == robot))
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
@@ -108,7 +163,10 @@ class CalibrationProblem:
         InputError
             When data and parameters do not fit, or compliances have measured torques here and not there.
         """
-        require_same_torques(self.robot, self.parameters, self.data, measured_torques(data))
+        theirs = {block.robot for block in data.blocks}
+        for name in theirs & self._present:
+            p = self.parameters.of_robot(name)
+            require_same_torques(self.arms[name], p, self._rows_of(name), measured_torques(data, name))
         return replace(self, data=data)
 
     def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
@@ -151,7 +209,7 @@ class CalibrationProblem:
         added = np.arange(len(whole)) >= len(p)
         if added.any():
             added[len(p) :] = whole.take(np.flatnonzero(added)).identify(identify).identified
-        return replace(self, robot=robot, parameters=replace(whole, identified=whole.identified | added))
+        return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
 
     def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
         """Return the same problem with other noise of the robot's own, or none.
@@ -480,17 +538,29 @@ class CalibrationProblem:
         (27, 6)
         """
         p = self.parameters
-        types = self.robot.joint_types
-        number = {f"theta{i}": i - 1 for i, kind in enumerate(types, start=1) if kind == "revolute"}
+        number = self._turning
         angles = np.array([name in number for name in p.names])
         nominal = p.nominal
         if at is not None:
             nominal = at
         alone = replace(self, parameters=replace(p, nominal=nominal, identified=angles), scatter=None)
-        found = np.zeros((len(self.groups), len(types)))
+        found = np.zeros((len(self.groups), max(robot.dof for robot in self.arms.values())))
         if angles.any():
             columns = [number[name] for name in p.names if name in number]
-            found[:, columns] = alone.jacobian(np.zeros(len(columns)))
+            J = alone.jacobian(np.zeros(len(columns)))
+            # the same joint of several robots: a row has slopes by those of its own robot alone
+            np.add.at(found.T, columns, J.T)
+        return found
+
+    @cached_property
+    def _turning(self) -> dict[str, int]:
+        """The offsets of revolute joints by name, with the joints' places."""
+        found = {}
+        for name, robot in self.arms.items():
+            for i, kind in enumerate(robot.joint_types):
+                if kind == "revolute":
+                    found[f"theta{i + 1}"] = i
+                    found[f"{name}.theta{i + 1}"] = i
         return found
 
     @cached_property
@@ -560,18 +630,22 @@ class CalibrationProblem:
     def _functions(self, block: Block) -> Functions:
         p = self.parameters
         absent = (p.nominal == 0) & ~p.identified
+        robot = self.arms[block.robot]
+        names = p.names
+        if block.robot:  # those of other robots keep their long names, which nobody asks for
+            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
         structure = Structure(
-            self.robot.joint_types, p.names, p.identified.tobytes(), absent.tobytes(),
-            block.markers, block.fixture, self._loads(block), tuple(self.robot.model.terms),
+            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(),
+            block.markers, block.fixture, self._loads(block), tuple(robot.model.terms),
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 
     @cached_property
-    def _needs(self) -> Needs:
-        return Needs.of(self.robot, self.parameters)
+    def _needs(self) -> dict[str, Needs]:
+        return {name: Needs.of(robot, self.parameters.of_robot(name)) for name, robot in self.arms.items()}
 
     def _loads(self, block: Block) -> Loads:
-        return loads_of(self.robot, self._needs, self.data, block)
+        return loads_of(self.arms[block.robot], self._needs[block.robot], self.data, block)
 
     def _rows(self, block: Block, part: slice) -> Array:
         """Return joint values of the model, what the joints bear, and measured values, side by side."""
@@ -587,9 +661,10 @@ class CalibrationProblem:
         return {}
 
     def _stacked(self, block: Block, part: slice) -> Array:
-        M, y = self.robot.joint_map, block.y[part]
-        joints = (block.q[part] @ M.T).reshape(len(y), -1)
-        return np.hstack([joints, *columns(self.robot, block, part), y])
+        robot = self.arms[block.robot]
+        y = block.y[part]
+        joints = (block.q[part] @ robot.joint_map.T).reshape(len(y), -1)
+        return np.hstack([joints, *columns(robot, block, part), y])
 
 
 def _cholesky(covariance: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -33,6 +33,11 @@ class Source(Protocol):
     @property
     def robot(self) -> Robot:
         """The nominal robot."""
+        ...
+
+    @property
+    def arms(self) -> Mapping[str, Robot]:
+        """The nominal robots by name; ``""`` for the only one."""
         ...
 
     @property

@@ -9,6 +9,7 @@ from fnmatch import fnmatchcase
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, split_unit
+from rpim_opt.robot.parameter_names import own_name
 
 PATTERN = re.compile(r"[*?\[]")
 JOINT_OFFSET = "joint_offset"
@@ -17,7 +18,7 @@ _OFFSET = re.compile(r"theta\d+")
 
 def is_joint_offset(name: str) -> bool:
     """Return whether a parameter is the offset of a revolute joint: set at assembly, and not machined."""
-    return _OFFSET.fullmatch(name) is not None
+    return _OFFSET.fullmatch(own_name(name)) is not None
 
 
 class Overlay:

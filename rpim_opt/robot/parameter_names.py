@@ -15,14 +15,19 @@ _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})(\d+)|(bend)(\d+)_\d+[xyz]")
 
 
+def own_name(name: str) -> str:
+    """Return what the robot itself calls a parameter: ``a2`` for ``left.a2`` of several robots."""
+    return name.rpartition(".")[2]
+
+
 def of_joint(name: str) -> bool:
-    """Return whether a parameter is the robot's own, and not of a frame."""
-    return _TABLE.fullmatch(name) is not None or of_term(name)
+    """Return whether a parameter is a robot's own, and not of a frame."""
+    return _TABLE.fullmatch(own_name(name)) is not None or of_term(name)
 
 
 def of_term(name: str) -> bool:
     """Return whether a parameter is one of a joint's terms, and not of the table or of a frame."""
-    return _TERM.fullmatch(name) is not None
+    return _TERM.fullmatch(own_name(name)) is not None
 
 
 def term_of(name: str, dof: int) -> tuple[Term, int]:
@@ -45,7 +50,7 @@ def group_of(name: str, dimension: str) -> str:
 
     What a measurement adds of its own (an anchor, a plane) is placed like the instrument: ``base``.
     """
-    if name.startswith(("tool_", "tool.")):
+    if own_name(name).startswith("tool_"):
         return "tool"
     if of_joint(name):
         return dimension
@@ -68,7 +73,7 @@ def known_patterns(names: Sequence[str], pattern: str) -> str:
     """List the known names, runs of a joint parameter shortened: ``alpha1..6``."""
     runs: dict[str, list[int]] = {}
     others = []
-    bends = [name for name in names if of_term(name) and name.startswith("bend")]
+    bends = [name for name in names if of_term(name) and own_name(name).startswith("bend")]
     for name in names:
         match = re.fullmatch(r"(.*[a-z])(\d+)", name)
         if name in bends:

@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import roll_pitch_yaw, rotation_rpy
 from rpim_opt.robot.overlay import Overlay
-from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint
+from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, own_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +85,26 @@ class Parameters:
         """Return the identified parameters alone, in the order of a calibration's unknowns."""
         return self.take(np.flatnonzero(self.identified))
 
+    def of_robot(self, robot: str) -> Parameters:
+        """Return what one of several robots has of the table, called as the robot itself calls it.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
+        >>> both.free.names[0], both.of_robot("left").free.names[0], "tool_x" in both.of_robot("right").names
+        ('left.alpha2', 'alpha2', True)
+        """
+        if not robot:
+            return self
+        found = self.take(self.places_of(robot))
+        terms = tuple(own_name(name) for name in self.terms if name in found.names)
+        return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
+
+    def places_of(self, robot: str) -> np.ndarray:
+        """Return where the parameters of one of several robots stand, those that it shares among them."""
+        mine = [name in (own_name(name), f"{robot}.{own_name(name)}") for name in self.names]
+        return np.flatnonzero(mine)
+
     @property
     def of_frames(self) -> np.ndarray:
         """(P,) which parameters place something (base, reflectors, anchors, ...) and are not the robot's own."""
@@ -117,7 +137,7 @@ class Parameters:
         """
         frames = "|".join(map(re.escape, ("base_", *self.own_frames)))
         turning = re.compile(rf"(alpha|theta|beta)\d+|({frames}|tool_(.*_)?)r[xyz]")
-        return np.array([bool(turning.fullmatch(name)) for name in self.names])
+        return np.array([bool(turning.fullmatch(own_name(name))) for name in self.names])
 
     def wrapped(self, x: Array) -> Array:
         """Return the deviations of the same robot with every rotation in (-pi, pi]; others stay as they are.
