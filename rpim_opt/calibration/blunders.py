@@ -141,9 +141,11 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
     among = np.zeros(len(q), dtype=bool)
     among[rows] = True
     found = np.zeros(len(rows), dtype=bool)
+    whose = np.array(problem.data.robot)
     for k, i in enumerate(rows):
         apart = np.sum((unit - unit[i]) ** 2, axis=1)
         apart[problem.data.configuration == problem.data.configuration[i]] = np.inf
+        apart[whose != whose[i]] = np.inf
         j = int(np.argmin(apart))
         found[k] = among[j] and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
     return found

@@ -83,6 +83,8 @@ def likely_causes(result: Outcome) -> list[str]:
 def _causes(problem: CalibrationProblem, x: Array, errors: Array) -> list[str]:
     """Return what explains a bad fit: something of all rows, else of some."""
     found = list(rows_without_values(problem))
+    if len(problem.arms) > 1:  # a table is read anew with the drawing of one robot
+        return found
     better = better_reading(problem)
     if better is not None:
         return [*found, better.sentence]

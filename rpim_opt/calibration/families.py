@@ -8,6 +8,7 @@ import numpy as np
 
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.family import families, family_scales
+from rpim_opt.robot.parameter_names import own_name
 
 TURNED = 2.0
 """Harmonics are looked for in joints that turned further [rad]: over less they are curve fitting."""
@@ -27,18 +28,27 @@ CANDIDATES = (
 
 def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
     """Return the parameters of every family that these data may tell and that are not identified yet."""
+    found: dict[str, tuple[str, ...]] = {}
+    for robot in problem.arms:
+        for family, names in _of_robot(problem, robot).items():
+            found[family] = tuple(dict.fromkeys((*found.get(family, ()), *names)))
+    return found
+
+
+def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
+    """Return the same of one of several robots."""
     p = problem.parameters
-    q = problem.data.q @ problem.robot.joint_map.T
+    q = problem.alone(robot).joint_values
     turned = {str(i) for i, travel in enumerate(np.ptp(q, axis=0), start=1) if travel > TURNED}
     known = set(p.free.names)
     found = {}
-    for family, names in families(problem.robot).items():
-        left = [name for name in names if name not in known]
+    for family, names in families(problem.arms[robot]).items():
+        left = names
         if family in TURNING:
-            left = [name for name in left if name.rpartition("_")[2].lstrip("cosin") in turned]
-        if left:
-            found[family] = tuple(left)
-    return found
+            left = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
+        called = [p.called(robot, name) for name in left]
+        found[family] = [name for name in called if name not in known]
+    return {family: names for family, names in found.items() if names}
 
 
 def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> CalibrationProblem:
@@ -48,5 +58,7 @@ def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> Calibrat
     identified = p.identified.copy()
     scale = p.scale.copy()
     identified[index] = True
-    scale[index] = family_scales(problem.robot, list(names))
+    for name, robot in problem.arms.items():
+        mine = [i for i in p.places_of(name) if i in index]
+        scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
     return problem.with_parameters(replace(p, identified=identified, scale=scale))

@@ -107,6 +107,8 @@ def upward(compared: Comparison) -> tuple[int, ...]:
         return ()
     if measured_torques(compared.problem.data):
         return ()  # signs of measured torques are the table's
+    if len(compared.problem.arms) > 1:
+        return ()  # numbers of joints would not say whose
     z = model.point.z
     sd = np.sqrt(np.diag(model.point.C))
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
@@ -117,14 +119,15 @@ def upward(compared: Comparison) -> tuple[int, ...]:
 
 def narrow(problem: CalibrationProblem) -> tuple[int, ...]:
     """Return the revolute joints that turned by less than harmonics need."""
-    travel = np.ptp(problem.data.q @ problem.robot.joint_map.T, axis=0)
+    if len(problem.arms) > 1:
+        return ()
+    travel = np.ptp(problem.joint_values, axis=0)
     kinds = problem.robot.joint_types
     return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED)
 
 
 def errors_alike(compared: Comparison, model: Judged) -> Alike | None:
     """Return whether similar configurations err alike, errors in units of their noise."""
-    data = compared.problem.data
     row = compared.row
     scatter = model.evidence.scatter(model.point.logs)
     stacks = model.evidence.data.stacks
@@ -138,7 +141,7 @@ def errors_alike(compared: Comparison, model: Judged) -> Alike | None:
         errors.append(np.pad(e, ((0, 0), (0, widest - e.shape[1]))))
         kinds.append(np.full(len(e), kind))
         first.append(row[stack.index[:, 0]])
-    q = data.q @ compared.problem.robot.joint_map.T
+    q = compared.problem.joint_values
     return alike(q[np.concatenate(first)], np.concatenate(errors), np.concatenate(kinds))
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.calibration import diagnosis
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
@@ -184,6 +184,7 @@ class Outcome:
         torque: Array | None = None,
         payload: float | Array | None = None,
         columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
     ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
@@ -202,6 +203,8 @@ class Outcome:
             Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
         columns
             What terms of your own see, by name, (N,) each [SI].
+        robot
+            Which of several robots.
 
         Raises
         ------
@@ -215,7 +218,7 @@ class Outcome:
         >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
         array([ 0.822, -0.026,  0.197])
         """
-        return self._at(q, transform, marker, torque, payload, columns).modelled(self.x)[0].reshape(-1, 4, 4)
+        return self._at(q, transform, marker, torque, payload, columns, robot).modelled(self.x)[0].reshape(-1, 4, 4)
 
     def predict(
         self,
@@ -225,6 +228,7 @@ class Outcome:
         payload: float | Array | None = None,
         of: Interval = "reached",
         columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
     ) -> Prediction:
         """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
 
@@ -233,7 +237,7 @@ class Outcome:
 
         Parameters
         ----------
-        q, marker, torque, payload, columns
+        q, marker, torque, payload, columns, robot
             As for `forward`.
         of
             ``"mean"``: of what the model says, J C J'. ``"reached"``: of the position that the robot will reach, with
@@ -257,7 +261,7 @@ class Outcome:
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
-        problem = self._at(q, position, marker, torque, payload, columns)
+        problem = self._at(q, position, marker, torque, payload, columns, robot)
         noise = position_noise(self.problem)[None]
         problem = problem.on(replace(problem.data, blocks=(replace(problem.data.blocks[0], covariance=noise),)))
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
@@ -281,7 +285,7 @@ class Outcome:
         return outside(self._ranges, data)
 
     @cached_property
-    def _ranges(self) -> Array:
+    def _ranges(self) -> Mapping[str, Array]:
         return measured_ranges(self.problem)
 
     def _at(
@@ -292,12 +296,15 @@ class Outcome:
         torque: Array | None,
         payload: float | Array | None = None,
         columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
     ) -> CalibrationProblem:
         """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
+        if robot not in self.problem.arms:
+            raise InputError("robot", f"'{robot}'", choices(robot, self.problem.arms))
         q = np.atleast_2d(np.asarray(q, dtype=float))
         data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
         data = bearing(data, self.problem.data, torque, payload, columns)
-        return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,)),)))
+        return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,), robot=robot),)))
 
     # --- errors ------------------------------------------------------------------------------------------------
 
@@ -346,7 +353,7 @@ class Outcome:
             torque = None
             if block.torque is not None:
                 torque = block.torque[:, 0]
-            found = self.forward(block.q[:, 0], block.markers[0], torque, block.payload, block.columns)
+            found = self.forward(block.q[:, 0], block.markers[0], torque, block.payload, block.columns, block.robot)
             points[block.row] = found[:, :3, 3]
             if {"x", "y", "z"} <= set(names):
                 points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]

@@ -54,23 +54,32 @@ class Outside:
         ]
 
 
-def measured_ranges(problem: Source) -> Array:
-    """Return the least and largest measured value of every joint (2, dof) [rad or m], of all points of all rows."""
-    parts = [block.q.reshape(-1, block.q.shape[2]) for part in problem.rows() for block in part.data.blocks]
-    low = np.min([q.min(axis=0) for q in parts], axis=0)
-    high = np.max([q.max(axis=0) for q in parts], axis=0)
-    return np.array([low, high])
+def measured_ranges(problem: Source) -> dict[str, Array]:
+    """Return the least and largest measured value of every joint (2, dof) [rad or m], of all points of all rows.
+
+    By robot, ``""`` for the only one.
+    """
+    parts: dict[str, list[Array]] = {}
+    for part in problem.rows():
+        for block in part.data.blocks:
+            parts.setdefault(block.robot, []).append(block.q.reshape(-1, block.q.shape[2]))
+    found = {}
+    for robot, measured in parts.items():
+        low = np.min([q.min(axis=0) for q in measured], axis=0)
+        high = np.max([q.max(axis=0) for q in measured], axis=0)
+        found[robot] = np.array([low, high])
+    return found
 
 
-def outside(ranges: Array, data: Dataset) -> Outside:
+def outside(ranges: Mapping[str, Array], data: Dataset) -> Outside:
     """Return which rows of a dataset have a point outside.
 
     Parameters
     ----------
     ranges
-        (2, dof) as of `measured_ranges`.
+        (2, dof) by robot, as of `measured_ranges`.
     data
-        Of the same robot.
+        Of the same robots.
 
     Examples
     --------
@@ -78,14 +87,14 @@ def outside(ranges: Array, data: Dataset) -> Outside:
     >>> import rpim_opt as ro
     >>> from rpim_opt.calibration.ranges import outside
     >>> data = ro.Dataset.of(np.array([[0.0, 1.0], [1.1, 1.0], [1.3, 2.5]]), np.zeros((3, 3)), sigma=1e-4)
-    >>> outside(np.array([[-1.0, 0.0], [1.0, 2.0]]), data)
+    >>> outside({"": np.array([[-1.0, 0.0], [1.0, 2.0]])}, data)
     Outside(count=3, rows=(2,), joints={1: 1, 2: 1})
     """
-    low, high = ranges
-    slack = np.maximum(SLACK * (high - low), LEAST)
-    beyond = np.zeros((len(data), len(low)), dtype=bool)
+    beyond = np.zeros((len(data), max(block.q.shape[2] for block in data.blocks)), dtype=bool)
     for block in data.blocks:
+        low, high = ranges[block.robot]
+        slack = np.maximum(SLACK * (high - low), LEAST)
         far = (block.q < low - slack) | (block.q > high + slack)
-        beyond[block.row] = far.any(axis=1)
+        beyond[block.row, : len(low)] = far.any(axis=1)
     by = {int(j) + 1: int(beyond[:, j].sum()) for j in np.flatnonzero(beyond.any(axis=0))}
     return Outside(len(data), tuple(np.flatnonzero(beyond.any(axis=1)).tolist()), by)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -122,6 +124,8 @@ class Uncertainty:
         torque: Array | None = None,
         payload: float | Array | None = None,
         of: Interval = "reached",
+        columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
     ) -> Prediction:
         """Return what `Calibration.predict` does, with the confidence's coverage factor.
 
@@ -129,7 +133,7 @@ class Uncertainty:
         ----------
         q
             (N, dof) joint values of the controller [rad or m].
-        marker, torque, payload
+        marker, torque, payload, columns, robot
             As for `Calibration.forward`; torques (N, dof) [Nm].
         of
             ``"mean"``, ``"reached"`` or ``"reading"``, as for `Calibration.predict`.
@@ -143,7 +147,8 @@ class Uncertainty:
         >>> (where.expanded / where.standard).round(2)
         array([[2.63, 2.63, 2.63]])
         """
-        return self.result.predict(q, marker, torque, payload, of)._replace(coverage_factor=self.coverage_factor)
+        found = self.result.predict(q, marker, torque, payload, of, columns, robot)
+        return found._replace(coverage_factor=self.coverage_factor)
 
     def budget(self) -> str:
         """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty).

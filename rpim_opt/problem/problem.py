@@ -129,7 +129,9 @@ class CalibrationProblem:
         if isinstance(self.robots, Robot):
             return self.robots
         names = ", ".join(self.robots)
-        raise InputError("robot", f"{len(self.robots)} in one problem ({names})", f"one: problem.alone('{min(self.robots)}')")
+        raise InputError(
+            "robot", f"{len(self.robots)} in one problem ({names})", f"one: problem.alone('{min(self.robots)}')"
+        )
 
     def alone(self, robot: str) -> CalibrationProblem:
         """Return the problem of one of several robots: its parameters, as itself calls them, and its rows.
@@ -142,11 +144,28 @@ class CalibrationProblem:
         """
         if robot not in self.arms:
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
+        if not robot:
+            return self
         scatter = self.scatter
-        if scatter is not None and scatter.at is not None and robot:
+        if scatter is not None and scatter.at is not None:
             scatter = replace(scatter, at=scatter.at[self.parameters.places_of(robot)])
         data = self.data.of_robot(robot)
         return CalibrationProblem(self.arms[robot], self.parameters.of_robot(robot), data, scatter=scatter)
+
+    @property
+    def joint_values(self) -> Array:
+        """Joint values of the model at every row's first point, (N, dof) [rad or m]; zero for joints that it lacks.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem  # its controller counts as the table does
+        >>> bool((problem.joint_values == problem.data.q).all())
+        True
+        """
+        found = np.zeros(self.data.q.shape)
+        for block in self.data.blocks:
+            M = self.arms[block.robot].joint_map
+            found[block.row, : len(M)] = block.q[:, 0] @ M.T
+        return found
 
     @cached_property
     def _present(self) -> frozenset[str]:

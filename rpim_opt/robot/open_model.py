@@ -22,6 +22,15 @@ class Asks(NamedTuple):
     approach: bool = False
     columns: frozenset[str] = frozenset()
 
+    def beside(self, other: Asks) -> Asks:
+        """Return what either asks."""
+        return Asks(
+            self.torques or other.torques,
+            self.gravity or other.gravity,
+            self.approach or other.approach,
+            self.columns | other.columns,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -98,8 +107,7 @@ class Model:
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    more = _asked(term, i, len(joint_types))
-                    found = Asks(*(a | b for a, b in zip(found, more, strict=True)))
+                    found = found.beside(_asked(term, i, len(joint_types)))
         return found
 
 

@@ -100,6 +100,12 @@ class Parameters:
         terms = tuple(own_name(name) for name in self.terms if name in found.names)
         return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
 
+    def called(self, robot: str, own: str) -> str:
+        """Return what the table calls a parameter of one of several robots: ``left.a2``, or ``a2`` if shared."""
+        if own in self.names or not robot:
+            return own
+        return f"{robot}.{own}"
+
     def places_of(self, robot: str) -> np.ndarray:
         """Return where the parameters of one of several robots stand, those that it shares among them."""
         mine = [name in (own_name(name), f"{robot}.{own_name(name)}") for name in self.names]

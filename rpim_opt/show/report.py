@@ -63,7 +63,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
 def page(result: Calibration) -> str:
     """Return the report as HTML; only its own style and script may run, and nothing can be loaded."""
     data: dict[str, Any] = {}
-    title = result.record.title or result.problem.robot.name
+    title = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     parts = [
         *summary_section(result),
         *errors_section(result),

@@ -9,6 +9,7 @@ import numpy as np
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.show.pieces import data_table, section, sets
 from rpim_opt.store.definition import definition
 
@@ -16,7 +17,6 @@ from rpim_opt.store.definition import definition
 def provenance_section(result: Calibration) -> list[Element]:
     """Return where the measurements come from and what was minimized."""
     record = result.record
-    robot = result.problem.robot
     rows = []
     for name, data in sets(result).items():
         for block in data.blocks:
@@ -25,7 +25,7 @@ def provenance_section(result: Calibration) -> list[Element]:
     facts = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",
-        "Robot": " - ".join(filter(None, [robot.name, f"{robot.dof} joints", robot.source])),
+        "Robot": "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items()),
         "Formulation": f"{result.formulation.name}: {_formulation(result)}",
         "Made": record.made,
         "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
@@ -45,6 +45,12 @@ def provenance_section(result: Calibration) -> list[Element]:
             "the page was written.",
         ),
     )
+
+
+def _robot(name: str, robot: Robot) -> str:
+    """Return a robot in words, with what it is called where there are several."""
+    called = f"{name}: {robot.name}" if name else robot.name
+    return " - ".join(filter(None, [called, f"{robot.dof} joints", robot.source]))
 
 
 def _formulation(result: Calibration) -> str:

@@ -17,7 +17,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Record
 from rpim_opt.store.definition import defined, definition, forms
 from rpim_opt.store.learned_parts import learned_part, scatter_part
-from rpim_opt.store.parts import data_part, finite, parameters_part, robot_part, selection_part
+from rpim_opt.store.parts import data_part, finite, parameters_part, robots_part, selection_part
 from rpim_opt.store.schema import FORMAT, VERSION
 
 
@@ -41,7 +41,7 @@ def content(result: Calibration) -> dict[str, Any]:
         "selection": selection_part(result.selection),
         "definition": definition(result.formulation),
         "forms": forms(result),
-        "robot": robot_part(result.problem.robot),
+        **robots_part(result.problem.arms),
         "model": parameters_part(result.problem.parameters),
         "data": {name: data_part(part) for name, part in data.items()},
         "scatter": scatter_part(result.problem.scatter),

@@ -6,6 +6,7 @@ Numbers are written with the fewest digits that read back to the same bits; null
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,19 @@ from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.schema import BlockPart, DataPart, ParameterPart, RobotPart, SelectionPart
+from rpim_opt.store.schema import BlockPart, DataPart, File, ParameterPart, RobotPart, SelectionPart
 
 
 def finite(value: float) -> float | None:
     """Return a number as a file has it: null where it is infinite or none."""
     return float(value) if np.isfinite(value) else None
+
+
+def robots_part(robots: Mapping[str, Robot]) -> dict[str, Any]:
+    """Return the robot, or several by name, under its key of a file."""
+    if "" in robots:
+        return {"robot": robot_part(robots[""])}
+    return {"robots": {name: robot_part(robot) for name, robot in robots.items()}}
 
 
 def robot_part(robot: Robot) -> dict[str, Any]:
@@ -78,6 +86,26 @@ def _in_words(term: Mapping[str, Any]) -> str:
     return f"a term of the {term['at']} ({what}{seen})"
 
 
+def robots_of(file: File, model: Model | Mapping[str, Model]) -> dict[str, Robot]:
+    """Return the robots that a file holds by name, ``""`` for the only one."""
+    if (file.robot is None) == (not file.robots):
+        raise InputError("key robot", "no robot" if file.robot is None else "one beside several", "robot, or robots")
+    if file.robot is not None:
+        if not isinstance(model, Model):
+            raise InputError("model", "models by name", "a Model, for the one robot of the file")
+        return {"": robot_of(file.robot, model)}
+    return {name: robot_of(part, _model_of(name, part, model)) for name, part in file.robots.items()}
+
+
+def _model_of(name: str, part: RobotPart, model: Model | Mapping[str, Model]) -> Model:
+    """Return the terms of one of several robots: given by name, or one model for all that have terms."""
+    if not isinstance(model, Model):
+        return model.get(name, Model())
+    if not part.terms:
+        return Model()
+    return model
+
+
 def _gravity_of(part: RobotPart) -> Gravity:
     """Return the gravity that a file holds; an older one has none, and nothing that would ask for it."""
     stated = part.gravity
@@ -112,8 +140,14 @@ def parameters_part(parameters: Parameters) -> list[dict[str, Any]]:
     ]
 
 
-def parameters_of(parts: list[ParameterPart], terms: tuple[str, ...] = ()) -> Parameters:
-    """Return the model parameters that a file holds, some of them of a user's own terms."""
+def parameters_of(parts: list[ParameterPart], robots: Mapping[str, Robot]) -> Parameters:
+    """Return the model parameters that a file holds, of its robots."""
+    table = _table_of(parts)
+    terms = [(key, name) for key, robot in robots.items() for name in robot.model.names(robot.joint_types)]
+    return replace(table, terms=tuple(dict.fromkeys(table.called(key, name) for key, name in terms)))
+
+
+def _table_of(parts: list[ParameterPart]) -> Parameters:
     return Parameters(
         tuple(p.name for p in parts),
         tuple(p.dimension for p in parts),
@@ -121,7 +155,6 @@ def parameters_of(parts: list[ParameterPart], terms: tuple[str, ...] = ()) -> Pa
         np.array([p.scale for p in parts]),
         np.array([np.inf if p.tolerance is None else p.tolerance for p in parts]),
         np.array([p.identified for p in parts]),
-        terms=terms,
     )
 
 
@@ -147,6 +180,7 @@ def _block_part(block: Block) -> dict[str, Any]:
         "payload": _optional(block.payload),
         "approach": _optional(block.approach),
         "columns": {name: values.tolist() for name, values in block.columns.items()},
+        "robot": block.robot,
     }
 
 
@@ -193,6 +227,7 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         payload=payload,
         approach=approach,
         columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
+        robot=part.robot,
     )
 
 

@@ -32,9 +32,10 @@ from rpim_opt.store.agreement import agreement
 from rpim_opt.store.content import content, derived, digest, sets
 from rpim_opt.store.definition import formulation_of, quadratic_of
 from rpim_opt.store.learned_parts import learned_of, scatter_of
-from rpim_opt.store.parts import data_of, parameters_of, robot_of, selection_of
+from rpim_opt.store.parts import data_of, parameters_of, robots_of, selection_of
 from rpim_opt.store.schema import FORMAT, VERSION, File, RowPart
 
+Models = Model | Mapping[str, Model]
 AGREEMENT_MM = 1e-6
 """By how much an error that a file states may differ from the one that its data and parameters give."""
 
@@ -72,7 +73,7 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
     write_json(_file(path), content(result))
 
 
-def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Model | None = None) -> Calibration:
+def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Models | None = None) -> Calibration:
     """Return the calibration that a file holds.
 
     Its figures are computed anew from the data in the file, and those that the file states are compared with them.
@@ -88,8 +89,8 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     measurements
         Measurement models of your own that the file names.
     model
-        The terms of your own that the calibration had: a file holds their names and no functions. They are checked by
-        names, columns and the errors of all rows.
+        The terms of your own that the calibration had, of several robots also by name: a file holds what the terms are
+        called and no functions. They are checked by names, columns and the errors of all rows.
 
     Raises
     ------
@@ -145,11 +146,11 @@ def _require_format(stored: Any, path: Path) -> None:
         raise InputError("key version", repr(written)[:40], f"{VERSION}; a newer rpim-opt may read it", path)
 
 
-def _calibration(file: File, known: Mapping[str, Measurement], model: Model) -> Calibration:
-    robot = robot_of(file.robot, model)
+def _calibration(file: File, known: Mapping[str, Measurement], model: Models) -> Calibration:
+    robots = robots_of(file, model)
     problem = CalibrationProblem(
-        robot,
-        parameters_of(file.model, model.names(robot.joint_types)),
+        robots.get("", robots),
+        parameters_of(file.model, robots),
         data_of(file.data.identification, known),
         scatter=scatter_of(file.scatter),
     )

@@ -77,6 +77,7 @@ class BlockPart(Part):
     payload: Vector | None = None
     approach: Cube | None = None
     columns: dict[str, Vector] = Field(default_factory=dict)
+    robot: str = ""
 
 
 class DataPart(Part):
@@ -252,7 +253,8 @@ class File(Part):
     certificate: CertificatePart | None
     trust: TrustPart | None
     held: list[HeldPart]
-    robot: RobotPart
+    robot: RobotPart | None = None
+    robots: dict[str, RobotPart] = Field(default_factory=dict)
     model: list[ParameterPart]
     data: SetsPart
     record: RecordPart

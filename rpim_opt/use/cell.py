@@ -77,12 +77,20 @@ class Known(NamedTuple):
     covariance: Array | None
 
     @classmethod
-    def of(cls, result: Calibration) -> Known:
-        """Return what a calibration identified; the other parameters do not deviate."""
+    def of(cls, result: Calibration, robot: str = "") -> Known:
+        """Return what a calibration identified of a robot; the other parameters do not deviate."""
         parameters = result.problem.parameters
         x = np.zeros(len(parameters))
         x[parameters.identified] = result.x
-        return cls(parameters, x, known_covariance(result))
+        covariance = known_covariance(result)
+        if not robot:
+            return cls(parameters, x, covariance)
+        places = parameters.places_of(robot)
+        if covariance is not None:
+            unknown = np.cumsum(parameters.identified) - 1
+            mine = unknown[places[parameters.identified[places]]]
+            covariance = covariance[np.ix_(mine, mine)]
+        return cls(parameters.of_robot(robot), x[places], covariance)
 
     def holding(self, prefix: str, tool: Sequence[float] | Array) -> Known:
         """Return the same with a tool that is known exactly, (6,) x, y, z [m], roll, pitch, yaw [rad]."""
@@ -141,10 +149,14 @@ class Cell(NamedTuple):
         base: bool,
         torques: bool,
         gravity: Gravity,
+        which: str = "",
     ) -> Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
-        robot = replace(result.problem.robot, gravity=gravity)
-        known = Known.of(result)
+        robot = replace(result.problem.arms[which], gravity=gravity)
+        known = Known.of(result, which)
+        measured = result.problem
+        if which:
+            measured = measured.sample().alone(which)
         reflector = _reflector(known.parameters, tool, marker)
         prefix = tool_prefix(reflector)
         if tool is not None:
@@ -155,10 +167,10 @@ class Cell(NamedTuple):
         if base:
             moved = np.linalg.inv(_base(stated)) @ _base(found)
         free = known.x[known.parameters.identified]
-        scatter = result.problem.scatter
+        scatter = measured.scatter
         if tool is not None and scatter is not None:
             scatter = replace(scatter, at=known.parameters.values(known.x))
-        problem = CalibrationProblem(robot, known.parameters, result.problem.data, scatter=scatter)
+        problem = CalibrationProblem(robot, known.parameters, measured.data, scatter=scatter)
         require_same_torques(robot, problem.parameters, problem.data, torques)
         loads = loads_on(robot, problem.parameters, problem.data, torques)
         return cls(
@@ -166,9 +178,7 @@ class Cell(NamedTuple):
             kind,
             nominal=Arm.of(robot, stated, stated, prefix, np.eye(4), kind, loads),
             real=Arm.of(robot, found, stated, prefix, moved, kind, loads),
-            spread=Spread(
-                problem, free, known.covariance, reflector, position_noise(result.problem), result.noise_level
-            ),
+            spread=Spread(problem, free, known.covariance, reflector, position_noise(measured), result.noise_level),
             loads=loads,
         )
 

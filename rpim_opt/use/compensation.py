@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
@@ -40,6 +40,7 @@ def compensate(
     payload_centre: Sequence[float] | Array | None = None,
     largest: float = 0.2,
     label: Sequence[str] = (),
+    robot: str = "",
 ) -> Compensation:
     """Correct joint commands so that the calibrated robot goes where the nominal one would.
 
@@ -91,6 +92,8 @@ def compensate(
         Largest correction of a joint [rad or m].
     label
         N row labels; numbers from 1 by default.
+    robot
+        Which of several robots.
 
     Returns
     -------
@@ -110,16 +113,19 @@ def compensate(
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
     """
-    robot = result.problem.robot
-    targets = checked(robot, Targets(tuple(label), q, poses, torque), orientation)
+    arms = result.problem.arms
+    if robot not in arms:
+        raise InputError("robot", f"'{robot}'", choices(robot, arms))
+    arm = arms[robot]
+    targets = checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest > 0:
         raise InputError("largest", f"{largest}", "a correction greater than zero")
     turned = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
     kind = pose if turned else position
-    gravity = robot.gravity
+    gravity = arm.gravity
     if payload_centre is not None:
         gravity = gravity.carrying(gravity.payload, list(payload_centre))
-    cell = Cell.of(result, kind, tool, marker, base, torque is not None, gravity)
+    cell = Cell.of(result, kind, tool, marker, base, torque is not None, gravity, robot)
     carried = _carried(cell, payload, payload_centre, len(targets.label))
 
     def part(start: int) -> dict[str, Array]:
@@ -133,8 +139,8 @@ def compensate(
         parts = list(pool.map(part, range(0, len(targets.label), BLOCK)))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     whole["status"] = tuple(whole["status"].tolist())
-    commands = Dataset.of(whole["q"], np.zeros((len(targets.label), 3)), 1.0)
-    return Compensation(robot, targets.label, **whole, outside=result.outside(commands))
+    commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((len(targets.label), 3)), 1.0)})
+    return Compensation(arm, targets.label, **whole, outside=result.outside(commands))
 
 
 def _carried(cell: Cell, payload: float | Array | None, centre: object, N: int) -> Array | None:

@@ -8,7 +8,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside
 
-RANGES = np.array([[-1.0, 0.0, 0.5], [1.0, 2.0, 0.5]])
+RANGES = {"": np.array([[-1.0, 0.0, 0.5], [1.0, 2.0, 0.5]])}
 
 
 def rows(q) -> ro.Dataset:
@@ -46,13 +46,13 @@ def test_rows_are_named_by_their_numbers_and_counted_by_joint():
 def test_every_point_of_a_row_counts():
     data = ro.load("distance").problem.data
     problem = ro.load("distance").problem
-    low, high = measured_ranges(problem)
+    low, high = measured_ranges(problem)[""]
     every = np.concatenate([block.q.reshape(-1, problem.robot.dof) for block in data.blocks])
     assert (low == every.min(axis=0)).all()
     assert (high == every.max(axis=0)).all()
     assert data.blocks[0].q.shape[1] == 2
-    tight = np.array([low, high])
-    tight[1, 0] = np.median(data.blocks[0].q[:, 1, 0])
+    tight = {"": np.array([low, high])}
+    tight[""][1, 0] = np.median(data.blocks[0].q[:, 1, 0])
     assert outside(tight, data).rows
 
 
@@ -61,7 +61,7 @@ def test_predictions_validation_and_commands_say_it():
     seen = instance.problem.data
     problem = instance.problem.on(seen.take(np.flatnonzero(np.abs(seen.q[:, 0]) < 1.5)))
     result = ro.calibrate(problem, ro.tikhonov, 1.0)
-    middle = measured_ranges(problem).mean(axis=0)
+    middle = measured_ranges(problem)[""].mean(axis=0)
     q = np.array([middle, [2.2, *middle[1:]]])
     assert result.predict(q).outside.rows == (1,)
     assert ro.calibration.Uncertainty(result).predict(q).outside.joints == {1: 1}

@@ -259,7 +259,7 @@ def test_columns_of_a_table_are_read_kept_and_missed(tmp_path: Path) -> None:
     cold = again.forward(Q[:2], columns={"temperature": 0.0, "hours": 1.0})
     hot = again.forward(Q[:2], columns={"temperature": 50.0, "hours": 1.0})
     assert np.abs(hot - cold).max() > 0
-    with pytest.raises(ro.InputError, match="compensation.*'(hours|temperature)'"):
+    with pytest.raises(ro.InputError, match=r"compensation.*'(hours|temperature)'"):
         ro.use.compensate(again, q=Q[:2])
 
 
