@@ -16,6 +16,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.robot.deflection import Statics
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.open_model import asked_by
 from rpim_opt.robot.parameter_names import of_term
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.posture import Posture, Symbol
@@ -79,7 +80,7 @@ class Needs(NamedTuple):
         used = parameters.identified | (parameters.nominal != 0)
         names = {parameters.names[i] for i in np.flatnonzero(used)}
         terms = [name for name in names if of_term(name)]
-        asked = robot.model.asks(robot.joint_types, names.__contains__)
+        asked = asked_by(robot.model, robot.joint_types, names.__contains__)
         return cls(
             torques=asked.torques or any(name.startswith("compliance") for name in terms),
             moments=asked.gravity or any(name.startswith("bend") for name in terms),
@@ -146,7 +147,7 @@ def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
 def _sees_approach(robot: Robot, name: str) -> bool:
     if not robot.model.terms:
         return False
-    return robot.model.asks(robot.joint_types, lambda other: other == name).approach
+    return asked_by(robot.model, robot.joint_types, lambda other: other == name).approach
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:

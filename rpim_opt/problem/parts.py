@@ -100,7 +100,14 @@ class PartitionedProblem:
 
     @property
     def arms(self) -> Mapping[str, Robot]:
-        """The nominal robots by name; ``""`` for the only one."""
+        """The nominal robots by name; ``""`` for the only one.
+
+        >>> import rpim_opt as ro
+        >>> whole = ro.load("position").problem
+        >>> parts = ro.problem.PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: whole.data])
+        >>> list(parts.arms)
+        ['']
+        """
         return self._first.arms
 
     @property
@@ -135,7 +142,21 @@ class PartitionedProblem:
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> PartitionedProblem:
         """Return the same problem on an arm that moves by the terms of a model, too; as `CalibrationProblem` has it.
 
-        What reads the parts has to read the columns that the terms see: give it `robot` of the result.
+        What reads the parts has to read the columns that the terms see.
+
+        Parameters
+        ----------
+        model, identify
+            As there.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> whole = ro.load("position").problem
+        >>> parts = ro.problem.PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: whole.data])
+        >>> bow = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1}, joints=(2,))
+        >>> ro.calibrate(parts.with_model(ro.Model([bow])), ro.tikhonov, weight=1.0).converged
+        True
         """
         return self._with(self._first.with_model(model, identify))
 

@@ -136,11 +136,18 @@ class CalibrationProblem:
     def alone(self, robot: str) -> CalibrationProblem:
         """Return the problem of one of several robots: its parameters, as itself calls them, and its rows.
 
+        Parameters
+        ----------
+        robot
+            Its name.
+
+        Examples
+        --------
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
         >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
         >>> len(both.data), len(both.alone("left").data), both.alone("left").parameters.free.names[0]
-        (80, 40, 'alpha2')
+        (80, 40, 'alpha1')
         """
         if robot not in self.arms:
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
@@ -222,7 +229,7 @@ class CalibrationProblem:
         >>> problem.parameters.free.names[-2:], problem.parameters.names[-1]
         (('bow2', 'bow3'), 'bow6')
         """
-        robot = replace(self.robot, model=self.robot.model.beside(model))
+        robot = replace(self.robot, model=Model((*self.robot.model.terms, *model.terms)))
         p = self.parameters
         whole = with_terms(p, model, robot.joint_types)
         added = np.arange(len(whole)) >= len(p)

@@ -52,7 +52,7 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     >>> half = [problem.on(data.take(range(20))), problem.on(data.take(range(20, 40)))]
     >>> both = ro.together(spring=half[0], autumn=half[1], shared=["[!b]*", "beta?"])  # all but the base
     >>> both.parameters.free.names[:2], both.parameters.free.names[-1], both.labels[-1]
-    (('alpha2', 'alpha3'), 'autumn.base_rz', 'c39')
+    (('alpha1', 'a1'), 'autumn.base_rz', 'c39')
     >>> result = ro.calibrate(both, ro.tikhonov, weight=1.0)
     >>> result.converged, result.x.shape, result.covariance.shape
     (True, (40,), (40, 40))

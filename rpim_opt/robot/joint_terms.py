@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 import casadi as ca
 
 from rpim_opt.robot.posture import Joint, Posture, Symbol
-from rpim_opt.robot.terms import Place, Term
+from rpim_opt.robot.terms import Place, Term, moved
 
 JOINT_TERMS = (
     Term(lambda joint, ratio: ratio * joint.q, {"ratio_ppm": 1000}, joints=("revolute", "prismatic")),
@@ -52,14 +52,14 @@ def motion(
         q + ratio q + ecc_cos cos q + ecc_sin sin q + compliance torque + ...        revolute
         q + ratio q                                                                  prismatic
     """
-    moved = posture.q[i - 1]
+    total = posture.q[i - 1]
     joint = Joint(i, posture)
     for term in (*terms_of(len(posture.q)), *terms):
         if term.at == "joint" and i in term.places(joint_types):
-            more = term.moved(joint, value)
+            more = moved(term, joint, value)
             if more is not None:
-                moved = moved + more
-    return moved
+                total = total + more
+    return total
 
 
 def displacement(
@@ -74,7 +74,7 @@ def displacement(
     total = None
     for term in terms:
         if term.at == at and i in term.places(joint_types):
-            moved = term.moved(Joint(i, posture), value)
-            if moved is not None:
-                total = moved if total is None else total + moved
+            more = moved(term, Joint(i, posture), value)
+            if more is not None:
+                total = more if total is None else total + more
     return total

@@ -13,7 +13,7 @@ from rpim_opt.robot.family import bend_names
 from rpim_opt.robot.joint_terms import BEND_SCALE, JOINT_TERMS
 from rpim_opt.robot.kinematics import FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.open_model import Model
+from rpim_opt.robot.open_model import Model, entries_of
 from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
@@ -89,7 +89,7 @@ def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str])
     InputError
         For a name that the table has.
     """
-    entries = dict(model.entries(joint_types))
+    entries = dict(entries_of(model, joint_types))
     for name in entries:
         if name in parameters.names:
             raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")

@@ -11,7 +11,7 @@ import casadi as ca
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.posture import Joint, Posture, Symbol
-from rpim_opt.robot.terms import Entry, Term
+from rpim_opt.robot.terms import Entry, Term, moved
 
 
 class Asks(NamedTuple):
@@ -77,38 +77,51 @@ class Model:
 
     @cached_property
     def columns(self) -> Mapping[str, str]:
-        """Further columns of the data that its terms see, name to dimension."""
-        return {name: dimension for term in self.terms for name, dimension in term.columns.items()}
+        """Further columns of the data that its terms see, name to dimension.
 
-    def entries(self, joint_types: Sequence[str]) -> Iterator[tuple[str, Entry]]:
-        """Yield the parameters by name."""
-        for term in self.terms:
-            for i in term.places(joint_types):
-                yield from zip(term.names(i), term.entries, strict=True)
+        >>> import rpim_opt as ro
+        >>> slow = ro.robot.Term(
+        ...     lambda joint, rate: rate * joint.column("hours"), {"drift_mrad": 0.1}, columns={"hours": ""}
+        ... )
+        >>> ro.Model([slow]).columns
+        {'hours': ''}
+        """
+        return {name: dimension for term in self.terms for name, dimension in term.columns.items()}
 
     def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
         """Return the names of all its parameters.
 
+        Parameters
+        ----------
+        joint_types
+            Of the arm.
+
+        Examples
+        --------
         >>> import rpim_opt as ro
         >>> sag = ro.robot.Term(lambda tool, x: [0, 0, x, 0, 0, 0], {"sag_mm": 0.1}, at="tool")
         >>> ro.Model([sag]).names(("revolute", "revolute"))
         ('sag',)
         """
-        return tuple(name for name, _ in self.entries(joint_types))
+        return tuple(name for name, _ in entries_of(self, joint_types))
 
-    def beside(self, other: Model) -> Model:
-        """Return a model with the terms of this one and of another."""
-        return Model((*self.terms, *other.terms))
 
-    def asks(self, joint_types: Sequence[str], used: Callable[[str], bool]) -> Asks:
-        """Return what the terms ask of a row that have no parameters, or one of which ``used(name)`` says so."""
-        found = Asks()
-        for term in self.terms:
-            for i in term.places(joint_types):
-                names = term.names(i)
-                if not names or any(map(used, names)):
-                    found = found.beside(_asked(term, i, len(joint_types)))
-        return found
+def entries_of(model: Model, joint_types: Sequence[str]) -> Iterator[tuple[str, Entry]]:
+    """Yield the parameters of a model's terms by name."""
+    for term in model.terms:
+        for i in term.places(joint_types):
+            yield from zip(term.names(i), term.entries, strict=True)
+
+
+def asked_by(model: Model, joint_types: Sequence[str], used: Callable[[str], bool]) -> Asks:
+    """Return what the terms ask of a row that have no parameters, or one of which ``used(name)`` says so."""
+    found = Asks()
+    for term in model.terms:
+        for i in term.places(joint_types):
+            names = term.names(i)
+            if not names or any(map(used, names)):
+                found = found.beside(_asked(term, i, len(joint_types)))
+    return found
 
 
 class _Stub:
@@ -135,7 +148,7 @@ def _asked(term: Term, i: int, dof: int) -> Asks:
     weight = _Stub()
     columns = {name: ca.SX.sym(name) for name in term.columns}
     posture = Posture(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), weight, columns)
-    found = term.moved(Joint(i, posture), lambda name: ca.SX.sym(name))
+    found = moved(term, Joint(i, posture), lambda name: ca.SX.sym(name))
     if found is None:
         return Asks()
     return Asks(

@@ -88,11 +88,18 @@ class Parameters:
     def of_robot(self, robot: str) -> Parameters:
         """Return what one of several robots has of the table, called as the robot itself calls it.
 
+        Parameters
+        ----------
+        robot
+            Its name; ``""`` for the only one.
+
+        Examples
+        --------
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
         >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
         >>> both.free.names[0], both.of_robot("left").free.names[0], "tool_x" in both.of_robot("right").names
-        ('left.alpha2', 'alpha2', True)
+        ('left.alpha1', 'alpha1', True)
         """
         if not robot:
             return self
@@ -101,13 +108,45 @@ class Parameters:
         return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
 
     def called(self, robot: str, own: str) -> str:
-        """Return what the table calls a parameter of one of several robots: ``left.a2``, or ``a2`` if shared."""
+        """Return what the table calls a parameter of one of several robots: ``left.a2``, or ``a2`` if shared.
+
+        Parameters
+        ----------
+        robot
+            Its name; ``""`` for the only one.
+        own
+            What the robot itself calls the parameter.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
+        >>> both.called("left", "a2"), both.called("left", "tool_x")
+        ('left.a2', 'tool_x')
+        """
         if own in self.names or not robot:
             return own
         return f"{robot}.{own}"
 
     def places_of(self, robot: str) -> np.ndarray:
-        """Return where the parameters of one of several robots stand, those that it shares among them."""
+        """Return where the parameters of one of several robots stand (k,), those that it shares among them.
+
+        Parameters
+        ----------
+        robot
+            Its name; ``""`` for the only one.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
+        >>> len(both), len(both.places_of("right"))
+        (222, 114)
+        """
+        if not robot:
+            return np.arange(len(self))
         mine = [name in (own_name(name), f"{robot}.{own_name(name)}") for name in self.names]
         return np.flatnonzero(mine)
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import casadi as ca
+
 from rpim_opt.basics.exceptions import InputError
 
 Symbol = Any  # ca.SX or a number: CasADi ships no types
@@ -48,6 +50,12 @@ class Posture:
         What gravity does; None where nothing asks.
     columns
         Further columns of the data by name [SI].
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.robot.Posture(q=[0.1, 0.5], columns={"temperature": 3.0}).torque is None
+    True
     """
 
     q: Sequence[Symbol]
@@ -88,33 +96,62 @@ class Joint:
 
     @property
     def every_q(self) -> Sequence[Symbol]:
-        """Joint values of all joints [rad or m]."""
+        """Joint values of all joints [rad or m].
+
+        >>> import rpim_opt as ro
+        >>> ro.robot.Joint(2, ro.robot.Posture(q=[0.1, 0.5])).every_q
+        [0.1, 0.5]
+        """
         return self.posture.q
 
     @property
     def torque(self) -> Symbol:
-        """Measured torque [Nm] where the data have torques, that of gravity elsewhere."""
+        """Measured torque [Nm] where the data have torques, that of gravity elsewhere.
+
+        >>> import rpim_opt as ro
+        >>> ro.robot.Joint(2, ro.robot.Posture(q=[0.1, 0.5], torque=[3.0, 7.0])).torque
+        7.0
+        """
         if self.posture.torque is None:
             return self.gravity
         return self.posture.torque[self.number - 1]
 
     @property
     def gravity(self) -> Symbol:
-        """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint."""
+        """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint.
+
+        >>> import rpim_opt as ro
+        >>> ro.robot.Joint(2, ro.robot.Posture(q=[0.1, 0.5])).gravity  # of a posture without weight
+        0.0
+        """
         if self.posture.weight is None:
             return 0.0
         return self.posture.weight.torque(self.number)
 
     @property
     def down(self) -> Symbol:
-        """Where gravity points in the frame after the joint, of the nominal arm: a unit vector (3, 1)."""
+        """Where gravity points in the frame after the joint, of the nominal arm: a unit vector (3, 1).
+
+        >>> import casadi as ca
+        >>> import rpim_opt as ro
+        >>> def bends(link, soft):  # a beam along x, clamped at the joint before it
+        ...     return ca.vertcat(0, 0, 0, soft * ca.cross(ca.DM([1, 0, 0]), link.down))
+        >>> beam = ro.robot.Term(bends, {"beam_mrad": 0.1}, at="link", joints=(2,))
+        >>> ro.load("position").problem.with_model(ro.Model([beam])).parameters.free.names[-1]
+        'beam2'
+        """
         if self.posture.weight is None:
-            return [0.0, 0.0, 0.0]
+            return ca.DM.zeros(3)
         return self.posture.weight.down(self.number)
 
     @property
     def payload(self) -> Symbol:
-        """Mass at the flange [kg]."""
+        """Mass at the flange [kg].
+
+        >>> import rpim_opt as ro
+        >>> ro.robot.Joint(2, ro.robot.Posture(q=[0.1, 0.5])).payload  # of a posture without weight
+        0.0
+        """
         if self.posture.weight is None:
             return 0.0
         return self.posture.weight.payload
@@ -127,7 +164,22 @@ class Joint:
         return self.posture.approach[self.number - 1]
 
     def moment(self, k: int, axis: str) -> Symbol:
-        """Return z_i . (R_k e_a x g_hat): what link k's first moment along its ``axis`` a means to this joint i."""
+        """Return z_i . (R_k e_a x g_hat): what link k's first moment along its ``axis`` a means to this joint i.
+
+        Parameters
+        ----------
+        k
+            The link, from 1.
+        axis
+            ``"x"``, ``"y"`` or ``"z"`` of its frame.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> own = ro.robot.Term(lambda joint, size: size * joint.moment(3, "x"), {"own_mrad": 0.1}, joints=(2,))
+        >>> ro.load("position").problem.with_model(ro.Model([own])).parameters.free.names[-1]
+        'own2'
+        """
         if self.posture.weight is None:
             return 0.0
         return self.posture.weight.moment(self.number, k, axis)
@@ -135,10 +187,21 @@ class Joint:
     def column(self, name: str) -> Symbol:
         """Return what a column of the data says of the row [SI]; the term has to name it in its ``columns``.
 
+        Parameters
+        ----------
+        name
+            Of the column.
+
         Raises
         ------
         InputError
             For a column that the term does not name.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> ro.robot.Joint(1, ro.robot.Posture(q=[0.1], columns={"hours": 8.0})).column("hours")
+        8.0
         """
         if name not in self.posture.columns:
             raise InputError("term", f"column '{name}'", f"columns={{'{name}': ...}} of the term, with its dimension")

@@ -110,7 +110,12 @@ class Term:
 
     @property
     def name(self) -> str:
-        """The parameters' names without the joint's number."""
+        """The parameters' names without the joint's number.
+
+        >>> import rpim_opt as ro
+        >>> ro.robot.Term(lambda joint, a, b: a + b * joint.q, {"zero_mrad": 0.1, "slope_ppm": 10}).name
+        'zero, slope'
+        """
         return ", ".join(entry.stem.partition("{}")[0] for entry in self.entries) or "without parameters"
 
     def names(self, i: int) -> tuple[str, ...]:
@@ -127,27 +132,6 @@ class Term:
         if not wanted:
             wanted = ("revolute",) if self.at == "joint" else ("revolute", "prismatic")
         return tuple(i for i, kind in enumerate(joint_types, start=1) if i in wanted or kind in wanted)
-
-    def moved(self, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
-        """Return by how much it moves, (1, 1) or (6, 1); None where its parameters are all zero.
-
-        Raises
-        ------
-        InputError
-            For a function that returns something else.
-        """
-        sizes = [value(name) for name in self.names(joint.number)]
-        # an effect may take a whole chain to write down: not for a parameter that is not there
-        if sizes and all(map(is_zero, sizes)):
-            return None
-        found = self.moves(joint, *sizes)
-        if isinstance(found, list | tuple):
-            found = ca.vertcat(*found)
-        found = ca.SX(found)
-        if found.numel() != SIZES[self.at]:
-            accepted = f"{SIZES[self.at]}, as a term of a {self.at} returns"
-            raise InputError(f"term '{self.name}'", f"{found.numel()} numbers", accepted)
-        return ca.vec(found)
 
 
 def require_columns(columns: Mapping[str, str], where: str) -> None:
@@ -183,6 +167,28 @@ def _numbered(stem: str, i: int) -> str:
     if "{}" in stem:
         return stem.format(i)
     return f"{stem}{i}"
+
+
+def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
+    """Return by how much a term moves, (1, 1) or (6, 1); None where its parameters are all zero.
+
+    Raises
+    ------
+    InputError
+        For a function that returns something else.
+    """
+    sizes = [value(name) for name in term.names(joint.number)]
+    # an effect may take a whole chain to write down: not for a parameter that is not there
+    if sizes and all(map(is_zero, sizes)):
+        return None
+    found = term.moves(joint, *sizes)
+    if isinstance(found, list | tuple):
+        found = ca.vertcat(*found)
+    found = ca.SX(found)
+    if found.numel() != SIZES[term.at]:
+        accepted = f"{SIZES[term.at]}, as a term of a {term.at} returns"
+        raise InputError(f"term '{term.name}'", f"{found.numel()} numbers", accepted)
+    return ca.vec(found)
 
 
 def is_zero(value: Symbol) -> bool:

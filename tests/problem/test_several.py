@@ -199,7 +199,7 @@ def test_one_robot_in_two_campaigns_is_one_robot_with_two_bases() -> None:
     """Equal to the problem of all rows, where the base is one, too."""
     problem, _ = simulated(configurations=40, noise=SIGMA, seed=3)
     spring, autumn = (problem.on(problem.data.take(range(*rows))) for rows in ((0, 20), (20, 40)))
-    everything = [name for name in problem.parameters.names]
+    everything = list(problem.parameters.names)
     whole = ro.together(spring=spring, autumn=autumn, shared=everything)
     assert whole.parameters.free.names == problem.parameters.free.names
     found = ro.calibrate(whole, ro.tikhonov, weight=1.0)
@@ -298,7 +298,7 @@ def test_measurements_in_parts_are_refused() -> None:
 def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     """Of DRAWS new sets of noise: the spread of the tool is the stated one, also between its components."""
     identify = ("alpha[2345]", "a[2345]", "theta[2345]", "d[45]", *TOOL, "base_*")
-    left, right, tool = two(counts=(30, 25), other=ARM, identify=identify)
+    left, right, _ = two(counts=(30, 25), other=ARM, identify=identify)
     whole = ro.together(left=left, right=right, shared=TOOL)
     truth = by_name(whole, ro.calibrate(whole, ro.least_squares).x)
     first = ro.calibrate(measured(whole, truth, seed=0), ro.least_squares)
