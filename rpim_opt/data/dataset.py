@@ -248,7 +248,7 @@ class Dataset:
         measurement
             What the instrument sees.
         torque, approach
-            Joint torques [Nm], and directions in which the joints moved last (-1, 0 or +1), (N, dof) or (N, p, dof) as q.
+            Joint torques [Nm], and directions of the last movement (-1, 0 or +1), (N, dof) or (N, p, dof) as q.
         payload
             (N,) mass at the flange [kg].
         columns
