@@ -7,6 +7,7 @@ import numpy as np
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.learned import Learned, Size
 from rpim_opt.robot.family import EXPECTED
+from rpim_opt.robot.overlay import is_joint_offset
 
 UNITS = {"position": ("mm", 1e3), "orientation": ("mrad", 1e3), "joint": ("mrad", 1e3), "instrument": ("times", 1.0)}
 WORDS = {
@@ -92,7 +93,7 @@ def _unusual(learned: Learned, names: tuple[str, ...], z: np.ndarray) -> list[st
     lines = []
     for name, ratio in learned.unusual(names, z, MOVED)[:MOST]:
         cause = "one that its group does not explain"
-        if name.startswith("theta"):
+        if is_joint_offset(name):
             cause = "an error of assembly or of its zero"
         lines.append(f"{name} moved by {ratio:.0f} times what its group does: {cause}.")
     return lines

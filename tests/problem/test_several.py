@@ -229,6 +229,8 @@ def test_a_result_goes_to_a_file_and_a_report_and_commands_and_back(tmp_path: Pa
     assert np.array_equal(again.problem.parameters.periodic, whole.parameters.periodic)
     assert str(again) == str(result)
     assert ro.load_result(tmp_path / "result.json", model=ro.Model([term])).problem.arms.keys() == {"left", "right"}
+    ro.show.write_report(result, tmp_path / "report.html")
+    assert "left: test arm" in (tmp_path / "report.html").read_text()
     assert lack_of_fit(result).left < 3 * SIGMA
     assert ro.calibration.likely_causes(result) == []
     assert list(result.robots) == ["left", "right"]
@@ -292,6 +294,16 @@ def test_measurements_in_parts_are_refused() -> None:
     parts = ro.problem.PartitionedProblem(left.robot, left.parameters, left.data, (lambda: left.data,))
     with pytest.raises(ro.InputError, match="a CalibrationProblem, in memory"):
         ro.together(parts, right, shared=TOOL)
+
+
+def test_more_equations_than_are_kept_come_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    left, right, _ = two(counts=(30, 30))
+    whole = ro.together(left=left, right=right, shared=TOOL)
+    expected = ro.calibrate(whole, ro.tikhonov, weight=1.0)
+    monkeypatch.setattr("rpim_opt.problem.parts.KEPT", 60)
+    found = ro.calibrate(whole, ro.tikhonov, weight=1.0)
+    assert found.converged
+    assert np.abs(found.z - expected.z).max() < 1e-8
 
 
 @pytest.mark.slow
