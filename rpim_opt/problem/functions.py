@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
@@ -15,7 +14,7 @@ from rpim_opt.data.models import MEASUREMENTS, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads
 from rpim_opt.robot.kinematics import FRAME, chain, frame
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.posture import Posture, Symbol
+from rpim_opt.robot.posture import SYMBOLS, Posture, Symbol
 from rpim_opt.robot.terms import Term
 
 Functions = Mapping[str, ca.Function]
@@ -27,7 +26,6 @@ transform = Measurement(
 """The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
 
 _READY = frozenset({*MEASUREMENTS.values(), transform})
-_lock = threading.RLock()  # symbols of CasADi are counted without one; a model may itself evaluate a problem
 
 
 class Structure(NamedTuple):
@@ -66,7 +64,7 @@ class Kept:
 
     def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
         """Return the functions as they were when they were first asked for."""
-        with _lock:
+        with SYMBOLS:
             if (structure, measurement) not in self._functions:
                 self._functions[structure, measurement] = asked(structure, measurement)
             return self._functions[structure, measurement]
@@ -85,7 +83,7 @@ def asked(structure: Structure, measurement: Measurement) -> Functions:
     """
     if measurement in _READY and not structure.terms:
         return _ready(structure, measurement)
-    with _lock:
+    with SYMBOLS:
         expressions = _expressions(structure, measurement)
         answer = ca.Function("row", list(expressions[:3]), list(expressions[3:]))
         return _built(answer.serialize())
@@ -93,7 +91,7 @@ def asked(structure: Structure, measurement: Measurement) -> Functions:
 
 @lru_cache(maxsize=256)
 def _ready(structure: Structure, measurement: Measurement) -> Functions:
-    with _lock:
+    with SYMBOLS:
         return _derived(_expressions(structure, measurement))
 
 

@@ -72,6 +72,7 @@ class Needs(NamedTuple):
 
     torques: bool
     moments: bool
+    payload: bool
     columns: frozenset[str]
 
     @classmethod
@@ -84,6 +85,7 @@ class Needs(NamedTuple):
         return cls(
             torques=asked.torques or any(name.startswith("compliance") for name in terms),
             moments=asked.gravity or any(name.startswith("bend") for name in terms),
+            payload=asked.gravity,
             columns=asked.columns,
         )
 
@@ -114,7 +116,7 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
         raise InputError("compensation", f"a term that sees column '{min(needs.columns)}'", accepted)
     weighs = needs.torques and not measured_torques(data)
     gravity = robot.gravity if weighs or needs.moments else None
-    return Loads(torques=torques, payload=weighs, gravity=gravity, weighs=weighs)
+    return Loads(torques=torques, payload=weighs or needs.payload, gravity=gravity, weighs=weighs)
 
 
 def columns(robot: Robot, block: Block, part: slice) -> list[Array]:

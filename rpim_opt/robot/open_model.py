@@ -10,7 +10,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.robot.posture import Joint, Posture, Symbol
+from rpim_opt.robot.posture import SYMBOLS, Joint, Posture, Symbol
 from rpim_opt.robot.terms import Entry, Term, moved
 
 
@@ -120,7 +120,8 @@ def asked_by(model: Model, joint_types: Sequence[str], used: Callable[[str], boo
         for i in term.places(joint_types):
             names = term.names(i)
             if not names or any(map(used, names)):
-                found = found.beside(_asked(term, i, len(joint_types)))
+                with SYMBOLS:
+                    found = found.beside(_asked(term, i, len(joint_types)))
     return found
 
 

@@ -148,7 +148,7 @@ def _carried(cell: Cell, payload: float | Array | None, centre: object, N: int) 
     if payload is None and centre is None:
         return None
     if not cell.loads.payload:
-        accepted = "a calibration that identified compliances, from the torques of gravity"
+        accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
         raise InputError("payload", "a payload that bends nothing", accepted)
     if payload is None:
         payload = cell.robot.gravity.payload

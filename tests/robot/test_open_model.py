@@ -274,6 +274,31 @@ def test_commands_are_corrected_for_a_users_term_as_for_a_built_in_one() -> None
         ro.use.identified(found)
 
 
+def test_commands_are_corrected_for_links_and_a_tool_under_any_payload() -> None:
+    terms = [
+        ro.robot.Term(
+            lambda link, soft: ca.vertcat(0, 0, 0, soft * ca.cross(ca.DM([1, 0, 0]), link.down)),
+            {"beam_mrad": 0.1},
+            at="link",
+            joints=(2, 3),
+        ),
+        ro.robot.Term(
+            lambda tool, soft: soft * tool.payload * 9.81 * ca.vertcat(tool.down, 0, 0, 0),
+            {"sag_um_per_N": 50},
+            at="tool",
+        ),
+    ]
+    empty = simulated(("a?", "d?"))[0].on(ro.Dataset.of(Q, np.zeros((N, 3)), SIGMA, payload=np.linspace(0, 9, N)))
+    problem = measured(empty.with_model(ro.Model(terms)), beam2=3e-3, beam3=-2e-3, sag=5e-5, a2=1e-3)
+    result = ro.calibrate(problem, ro.tikhonov, weight=1e-6)
+    for carried in (0.0, 7.0):
+        found = ro.use.compensate(result, q=Q[:5], orientation=False, payload=carried)
+        nominal = (ro.robot.forward_kinematics(ARM, Q[:5]) @ [0.03, -0.02, 0.06, 1])[:, :3]
+        there = result.forward(found.q, payload=carried)[:, :3, 3]
+        assert found.position_before.min() > 1e-4
+        assert np.abs(there - nominal).max() < 1e-7
+
+
 def test_a_measurement_may_see_joint_values_torques_and_columns() -> None:
     """A tool that measures its own bending: the reading is z, and what the torque of joint 3 and q2 make of it."""
 
