@@ -73,14 +73,18 @@ def starting_parameters(
         place, located = locate(robot, data, tools)
         places |= {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
-    own_frames: dict[str, None] = {}
     for block in data.blocks:
         kind = block.measurement
-        own_frames |= dict.fromkeys(of_fixture(name + "_", block.fixture) for name in kind.frames)
         given = _own_values(robot, block, place, places[block.markers[0]], own or {})
         for name, dimension in kind.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    return model_parameters(robot, place, tools, entries, tuple(own_frames))
+    return model_parameters(robot, place, tools, entries, own_frames(data))
+
+
+def own_frames(data: Dataset) -> tuple[str, ...]:
+    """Return the prefixes of the frames that measurements have of their own, ``plane_``."""
+    blocks = [(block.measurement, block.fixture) for block in data.blocks]
+    return tuple(dict.fromkeys(of_fixture(name + "_", fixture) for kind, fixture in blocks for name in kind.frames))
 
 
 def _require_reflectors(data: Dataset, tools: Mapping[str, Place]) -> None:

@@ -25,6 +25,7 @@ from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.data.record import Record
+from rpim_opt.problem.frames import own_frames
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.open_model import Model
@@ -148,10 +149,11 @@ def _require_format(stored: Any, path: Path) -> None:
 
 def _calibration(file: File, known: Mapping[str, Measurement], model: Models) -> Calibration:
     robots = robots_of(file, model)
+    data = data_of(file.data.identification, known)
     problem = CalibrationProblem(
         robots.get("", robots),
-        parameters_of(file.model, robots),
-        data_of(file.data.identification, known),
+        replace(parameters_of(file.model, robots), own_frames=own_frames(data)),
+        data,
         scatter=scatter_of(file.scatter),
     )
     x = np.array(file.x)

@@ -296,6 +296,14 @@ def test_measurements_in_parts_are_refused() -> None:
         ro.together(parts, right, shared=TOOL)
 
 
+def test_a_loaded_result_knows_which_angles_are_those_of_frames(tmp_path: Path) -> None:
+    problem = ro.load("plane").problem
+    ro.store.save_result(ro.calibrate(problem, ro.tikhonov, weight=1.0), tmp_path / "result.json")
+    again = ro.load_result(tmp_path / "result.json").problem
+    assert problem.parameters.own_frames
+    assert np.array_equal(again.parameters.periodic, problem.parameters.periodic)
+
+
 def test_more_equations_than_are_kept_come_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     left, right, _ = two(counts=(30, 30))
     whole = ro.together(left=left, right=right, shared=TOOL)
