@@ -1,3 +1,6 @@
+from .certified import CertifiedStart as CertifiedStart
+from .certified import certified_hand_eye as certified_hand_eye
+from .certified import certified_motions as certified_motions
 from .design import Design as Design
 from .design import choose as choose
 from .design import random_candidates as random_candidates

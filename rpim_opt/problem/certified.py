@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -18,8 +19,10 @@ GAP = 1e-3
 """Cost over bound, in units of one plus the cost, up to which the two are the same: a chi-squared means nothing finer."""
 UNKNOWN = 0.1
 """Standard deviation of a rotation [rad] from which it is not determined."""
-RANK_ONE = 1e-2
-"""Second over first eigenvalue of the moment matrix up to which it is of rank one."""
+FAR = 0.5
+"""Angle [rad] within which all starts have to be that fit as well, for there to be one."""
+AS_WELL = 1e-4
+"""Probability that the truth fits worse than what counts as fitting as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,9 @@ class CertifiedStart:
         one.
     uncertainty
         Standard deviation of the least certain rotation [rad].
+    radius
+        Angle [rad] from these rotations beyond which all others fit worse by more than noise explains; proven as the
+        bound is.
     weights
         (N,) that the loss gives the measurements; one for those that count in full.
     certified
@@ -75,6 +81,7 @@ class CertifiedStart:
     gap: float
     rank_ratio: float
     uncertainty: float
+    radius: float
     weights: Array
     certified: bool
     reason: str
@@ -306,7 +313,8 @@ def _judged(
     gap = excess / (1 + solved.cost)
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
-    doubt = _doubt(solved, loops, gap, uncertainty, scale)
+    radius = best.radius(float(chi2.ppf(1 - AS_WELL, loops.unknowns)))
+    doubt = _doubt(solved, gap, uncertainty, radius, scale)
     reason = doubt or f"no other start is better: the bound meets the cost within {gap:.1e} of it"
     return CertifiedStart(
         bases=frames[0],
@@ -317,13 +325,14 @@ def _judged(
         gap=gap,
         rank_ratio=best.rank_ratio,
         uncertainty=uncertainty,
+        radius=radius,
         weights=solved.weights,
         certified=not doubt,
         reason=reason,
     )
 
 
-def _doubt(solved: Solved, loops: Loops, gap: float, uncertainty: float, scale: float) -> str:
+def _doubt(solved: Solved, gap: float, uncertainty: float, radius: float, scale: float) -> str:
     """Return what keeps a start from being certain, in words; nothing where nothing does."""
     N = len(solved.weights)
     full = int(np.sum(solved.weights > 0.999))
@@ -332,8 +341,8 @@ def _doubt(solved: Solved, loops: Loops, gap: float, uncertainty: float, scale: 
         return f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would"
     if gap > GAP:
         return f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better"
-    if solved.smallest.rank_ratio > RANK_ONE:
-        return f"several starts are as good (second eigenvalue {solved.smallest.rank_ratio:.2g} of the first)"
+    if radius > FAR:
+        return f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell"
     if scale <= 0:
         return "the measurements do not determine the scale"
     if not solved.settled:

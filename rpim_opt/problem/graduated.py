@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.loops import Loops
-from rpim_opt.problem.rotations import Smallest, lifted, smallest
+from rpim_opt.problem.rotations import Smallest, lifted, nearest, smallest
 
 LOSSES = ("squares", "huber", "truncated")
 QUANTILES = {"huber": 0.90, "truncated": 0.99}
@@ -18,6 +18,8 @@ QUANTILES = {"huber": 0.90, "truncated": 0.99}
 FACTOR = 1.6
 """By which the truncated loss comes nearer to itself from one pass to the next."""
 MOST_PASSES = 100
+FEWEST = 3
+"""Measurements that have to have a weight."""
 SETTLED = 1e-6
 """Weights that change by less from pass to pass are found."""
 
@@ -36,12 +38,8 @@ class Solved:
         (N,) that the loss gives the measurements; one for a square.
     squares
         (N,) squared residuals.
-    triangle
-        (n, n) of the last weighted problem.
     cost
         The loss, summed, and what is expected of translations.
-    passes
-        How often the relaxation was solved.
     settled
         Whether the weights are those of the residuals.
     """
@@ -50,13 +48,11 @@ class Solved:
     smallest: Smallest
     weights: Array
     squares: Array
-    triangle: Array
     cost: float
-    passes: int = 1
     settled: bool = True
 
 
-Weigh = Callable[[Array, Array], Array]
+Weigh = Callable[[Array], Array]
 
 
 def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
@@ -97,12 +93,21 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
 
 
 def _weighted(loops: Loops, weights: Array, loss: str, candidates: Sequence[Array] = ()) -> Solved:
-    """Return the solution of a weighted sum of squares."""
+    """Return the solution of a weighted sum of squares, by the relaxation."""
     triangle = loops.triangle(weights)
-    best = smallest(loops.form(triangle), candidates)
+    return _solved(loops, weights, loss, triangle, smallest(loops.form(triangle), candidates))
+
+
+def _followed(loops: Loops, weights: Array, loss: str, solved: Solved) -> Solved:
+    """Return the solution of a weighted sum of squares near that of other weights."""
+    triangle = loops.triangle(weights)
+    return _solved(loops, weights, loss, triangle, nearest(loops.form(triangle), solved.smallest.rotations))
+
+
+def _solved(loops: Loops, weights: Array, loss: str, triangle: Array, best: Smallest) -> Solved:
     v = loops.completed(triangle, lifted(best.rotations))
     squares = loops.squares(v)
-    return Solved(v, best, weights, squares, triangle, _cost(loops, v, squares, loss))
+    return Solved(v, best, weights, squares, _cost(loops, v, squares, loss))
 
 
 def _cost(loops: Loops, v: Array, squares: Array, loss: str) -> float:
@@ -124,43 +129,39 @@ def _truncated_weights(squares: Array, beyond: Array) -> Array:
     return (squares <= beyond).astype(float)
 
 
-def _repeated(loops: Loops, solved: Solved, loss: str, weigh: Callable[[Array], Array]) -> Solved:
-    """Return the fixed point of weights and solution."""
-    passes = solved.passes
-    while passes < MOST_PASSES:
+def _repeated(loops: Loops, solved: Solved, loss: str, weigh: Weigh) -> Solved:
+    """Return the fixed point of weights and solution, the last of which is the relaxation's."""
+    for _ in range(MOST_PASSES):
         weights = weigh(solved.squares)
-        if np.max(np.abs(weights - solved.weights)) < SETTLED:
-            return _after(solved, passes, True)
-        if np.sum(weights > 0) < 3:
+        if np.sum(weights > 0) < FEWEST:
             break
+        if np.max(np.abs(weights - solved.weights)) >= SETTLED:
+            solved = _followed(loops, weights, loss, solved)
+            continue
+        if np.isfinite(solved.smallest.bound):
+            return replace(solved, settled=True)
         solved = _weighted(loops, weights, loss, [solved.smallest.rotations])
-        passes += 1
-    return _after(solved, passes, False)
-
-
-def _after(solved: Solved, passes: int, settled: bool) -> Solved:
-    own = {name: getattr(solved, name) for name in ("v", "smallest", "weights", "squares", "triangle", "cost")}
-    return Solved(**own, passes=passes, settled=settled)
+    if not np.isfinite(solved.smallest.bound):
+        solved = _weighted(loops, solved.weights, loss, [solved.smallest.rotations])
+    return replace(solved, settled=False)
 
 
 def _graduated(loops: Loops, solved: Solved, beyond: Array) -> Solved:
-    """Return a least of the truncated loss: losses between it and a square, each from the one before.
+    """Return a least of the truncated loss: losses between a square and it, each from the one before.
 
     The loss of parameter mu has weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them
     sqrt(mu (mu + 1) c^2 / r^2) - mu.
     """
     ratio = float(np.max(solved.squares / beyond))
     mu = 1 / max(2 * ratio - 1, 1e-3)
-    passes = solved.passes
-    while passes < MOST_PASSES and ratio > 1:
+    for _ in range(MOST_PASSES):
         between = np.sqrt(mu * (mu + 1) * beyond / np.maximum(solved.squares, 1e-300)) - mu
         weights = np.clip(between, 0.0, 1.0)
-        if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < 3:
+        if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
             break
-        solved = _weighted(loops, weights, "truncated", [solved.smallest.rotations])
-        passes += 1
+        solved = _followed(loops, weights, "truncated", solved)
         mu *= FACTOR
-    return _repeated(loops, _after(solved, passes, False), "truncated", lambda squares: _truncated_weights(squares, beyond))
+    return _repeated(loops, solved, "truncated", lambda squares: _truncated_weights(squares, beyond))
 
 
 def _from(loops: Loops, rotations: Array, beyond: Array) -> Solved | None:
@@ -168,7 +169,7 @@ def _from(loops: Loops, rotations: Array, beyond: Array) -> Solved | None:
     triangle = loops.triangle(np.ones(len(loops.rows)))
     squares = loops.squares(loops.completed(triangle, lifted(rotations)))
     weights = _truncated_weights(squares, beyond)
-    if np.sum(weights) < 3:
+    if np.sum(weights) < FEWEST:
         return None
     solved = _weighted(loops, weights, "truncated", [rotations])
     return _repeated(loops, solved, "truncated", lambda squares: _truncated_weights(squares, beyond))

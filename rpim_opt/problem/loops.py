@@ -33,6 +33,12 @@ class Loops:
     linear: int
     freedom: Array
 
+    @property
+    def unknowns(self) -> int:
+        """How many numbers are sought: three a rotation."""
+        n = self.rows.shape[2] - 1 - self.linear
+        return self.linear + n // 3
+
     def triangle(self, weights: Array) -> Array:
         """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
         n = self.rows.shape[2]

@@ -44,6 +44,8 @@ class Smallest:
         Second eigenvalue of the relaxation's moment matrix over its first.
     information
         (3k, 3k) half the second derivative of the value by rotation vectors [1/rad^2].
+    steepness
+        c >= 0: every x has a value of at least bound + c |x_other|^2, x_other being what of x is not along the best.
     """
 
     rotations: Array
@@ -51,6 +53,24 @@ class Smallest:
     bound: float
     rank_ratio: float
     information: Array
+    steepness: float
+
+    def radius(self, excess: float) -> float:
+        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
+
+        Both x are of the same length and begin with 1, so that |x - x_best|^2 <= 3 |x_other|^2; and
+        |R - R_best|^2 = 8 sin^2(angle / 2).
+        """
+        if self.steepness <= 0:
+            return float(np.pi)
+        other = (excess + self.value - self.bound) / self.steepness
+        return float(2 * np.arcsin(min(1.0, np.sqrt(3 * other / 8))))
+
+
+def nearest(L: Array, rotations: Array) -> Smallest:
+    """Return the stationary rotations near some, of which nothing is known."""
+    best = _refined(L, rotations)
+    return Smallest(best, _value(L, best), -np.inf, np.inf, np.zeros((3 * len(best), 3 * len(best))), 0.0)
 
 
 def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
@@ -87,8 +107,8 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
     refined = [_refined(L, start) for start in starts]
     values = [_value(L, R) for R in refined]
     best = refined[int(np.argmin(values))]
-    bound = _bound(Q, lifted(best), min(values), moments.multipliers)
-    return Smallest(best, min(values), bound, moments.rank_ratio, _slopes(L, best)[1] / 2)
+    bound, steepness = _bound(Q, lifted(best), min(values), moments.multipliers)
+    return Smallest(best, min(values), bound, moments.rank_ratio, _slopes(L, best)[1] / 2, steepness)
 
 
 def lifted(rotations: Array) -> Array:
@@ -170,11 +190,12 @@ def _moved(L: Array, rotations: Array, step: Array, value: float) -> tuple[Array
     return rotations, value
 
 
-def _bound(Q: Array, x: Array, value: float, multipliers: Array) -> float:
-    """Return a value that no rotations undercut, from multipliers near the solver's."""
+def _bound(Q: Array, x: Array, value: float, multipliers: Array) -> tuple[float, float]:
+    """Return a value that no rotations undercut, from multipliers near the solver's, and how steeply others rise."""
     C = rotation_constraints((len(x) - 1) // 9)
     S = Q - np.tensordot(multipliers, C, axes=1)
     S[0, 0] -= value
     moves = np.linalg.lstsq((C @ x).T, S @ x, rcond=1e-12)[0]
     S = S - np.tensordot(moves, C, axes=1)
-    return value + min(0.0, float(np.linalg.eigvalsh(S)[0])) * float(x @ x)
+    eigenvalues = np.linalg.eigvalsh(S)
+    return value + min(0.0, float(eigenvalues[0])) * float(x @ x), max(0.0, float(eigenvalues[1]))
