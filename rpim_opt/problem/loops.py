@@ -72,7 +72,7 @@ class Seen:
     measured
         (N, 4, 4) in an instrument's frame.
     turned
-        (N,) whether the orientation was measured, too: of all poses of a marker, or of none.
+        (N,) whether the orientation was measured, too.
     instrument, marker
         (N,) numbers of what saw and what was seen, from 0.
     sigma

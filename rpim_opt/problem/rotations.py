@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.moments import Moments, relax, rotation_constraints
+from rpim_opt.problem.placing import proper
 
 STEPS = 50
 """Newton steps after which rotations are as good as they get."""
@@ -114,15 +115,6 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
 def lifted(rotations: Array) -> Array:
     """Return x = (1, vec R_1, ..., vec R_k), rows first."""
     return np.concatenate([[1.0], rotations.ravel()])
-
-
-def proper(M: Array) -> Array:
-    """Return the rotations nearest to M (..., 3, 3)."""
-    U, _, Vt = np.linalg.svd(M)
-    handed = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    U = U.copy()
-    U[..., :, 2] *= handed[..., None]
-    return U @ Vt
 
 
 def _value(L: Array, rotations: Array) -> float:
