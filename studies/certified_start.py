@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -50,9 +51,9 @@ def run(seed: int) -> dict[str, float | str]:
     for i in wrong:
         measured[i] = _transform(rng, np.pi, 1.0) @ measured[i]
     loss = "truncated" if share else "squares"
-    begin = time.perf_counter()
+    begin = time.process_time()
     start = ro.problem.certified_hand_eye(flange, measured, sigma=tuple(sigma), loss=loss)
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     good = np.setdiff1d(np.arange(N), wrong)
     information = _information(flange[good], measured[good], base, tool, sigma)
     own = start.bases[""], start.tools[""]
@@ -177,7 +178,7 @@ def _li(flange: Any, measured: Any) -> tuple[np.ndarray, np.ndarray]:
     for i, (A, B) in enumerate(zip(flange, measured, strict=True)):
         a = slice(12 * i, 12 * i + 9)
         b = slice(12 * i + 9, 12 * i + 12)
-        # B_R P - Z_R A_R = 0;  Z_R'y is made linear by B^-1: P'... here A_R t + A_t = Z_R'y - u
+        # B_R X_R' - Z_R A_R = 0,  Z_R'y - A_R t - u = A_t
         rows[a, :9] = -np.kron(np.eye(3), A[:3, :3].T)
         rows[a, 9:18] = np.kron(B[:3, :3], np.eye(3))
         rows[b, :9] = np.kron(B[:3, 3], np.eye(3))
@@ -219,4 +220,65 @@ def _with_translations(flange: Any, measured: Any, Z: Any, X: Any) -> tuple[np.n
 
 
 def report(rows: list[dict[str, Any]]) -> Report:
-    return Report("", {})
+    """Return how often answers are right and certified, by scene, and what that takes."""
+    metrics = {
+        "worse_than_a_closed_form": float(sum(row["cost"] > _best(row) * (1 + 1e-9) + 1e-6 for row in rows)),
+        "certified_but_wrong": float(sum(row["certified"] and not _right(row) for row in rows)),
+        "right": _share(rows, _right),
+        "certified_of_right": _share([row for row in rows if _right(row)], lambda row: bool(row["certified"])),
+    }
+    lines = []
+    for scene in SCENES:
+        for some in (False, True):
+            part = [row for row in rows if row["scene"] == scene and bool(row["outliers"]) == some]
+            if part:
+                lines.append([scene, "10 to 40 %" if some else "none", str(len(part)), *_counts(part)])
+    times = [[row["milliseconds"] for row in rows if bool(row["outliers"]) == some] for some in (False, True)]
+    clean, robust = (f"{np.median(each):.0f} ms (95 %: {np.percentile(each, 95):.0f} ms)" for each in times)
+    text = (
+        f"{len(rows)} cases: 3 to 60 poses, noise of 0.01 to 5 mm and 0.1 to 32 mrad, half of them with outliers (then "
+        "the truncated loss). An answer is right if its distance from the truth, in standard deviations of the good "
+        "poses, is one that noise has in all but one of a million cases. Turns about one axis do not determine base "
+        f"and tool. Costs above that of the best closed form: {metrics['worse_than_a_closed_form']:.0f}. Certified "
+        f"but wrong: {metrics['certified_but_wrong']:.0f}. Of the right ones "
+        f"{100 * metrics['certified_of_right']:.1f} % are certified; the others are right by chance, or so many poses "
+        f"were outliers that as many might agree with something else. Time of the processor, one thread: {clean}, with "
+        f"outliers {robust}.\n\n"
+    )
+    head = ["scene", "outliers", "cases", "right", "certified", "certified, wrong", "best closed form right"]
+    names = [f"{name}, distance" for name in CLOSED]
+    determined = [row for row in rows if row["certified"] and not row["outliers"]]
+    far = {"certified start": [_root(row["distance"]) for row in determined]}
+    far |= {name[:-10]: [_root(row[name]) for row in determined if name in row] for name in names}
+    figure = distributions(far, "distance from the truth [standard deviations], no outliers")
+    return Report(text + markdown(head, lines), metrics, {"distances": figure})
+
+
+def _root(square: float) -> float:
+    return max(float(np.sqrt(square)), 1e-3)
+
+
+def _right(row: dict[str, Any]) -> bool:
+    return row["distance"] <= RIGHT
+
+
+def _closed(row: dict[str, Any], what: str) -> list[float]:
+    """Return what closed forms have; a table of all cases says NaN where there is none."""
+    found = [float(row.get(f"{name}, {what}", np.nan)) for name in CLOSED]
+    return [each for each in found if np.isfinite(each)]
+
+
+def _best(row: dict[str, Any]) -> float:
+    return min(_closed(row, "cost"), default=np.inf)
+
+
+def _share(rows: list[dict[str, Any]], what: Callable[[dict[str, Any]], bool]) -> float:
+    return float(np.mean([what(row) for row in rows])) if rows else 1.0
+
+
+def _counts(part: list[dict[str, Any]]) -> list[str]:
+    right = [_right(row) for row in part]
+    certified = [bool(row["certified"]) for row in part]
+    wrong = [c and not r for c, r in zip(certified, right, strict=True)]
+    closed = [min(_closed(row, "distance"), default=np.inf) <= RIGHT for row in part]
+    return [str(sum(each)) for each in (right, certified, wrong, closed)]

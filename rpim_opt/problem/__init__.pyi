@@ -1,4 +1,3 @@
-from .certified import CertifiedStart as CertifiedStart
 from .certified import certified_hand_eye as certified_hand_eye
 from .certified import certified_motions as certified_motions
 from .design import Design as Design
@@ -20,3 +19,4 @@ from .placing import tool_from_distances as tool_from_distances
 from .problem import CalibrationProblem as CalibrationProblem
 from .scatter import Scatter as Scatter
 from .source import Source as Source
+from .verdict import CertifiedStart as CertifiedStart

@@ -25,6 +25,8 @@ from rpim_opt.robot.mdh import Robot
 
 ENOUGH = 2000
 """Rows of a measurement from which frames are placed, where there are more."""
+FREE = 0.1
+"""Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
 MOST_TURNING = 2
 """Markers whose orientations place the base, where more turn: those of the others follow from the base."""
 
@@ -63,7 +65,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
 
 def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
     """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
-    from rpim_opt.problem.certified import UNKNOWN, certified_hand_eye  # CVXPY waits until a base is located
+    from rpim_opt.problem.certified import certified_hand_eye  # CVXPY waits until a base is located
 
     turning = _turning(seen)
     sigma = np.concatenate([_deviations(block) for block in seen])
@@ -75,7 +77,7 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
         expected=places,
         spread=TOOL_ERROR,
     )
-    if start.uncertainty > UNKNOWN:
+    if start.uncertainty > FREE:
         raise InputError("the data", start.reason, "turns about two axes")
     base = start.bases[""]
     found = {marker: place.copy() for marker, place in places.items()}

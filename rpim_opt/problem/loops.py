@@ -1,15 +1,18 @@
-"""Closed loops of base, flange, tool and instrument, linear in the entries of rotations, in translations and a scale."""
+"""Closed loops of base, flange, tool and instrument, linear in rotations' entries, translations and a scale."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 
 RIDGE = 1e-6
-"""A translation that the loops do not show stays where it is expected: in units of their size, a loop's part in this."""
+"""How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
+SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +47,24 @@ class Loops:
         n = self.rows.shape[2]
         rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
         stacked = np.vstack([rows, self.prior, np.zeros((n, n))])
-        return np.linalg.qr(stacked, mode="r")
+        return np.asarray(np.linalg.qr(stacked, mode="r"))
 
     def squares(self, v: Array) -> Array:
         """Return |J_i v|^2 (N,)."""
-        return np.sum((self.rows @ v) ** 2, axis=1)
+        return np.asarray(np.sum((self.rows @ v) ** 2, axis=1))
 
     def form(self, triangle: Array) -> Array:
         """Return L (n-linear, n-linear), with |L x|^2 the least over translations and scale (a Schur complement)."""
+        pivots = np.abs(np.diag(triangle)[: self.linear])
+        if pivots.min() <= SINGULAR * pivots.max():
+            raise InputError("poses", "places that do not determine translations and scale", "places that differ")
         return triangle[self.linear :, self.linear :]
 
     def completed(self, triangle: Array, x: Array) -> Array:
         """Return v (n,) with the translations and the scale that are best for x."""
         T = triangle[: self.linear]
-        y = np.linalg.solve(T[:, : self.linear], -T[:, self.linear :] @ x)
-        return np.concatenate([y, x])
+        y = solve_triangular(T[:, : self.linear], -T[:, self.linear :] @ x)
+        return np.concatenate([np.asarray(y, dtype=float), x])
 
 
 @dataclass(frozen=True, eq=False)
