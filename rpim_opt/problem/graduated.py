@@ -95,7 +95,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
 def _weighted(loops: Loops, weights: Array, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     """Return the solution of a weighted sum of squares, by the relaxation."""
     triangle = loops.triangle(weights)
-    return _solved(loops, weights, loss, triangle, smallest(loops.form(triangle), candidates))
+    return _solved(loops, weights, loss, triangle, smallest(loops.form(triangle), candidates, loops.shared))
 
 
 def _followed(loops: Loops, weights: Array, loss: str, solved: Solved) -> Solved:

@@ -27,7 +27,7 @@ ENOUGH = 2000
 """Rows of a measurement from which frames are placed, where there are more."""
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
-MOST_TURNING = 2
+MOST_TURNING = 4
 """Markers whose orientations place the base, where more turn: those of the others follow from the base."""
 
 
@@ -94,7 +94,7 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
 
 
 def _turning(seen: Sequence[Block]) -> set[str]:
-    """Return the markers whose orientations count: of the two with the most, for each makes the relaxation larger."""
+    """Return the markers whose orientations count: of those with the most, for each makes the relaxation larger."""
     poses = [block for block in seen if block.measurement.name == "pose"]
     poses.sort(key=lambda block: -len(block.row))
     return {block.markers[0] for block in poses[:MOST_TURNING]}

@@ -29,12 +29,15 @@ class Loops:
         How many of the n are translations and the scale: they are eliminated exactly.
     freedom
         (N,) degrees of freedom of a measurement: 3 for a position, 6 for a pose.
+    shared
+        How many of the rotations, the first ones, others have products with; the others have none among themselves.
     """
 
     rows: Array
     prior: Array
     linear: int
     freedom: Array
+    shared: int
 
     @property
     def unknowns(self) -> int:
@@ -142,7 +145,7 @@ def of_poses(seen: Seen, scaled: bool) -> Loops:
         J[at, 3:, last[at] + k] = of_tool[at, :, k] * angles[at, None]
     weak = RIDGE * float(np.sqrt(np.sum(lengths**2)))
     prior = _expected(seen.expected, max(1 / seen.spread, weak), robot, J.shape[2])
-    return Loops(J, prior, linear, np.where(seen.turned, 6, 3))
+    return Loops(J, prior, linear, np.where(seen.turned, 6, 3), bases)
 
 
 def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float, scaled: bool) -> Loops:
@@ -170,7 +173,7 @@ def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float,
     J[:, 3:] /= np.sqrt(2) * sigma[:, 1, None, None]
     weak = RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2)))
     prior = _expected(expected[None], max(1 / spread, weak), robot, J.shape[2])
-    return Loops(J, prior, linear, np.full(N, 6))
+    return Loops(J, prior, linear, np.full(N, 6), 1)
 
 
 def _expected(points: Array, certainty: float, robot: int, n: int) -> Array:

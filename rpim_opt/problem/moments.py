@@ -1,48 +1,16 @@
-"""Quadratic forms of rotations, relaxed to moment matrices: the definition in CVXPY, its minimum by Clarabel."""
+"""Quadratic forms of rotations, relaxed to moment matrices: the definition in CVXPY."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import clarabel as clarabel_module
 import cvxpy as cp
 import numpy as np
-from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
-from scipy import sparse
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.phases import phase
-
-clarabel: Any = clarabel_module  # a compiled module, without types
-SOUGHT = 1e-11
-"""Tolerance of gap and feasibility that Clarabel goes on to while it makes progress; the form is of size one."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """What the relaxation says.
-
-    Parameters
-    ----------
-    matrix
-        (n, n) moment matrix; of rank one where it is x x' of rotations.
-    multipliers
-        (c,) of the constraints of `rotation_constraints`.
-    status
-        Clarabel's word.
-    """
-
-    matrix: Array
-    multipliers: Array
-    status: str
-
-    @property
-    def rank_ratio(self) -> float:
-        """Second eigenvalue of the moment matrix over its first: zero where it is of rank one."""
-        eigenvalues = np.linalg.eigvalsh(self.matrix)
-        return float(abs(eigenvalues[-2]) / eigenvalues[-1])
 
 
 @lru_cache
@@ -95,101 +63,81 @@ class Relaxation:
     For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
     constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
     M_00 = 1 and <C_j, M> = 0.
-    """
 
-    problem: cp.Problem
-    form: cp.Parameter
-    bound: cp.Variable
-    multipliers: cp.Variable
-    constraint: Any
-
-
-def relaxation(count: int) -> Relaxation:
-    """Return the definition for so many rotations, its form Q a parameter."""
-    C = rotation_constraints(count)
-    n = C.shape[1]
-    form = cp.Parameter((n, n), symmetric=True)
-    bound = cp.Variable()
-    multipliers = cp.Variable(len(C))
-    first = np.zeros((n, n))
-    first[0, 0] = 1.0
-    combined = cp.reshape(C.reshape(len(C), -1).T @ multipliers, (n, n), order="C")
-    constraint = form - bound * first - combined >> 0
-    return Relaxation(cp.Problem(cp.Maximize(bound), [constraint]), form, bound, multipliers, constraint)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cone:
-    """The relaxation in Clarabel's form, which CVXPY made once: only b is of the form Q, and is its triangle."""
-
-    A: Any
-    q: Array
-    cones: Any
-    columns: slice
-    upper: tuple[np.ndarray, np.ndarray]
-    root: Array
-
-    def triangle(self, Q: Array) -> Array:
-        """Return the upper triangle column by column, what is off the diagonal times the root of two."""
-        return Q[self.upper] * self.root
-
-    def matrix(self, triangle: Array) -> Array:
-        """Return the symmetric matrix of a triangle."""
-        n = self.upper[1][-1] + 1
-        M = np.zeros((n, n))
-        M[self.upper] = triangle / self.root
-        return M + np.triu(M, 1).T
-
-
-@lru_cache
-def _cone(count: int) -> _Cone:
-    stated = relaxation(count)
-    n = stated.form.shape[0]
-    stated.form.value = np.eye(n)
-    data = stated.problem.get_problem_data(cp.CLARABEL, solver_opts={})[0]
-    start = data["param_prob"].var_id_to_col[stated.multipliers.id]
-    columns, rows = np.tril_indices(n)
-    root = np.where(rows == columns, 1.0, np.sqrt(2))
-    A = sparse.csc_matrix(data["A"])
-    own = slice(start, start + stated.multipliers.size)
-    return _Cone(A, data["c"], dims_to_solver_cones(data["dims"]), own, (rows, columns), root)
-
-
-def relax(Q: Array) -> Moments:
-    """Return the moment matrix and the multipliers of the relaxation of min x'Q x.
+    Where Q has no products of some rotations (tools seen by the same cameras), the left side is the sum of positive
+    semidefinite parts, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler et
+    al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
 
     Parameters
     ----------
-    Q
-        (n, n) symmetric, n = 1 + 9 k for k rotations.
-
-    Examples
-    --------
-    The rotation with the largest trace is none at all.
-
-    >>> import numpy as np
-    >>> from rpim_opt.problem.moments import relax
-    >>> Q = np.zeros((10, 10))
-    >>> Q[0, [1, 5, 9]] = Q[[1, 5, 9], 0] = -0.5
-    >>> found = relax(Q)
-    >>> found.matrix[0, 1:].reshape(3, 3).round(6) + 0.0
-    array([[1., 0., 0.],
-           [0., 1., 0.],
-           [0., 0., 1.]])
+    problem
+        As above.
+    places
+        Of each part among the n.
+    forms
+        Each part's share of Q; products of what is shared stand in the last.
+    bound, multipliers
+        The unknowns.
+    constraints
+        One for each part.
     """
-    cone = _cone((len(Q) - 1) // 9)
-    size = float(np.abs(Q).max()) or 1.0
-    P = sparse.csc_matrix((len(cone.q), len(cone.q)))
-    with phase("solve"):
-        b = cone.triangle(Q / size)
-        found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings()).solve()
-    return Moments(cone.matrix(np.array(found.z)), size * np.array(found.x)[cone.columns], str(found.status))
+
+    problem: cp.Problem
+    places: tuple[np.ndarray, ...]
+    forms: tuple[cp.Parameter, ...]
+    bound: cp.Variable
+    multipliers: cp.Variable
+    constraints: tuple[Any, ...]
+
+    def state(self, Q: Array) -> None:
+        """Give the parameters the values of a form."""
+        for form, share in zip(self.forms, shares(Q, self.places), strict=True):
+            form.value = share
 
 
-@lru_cache
-def _settings() -> Any:
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.max_threads = 1
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = SOUGHT
-    return settings
+def _places(count: int, shared: int) -> tuple[np.ndarray, ...]:
+    """Return the places of every part: of 1, the shared rotations and one of the others."""
+    common = np.arange(1 + 9 * shared)
+    own = [np.arange(1 + 9 * k, 10 + 9 * k) for k in range(shared, count)]
+    return tuple(np.concatenate([common, each]) for each in own) or (common,)
+
+
+def shares(Q: Array, places: Sequence[np.ndarray]) -> list[Array]:
+    """Return each part's share of a form."""
+    common = np.intersect1d(places[0], places[-1])
+    parts = [Q[np.ix_(place, place)] for place in places]
+    for part in parts[:-1]:
+        part[: len(common), : len(common)] = 0.0
+    return parts
+
+
+def relaxation(count: int, shared: int) -> Relaxation:
+    """Return the definition for so many rotations, of which the first are shared by all others."""
+    places = _places(count, shared)
+    bound = cp.Variable()
+    multipliers = cp.Variable(20 * count)
+    common = 1 + 9 * shared
+    moved = [cp.Variable((common, common), symmetric=True) for _ in places[1:]]
+    first = np.zeros((common, common))
+    first[0, 0] = 1.0
+    last = -bound * first  # of what is shared, the last part has what the others leave
+    for each in moved:
+        last = last - each
+    forms = tuple(cp.Parameter((len(place), len(place)), symmetric=True) for place in places)
+    constraints = []
+    for place, form, corner in zip(places, forms, [*moved, last], strict=True):
+        border = np.eye(len(place))[:, :common]
+        own = _own_constraints(place, count, shared, corner is last)
+        C = rotation_constraints(count)[np.ix_(own, place, place)].reshape(len(own), -1)
+        combined = cp.reshape(C.T @ multipliers[own], form.shape, order="C")
+        constraints.append(form + border @ corner @ border.T - combined >> 0)
+    problem = cp.Problem(cp.Maximize(bound), constraints)
+    return Relaxation(problem, places, forms, bound, multipliers, tuple(constraints))
+
+
+def _own_constraints(place: np.ndarray, count: int, shared: int, last: bool) -> np.ndarray:
+    """Return which constraints are a part's: of its own rotation, and in the last of those that are shared."""
+    rotations = [*range(shared)] if last else []
+    if len(place) > 1 + 9 * shared:
+        rotations.append(int(place[-1]) // 9 - 1)
+    return (20 * np.array(rotations)[:, None] + np.arange(20)).ravel()

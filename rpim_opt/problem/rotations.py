@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.moments import Moments, relax, rotation_constraints
+from rpim_opt.problem.moments import rotation_constraints
 from rpim_opt.problem.placing import proper
+from rpim_opt.problem.relaxed import Moments, relax
 
 STEPS = 50
 """Newton steps after which rotations are as good as they get."""
@@ -74,7 +75,7 @@ def nearest(L: Array, rotations: Array) -> Smallest:
     return Smallest(best, _value(L, best), -np.inf, np.inf, np.zeros((3 * len(best), 3 * len(best))), 0.0)
 
 
-def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
+def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = None) -> Smallest:
     """Return the best of what the relaxation and candidates (k, 3, 3) lead to, with the relaxation's bound.
 
     ::
@@ -91,6 +92,8 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
         (m, n), n = 1 + 9 k.
     candidates
         Further rotations to start from.
+    shared
+        As `relax` has it.
 
     Examples
     --------
@@ -103,7 +106,7 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
     (True, True)
     """
     Q = L.T @ L
-    moments = relax(Q)
+    moments = relax(Q, shared)
     starts = [*_rounded(moments), *candidates]
     refined = [_refined(L, start) for start in starts]
     values = [_value(L, R) for R in refined]

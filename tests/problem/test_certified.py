@@ -10,8 +10,9 @@ from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.problem.located import locate
-from rpim_opt.problem.moments import relax, relaxation, rotation_constraints
+from rpim_opt.problem.moments import relaxation, rotation_constraints
 from rpim_opt.problem.placing import hand_eye, transforms
+from rpim_opt.problem.relaxed import relax
 from rpim_opt.problem.rotations import lifted, smallest
 from rpim_opt.study.grid import find_study, load_study
 from tests import SHARED
@@ -59,20 +60,39 @@ def test_the_constraints_are_all_that_rotations_obey(count: int) -> None:
     assert np.linalg.matrix_rank(C.reshape(len(C), -1)) == len(C) == 20 * count == vanishing
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_solver_is_given_what_is_stated(count: int) -> None:
-    rng = np.random.default_rng(count)
+def form(rng: np.random.Generator, count: int, shared: int) -> np.ndarray:
+    """Return a form of which rotations that are not shared have no products."""
     M = rng.normal(size=(1 + 9 * count, 1 + 9 * count))
     Q = M + M.T
-    stated = relaxation(count)
-    stated.form.value = Q
+    for i in range(shared, count):
+        for j in range(shared, count):
+            if i != j:
+                Q[1 + 9 * i : 10 + 9 * i, 1 + 9 * j : 10 + 9 * j] = 0.0
+    return Q
+
+
+@pytest.mark.parametrize(("count", "shared"), [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 1)])
+def test_the_solver_is_given_what_is_stated(count: int, shared: int) -> None:
+    Q = form(np.random.default_rng(count), count, shared)
+    stated = relaxation(count, shared)
+    stated.state(Q)
     stated.problem.solve(solver=cp.CLARABEL)
-    found = relax(Q)
-    assert np.sum(Q * found.matrix) == pytest.approx(stated.bound.value, abs=1e-6)
-    assert np.abs(found.matrix - stated.constraint.dual_value).max() < 1e-4
+    found = relax(Q, shared)
+    assert np.sum(Q * found.matrix) == pytest.approx(stated.bound.value, abs=1e-5)
+    for constraint, place in zip(stated.constraints, stated.places, strict=True):
+        assert np.abs(found.matrix[np.ix_(place, place)] - constraint.dual_value).max() < 1e-3
     S = Q - np.tensordot(found.multipliers, rotation_constraints(count), axes=1)
     S[0, 0] -= stated.bound.value
-    assert np.linalg.eigvalsh(S)[0] > -1e-6
+    assert np.linalg.eigvalsh(S)[0] > -1e-5
+    assert np.linalg.eigvalsh(found.matrix)[0] > -1e-6
+
+
+@pytest.mark.parametrize(("count", "shared"), [(3, 1), (4, 1), (4, 2)])
+def test_parts_say_as_much_as_the_whole(count: int, shared: int) -> None:
+    Q = form(np.random.default_rng(10 + count), count, shared)
+    whole = relax(Q)
+    parts = relax(Q, shared)
+    assert np.sum(Q * parts.matrix) == pytest.approx(np.sum(Q * whole.matrix), rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(6))
