@@ -64,9 +64,9 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
         huber      r^2,  2 c r - c^2 beyond c             c^2 a quantile of chi-squared
         truncated  min(r^2, c^2)
 
-    Huber's loss by repeated weights c / r. The truncated loss by graduated non-convexity, from one that is nearly a
-    square (Yang et al. 2020, IEEE RA-L 5:1127), every weighted problem by the relaxation; then once more from the
-    candidates, so that none of them is better.
+    From the relaxation's optimum of the squares Huber's loss follows repeated weights c / r, and the truncated loss
+    graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127), by Newton's steps; the last weighted problem is the
+    relaxation's again. The truncated loss is followed from the candidates, too, so that none of them is better.
 
     Parameters
     ----------

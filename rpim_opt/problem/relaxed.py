@@ -17,8 +17,8 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.problem.moments import relaxation, shares
 
 clarabel: Any = clarabel_module  # a compiled module, without types
-SOUGHT = 1e-11
-"""Tolerance of gap and feasibility that Clarabel goes on to while it makes progress; the form is of size one."""
+SOUGHT = 1e-8
+"""Tolerance of gap and feasibility, the form being of size one: what follows refines rotations and multipliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,5 +142,6 @@ def _settings() -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
+    settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = SOUGHT
     return settings
