@@ -23,7 +23,8 @@ FLOORS: dict[str, set[str]] = {
     "robot": {"casadi", "pydantic"},
     # casadi: what an instrument sees is differentiated; table libraries are loaded by name in basics.tables
     "data": {"casadi"},
-    "problem": {"casadi"},
+    # clarabel, cvxpy: where a problem starts is the optimum of a relaxation, of which the programs above know nothing
+    "problem": {"casadi", "clarabel", "cvxpy"},
     "convex": {"clarabel", "cvxpy"},
     # casadi: a reflector's transform is a measurement, too; cvxpy: whether the loss is a sum of squares
     "calibration": {"casadi", "cvxpy"},

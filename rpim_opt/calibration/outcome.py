@@ -58,8 +58,8 @@ class Iteration:
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
     >>> for passed in result.history[:2]:
     ...     print(f"{passed.objective:.3f} {passed.step:.2f} {passed.weight:g} {passed.damping:g}")
-    111.445 3.57 1 0
-    109.557 0.32 1 0
+    111.417 3.57 1 0
+    109.557 0.31 1 0
     """
 
     objective: float

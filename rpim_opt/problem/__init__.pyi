@@ -1,3 +1,5 @@
+from .certified import certified_hand_eye as certified_hand_eye
+from .certified import certified_motions as certified_motions
 from .design import Design as Design
 from .design import choose as choose
 from .design import random_candidates as random_candidates
@@ -18,3 +20,4 @@ from .problem import CalibrationProblem as CalibrationProblem
 from .scatter import Scatter as Scatter
 from .several import together as together
 from .source import Source as Source
+from .verdict import CertifiedStart as CertifiedStart

@@ -12,8 +12,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.located import locate
 from rpim_opt.problem.parts import in_parts
-from rpim_opt.problem.placing import NOMINAL_ERROR, Place, locate
+from rpim_opt.problem.placing import NOMINAL_ERROR, Place
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.mdh import Robot
@@ -70,7 +71,7 @@ def starting_parameters(
     _require_reflectors(data, tools)
     places: dict[str, Place] = dict(tools)
     if base is None:
-        place, located = locate(robot, data, tools)
+        place, located, _ = locate(robot, data, tools)
         places |= {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
     for block in data.blocks:
@@ -128,7 +129,7 @@ def relocated(problem: Source) -> Source | None:
         at[tool_prefix(block.markers[0])] = [index[tool_prefix(block.markers[0]) + c] for c in FRAME]
     tools = {b.markers[0]: p.nominal[at[tool_prefix(b.markers[0])]] for b in data.blocks}
     try:
-        base, places = locate(problem.robot, data, tools)
+        base, places, _ = locate(problem.robot, data, tools)
     except InputError:
         return None
     found = {"base_": base} | {tool_prefix(b.markers[0]): places[b.markers[0]] for b in data.blocks}

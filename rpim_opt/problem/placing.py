@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -10,14 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Dataset
-from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers
-from rpim_opt.robot.mdh import Robot
 
 Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
-ENOUGH = 2000
-"""Rows of a measurement from which frames are placed, where there are more."""
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
 """What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
 
@@ -161,7 +156,7 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
     sign = 1.0 if np.linalg.det(V) > 0 else -1.0
     Z, X = np.eye(4), np.eye(4)
-    Z[:3, :3], X[:3, :3] = _proper(sign * V), _proper(sign * W).T
+    Z[:3, :3], X[:3, :3] = proper(sign * V), proper(sign * W).T
     A = np.concatenate([np.hstack([Z[:3, :3] @ R, np.eye(3)]) for R in RA])
     o = np.asarray(start, dtype=float)
     b = measured[:, :3, 3] - (flange[:, :3, 3] + RA @ o) @ Z[:3, :3].T
@@ -170,51 +165,13 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     return Z, X
 
 
-def _proper(M: Array) -> Array:
-    """Return the rotation nearest to M."""
+def proper(M: Array) -> Array:
+    """Return the rotations nearest to M (..., 3, 3)."""
     U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
-
-
-def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array]]:
-    """Return the base (6,) and the reflectors (6,) by marker, from positions and poses on the nominal robot.
-
-    Poses give both by `hand_eye`. Otherwise distances correct the reflectors and registration places the base.
-
-    Raises
-    ------
-    InputError
-        When there are no positions and no poses, or they do not determine the base.
-    """
-    seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
-    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
-    if not seen:
-        raise InputError("key base", '"auto" without positions or poses', "a table [base]")
-    places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
-    source, target, weight = [], [], []
-    for block in seen:
-        flange, marker = forward_kinematics(robot, block.q[:, 0]), block.markers[0]
-        if block.measurement.name == "pose":
-            try:
-                base, tool = hand_eye(flange, transforms(block.y), places[marker][:3])
-            except InputError:
-                pass  # too few turns: positions and the stated tool have to do
-            else:
-                places[marker] = frame_numbers(tool)
-                return frame_numbers(base), places
-        if len(flange) > 3:
-            places[marker][:3] = tool_from_distances(flange, block.y[:, :3], places[marker][:3], TOOL_ERROR)
-        source.append(flange[:, :3, :3] @ places[marker][:3] + flange[:, :3, 3])
-        target.append(block.y[:, :3])
-        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
-        weight.append(1 / np.broadcast_to(variance, len(flange)))
-    q = np.concatenate(weight)
-    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), places
-
-
-def _spread(count: int) -> np.ndarray:
-    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
+    handed = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    U = U.copy()
+    U[..., :, 2] *= handed[..., None]
+    return U @ Vt
 
 
 def transforms(y: Array) -> Array:

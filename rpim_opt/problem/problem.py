@@ -356,7 +356,7 @@ class CalibrationProblem:
         >>> problem = ro.load("pose").problem
         >>> nominal = np.zeros(len(problem.parameters.free))
         >>> [f"{1e3 * problem.errors(nominal, dimension).mean():.2f}" for dimension in ("length", "angle")]  # mm, mrad
-        ['15.01', '7.09']
+        ['15.00', '7.07']
         """
         errors = np.full(len(self.data), np.nan)
         for block in self.data.blocks:

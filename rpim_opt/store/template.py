@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.problem.frames import starting_parameters
-from rpim_opt.problem.placing import locate
+from rpim_opt.problem.located import locate
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH
@@ -114,12 +114,13 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array]) -> tuple[Ar
     """Return the base to state, None for registration, and why."""
     if not {block.measurement.name for block in rows.blocks} & {"position", "pose"}:
         return arm.base, "As the robot's file has it: these measurements do not depend on it."
-    found = locate(arm.robot, rows, tools)[0]
+    found, _, verdict = locate(arm.robot, rows, tools)
     if same_place(found, arm.base):
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
-    return None, f"Guessed: the data put the base at {placed(found)}, so the instrument has a frame of its own."
+    how = f"Guessed: the data put the base at {placed(found)}, so the instrument has a frame of its own ({verdict})."
+    return None, how
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:

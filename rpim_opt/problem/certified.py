@@ -1,0 +1,236 @@
+"""Base and tool of poses, positions or motions: the optimum of a relaxation, with its proof."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.problem.graduated import LOSSES, Solved, solve
+from rpim_opt.problem.loops import Seen, of_motions, of_poses
+from rpim_opt.problem.placing import NOMINAL_ERROR, Place, hand_eye
+from rpim_opt.problem.verdict import CertifiedStart, judged
+
+
+@one_blas_thread
+def certified_hand_eye(
+    flange: Array,
+    measured: Array,
+    *,
+    marker: Sequence[str] | None = None,
+    instrument: Sequence[str] | None = None,
+    sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
+    expected: Mapping[str, Place] | None = None,
+    spread: float = np.inf,
+    scaled: bool = False,
+    loss: str = "squares",
+) -> CertifiedStart:
+    """Return bases Z and tools X of A X = Z B, measured_i = Z flange_i X, with a proof that none are better.
+
+    ::
+
+        minimize  sum_i loss(|r_i|),   |r_i|^2 = |Z_R'y_i - A_R,i t - A_t,i - u|^2 / sigma_position^2
+                                               + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
+
+    over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t of several instruments and markers, all at once. The
+    translations are eliminated exactly; the rotations are relaxed to a moment matrix (`moments.Relaxation`).
+
+    Parameters
+    ----------
+    flange
+        (N, 4, 4) transforms of the flange in the robot's base [m].
+    measured
+        (N, 4, 4) of the tool in the instrument's frame; or positions (N, 3), whose loops end with r's first part.
+        A pose without orientation has NaN for its rotation.
+    marker, instrument
+        (N,) names of what was seen (reflector, target) and by what (camera); by default one of each.
+    sigma
+        Standard deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of
+        the robot, which is not as its drawing says.
+    expected, spread
+        (3,) where markers are in the flange frame [m], and the standard deviation of that [m]. A direction that the
+        measurements do not show stays there in any case.
+    scaled
+        Whether the unit of the instrument's lengths is unknown.
+    loss
+        "squares", "huber" or "truncated", which leaves out what is wrong.
+
+    Raises
+    ------
+    InputError
+        For fewer than three measurements, and what is no transform.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
+    >>> base, tool = np.eye(4), np.eye(4)
+    >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
+    >>> seen = base @ flange @ tool
+    >>> seen[0, 0, 3] += 0.5  # one of them is wrong
+    >>> start = ro.problem.certified_hand_eye(flange, seen, loss="truncated")
+    >>> bool(np.abs(start.bases[""] - base).max() < 1e-6), bool(np.abs(start.tools[""] - tool).max() < 1e-6)
+    (True, True)
+    >>> start.certified, int(np.sum(start.weights == 0))
+    (True, 1)
+    """
+    flange, measured, turned = _checked(flange, measured, loss)
+    N = len(flange)
+    markers, which = _numbered(marker, N, "marker")
+    instruments, where = _numbered(instrument, N, "instrument")
+    places = np.array([np.asarray((expected or {}).get(name, (0, 0, 0)), dtype=float)[:3] for name in markers])
+    seen = Seen(flange, measured, turned, where, which, _deviations(sigma, N), places, spread)
+    loops = of_poses(seen, scaled)
+    simple = len(markers) == len(instruments) == 1 and turned.all()
+    solved = solve(loops, loss, _closed_form(flange, measured) if simple else [])
+    bases, tools, scale = _frames(solved, seen, loops.linear, scaled)
+    named = dict(zip(instruments, bases, strict=True)), dict(zip(markers, tools, strict=True))
+    return judged(solved, loops, named, scale)
+
+
+@one_blas_thread
+def certified_motions(
+    A: Array,
+    B: Array,
+    *,
+    sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
+    expected: Place = (0, 0, 0),
+    spread: float = np.inf,
+    scaled: bool = False,
+    loss: str = "squares",
+) -> CertifiedStart:
+    """Return the tool X of A X = X B, motions of the flange and of what is on it, with a proof that none is better.
+
+    ::
+
+        minimize  sum_i loss(|r_i|),   |r_i|^2 = |X_R B_t,i - A_R,i t + t - A_t,i|^2 / sigma_position^2
+                                               + |A_R,i X_R - X_R B_R,i|^2 / (2 sigma_orientation^2)
+
+    Parameters
+    ----------
+    A
+        (N, 4, 4) motions of the flange, flange_i^-1 flange_j [m].
+    B
+        (N, 4, 4) motions of the tool or camera in its own frame.
+    sigma
+        Standard deviations of a motion's translation [m] and rotation [rad], each a number or (N,).
+    expected, spread
+        (3,) where the tool is in the flange frame [m], and the standard deviation of that [m].
+    scaled
+        Whether the unit of lengths in B is unknown (a single camera).
+    loss
+        "squares", "huber" or "truncated".
+
+    Raises
+    ------
+    InputError
+        For fewer than two motions, and what is no transform.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
+    >>> tool = np.eye(4)
+    >>> tool[:3, 3] = [0.0, 0.02, 0.06]
+    >>> A = np.linalg.inv(flange[:-1]) @ flange[1:]
+    >>> B = np.linalg.inv(tool) @ A @ tool
+    >>> B[:, :3, 3] *= 20  # in units of five centimetres
+    >>> start = ro.problem.certified_motions(A, B, scaled=True)
+    >>> bool(np.abs(start.tools[""] - tool).max() < 1e-6), round(start.scale, 9)
+    (True, 0.05)
+    """
+    A, B, turned = _checked(A, B, loss, 2)
+    if not turned.all():
+        raise InputError("B", "motions without a rotation", "rotations of all motions")
+    place = np.asarray(expected, dtype=float)
+    loops = of_motions(A, B, _deviations(sigma, len(A)), place, spread, scaled)
+    solved = solve(loops, loss)
+    scale = 1 / solved.v[3] if scaled else 1.0
+    tool = _transform(solved.smallest.rotations[0], solved.v[:3] * scale)
+    return judged(solved, loops, ({}, {"": tool}), scale)
+
+
+def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tuple[Array, Array, np.ndarray]:
+    """Return transforms and which were measured to turn; refuse what is none."""
+    flange = np.asarray(flange, dtype=float)
+    measured = np.asarray(measured, dtype=float)
+    N = len(flange)
+    if loss not in LOSSES:
+        raise InputError("loss", repr(loss), ", ".join(LOSSES))
+    if flange.shape != (N, 4, 4) or measured.shape not in ((N, 4, 4), (N, 3)):
+        raise InputError(
+            "transforms", f"shapes {flange.shape}, {measured.shape}", "(N, 4, 4) both, or positions (N, 3)"
+        )
+    if fewest > N:
+        raise InputError("poses", f"{N}", f"{fewest} or more")
+    points = measured if measured.ndim == 2 else measured[:, :3, 3]
+    poses = np.tile(np.eye(4), (N, 1, 1))
+    poses[:, :3, 3] = points
+    turned = np.zeros(N, dtype=bool)
+    if measured.ndim == 3:
+        turned = np.asarray(~np.isnan(measured[:, :3, :3]).any(axis=(1, 2)))
+        poses[turned] = measured[turned]
+    if not (np.isfinite(flange).all() and np.isfinite(poses).all()):
+        raise InputError("transforms", "numbers that are not finite", "finite numbers")
+    for R in (flange[:, :3, :3], poses[:, :3, :3]):
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
+        if len(wrong):
+            raise InputError(
+                f"pose {wrong[0] + 1}", f"a matrix that misses R R' = 1 by {off[wrong[0]]:.2g}", "a rotation"
+            )
+    return flange, poses, turned
+
+
+def _numbered(names: Sequence[str] | None, N: int, what: str) -> tuple[list[str], np.ndarray]:
+    if names is None:
+        return [""], np.zeros(N, dtype=int)
+    if len(names) != N:
+        raise InputError(what, f"{len(names)} names", f"one for each of {N} poses")
+    known, number = np.unique(np.asarray(names, dtype=str), return_inverse=True)
+    return known.tolist(), number
+
+
+def _deviations(sigma: tuple[float | Array, float | Array], N: int) -> Array:
+    both = np.stack([np.broadcast_to(np.asarray(each, dtype=float), N) for each in sigma], axis=1)
+    if not (np.isfinite(both).all() and (both > 0).all()):
+        raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
+    return both
+
+
+def _closed_form(flange: Array, measured: Array) -> list[Array]:
+    """Return the closed form's rotations (2, 3, 3), if there is one."""
+    try:
+        Z, X = hand_eye(flange, measured)
+    except InputError:
+        return []
+    return [np.stack([Z[:3, :3], X[:3, :3].T])]
+
+
+def _frames(solved: Solved, seen: Seen, linear: int, scaled: bool) -> tuple[list[Array], list[Array], float]:
+    """Return bases, tools and the scale of `loops.of_poses`."""
+    v = solved.v
+    R = solved.smallest.rotations
+    tools = len(seen.expected)
+    scale = 1 / v[linear - 1] if scaled else 1.0
+    bases = (linear - scaled) // 3 - tools
+    turning = np.unique(seen.marker[seen.turned]).tolist()
+    turns = {k: R[bases + i].T for i, k in enumerate(turning)}
+    t = v[: linear - scaled].reshape(-1, 3) * scale
+    Z = [_transform(R[i], R[i] @ t[tools + i]) for i in range(bases)]
+    X = [_transform(turns.get(k, np.eye(3)), t[k]) for k in range(tools)]
+    return Z, X, scale
+
+
+def _transform(R: Array, t: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T

@@ -1,0 +1,151 @@
+"""Where the data put base and reflectors on the nominal robot: by the certified start, else by closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.problem.placing import (
+    NOMINAL_ERROR,
+    TOOL_ERROR,
+    Place,
+    hand_eye,
+    proper,
+    register,
+    tool_from_distances,
+    transforms,
+)
+from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers
+from rpim_opt.robot.mdh import Robot
+
+ENOUGH = 2000
+"""Rows of a measurement from which frames are placed, where there are more."""
+FREE = 0.1
+"""Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
+MOST_TURNING = 4
+"""Markers whose orientations place the base, where more turn: those of the others follow from the base."""
+
+
+class Located(NamedTuple):
+    """Where base (6,) and reflectors (6,) by marker are [m, rad], and how that was found, in a sentence."""
+
+    base: Array
+    tools: dict[str, Array]
+    how: str
+
+
+def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
+    """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
+
+    All of them together by `certified_hand_eye`. Where the rotations are not determined by that, closed forms say what
+    they can: poses by `hand_eye`; of positions, distances correct the reflectors and registration places the base.
+
+    Raises
+    ------
+    InputError
+        When there are no positions and no poses, or they do not determine the base.
+    """
+    seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
+    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
+    if not seen:
+        raise InputError("key base", '"auto" without positions or poses', "a table [base]")
+    places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
+    flanges = [forward_kinematics(robot, block.q[:, 0]) for block in seen]
+    try:
+        return _certified(seen, flanges, places)
+    except InputError as error:
+        base, found = _closed_forms(seen, flanges, places)
+        return Located(base, found, f"by closed forms: {error.found}")
+
+
+def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
+    """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
+    from rpim_opt.problem.certified import certified_hand_eye  # CVXPY waits until a base is located
+
+    turning = _turning(seen)
+    sigma = np.concatenate([_deviations(block) for block in seen])
+    start = certified_hand_eye(
+        np.concatenate(flanges),
+        np.concatenate([_measured(block, block.markers[0] in turning) for block in seen]),
+        marker=[block.markers[0] for block in seen for _ in block.row],
+        sigma=(sigma[:, 0], sigma[:, 1]),
+        expected=places,
+        spread=TOOL_ERROR,
+    )
+    if start.uncertainty > FREE:
+        raise InputError("the data", start.reason, "turns about two axes")
+    base = start.bases[""]
+    found = {marker: place.copy() for marker, place in places.items()}
+    for block, flange in zip(seen, flanges, strict=True):
+        tool = start.tools[block.markers[0]]
+        if block.measurement.name == "pose":
+            turned = (base @ flange)[:, :3, :3].transpose(0, 2, 1) @ transforms(block.y)[:, :3, :3]
+            tool[:3, :3] = proper(turned.sum(axis=0))
+            found[block.markers[0]] = frame_numbers(tool)
+        else:
+            found[block.markers[0]][:3] = tool[:3, 3]
+    verdict = "certified" if start.certified else "not certified"
+    return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+
+
+def _turning(seen: Sequence[Block]) -> set[str]:
+    """Return the markers whose orientations count: of those with the most, for each makes the relaxation larger."""
+    poses = [block for block in seen if block.measurement.name == "pose"]
+    poses.sort(key=lambda block: -len(block.row))
+    return {block.markers[0] for block in poses[:MOST_TURNING]}
+
+
+def _measured(block: Block, turning: bool) -> Array:
+    """Return poses (N, 4, 4), their rotations NaN where positions alone count."""
+    if turning and block.measurement.name == "pose":
+        return transforms(block.y)
+    T = np.full((len(block.y), 4, 4), np.nan)
+    T[:, :3, 3] = block.y[:, :3]
+    T[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    return T
+
+
+def _deviations(block: Block) -> Array:
+    """Return standard deviations (N, 2) of a position [m] and a turn [rad]: the instrument's and the robot's."""
+    variance = np.full((len(block.row), 2), NOMINAL_ERROR**2)
+    covariance = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
+    variance[:, 0] += np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3
+    if block.measurement.name == "pose":
+        variance[:, 1] += np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+    return np.sqrt(variance)
+
+
+def _closed_forms(
+    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """Return the base and the reflectors, of which the first whose poses tell decide alone."""
+    found = {marker: place.copy() for marker, place in places.items()}
+    source, target, weight = [], [], []
+    for block, flange in zip(seen, flanges, strict=True):
+        marker = block.markers[0]
+        if block.measurement.name == "pose":
+            try:
+                base, tool = hand_eye(flange, transforms(block.y), found[marker][:3])
+            except InputError:
+                pass  # too few turns: positions and the stated tool have to do
+            else:
+                found[marker] = frame_numbers(tool)
+                return frame_numbers(base), found
+        if len(flange) > 3:
+            found[marker][:3] = tool_from_distances(flange, block.y[:, :3], found[marker][:3], TOOL_ERROR)
+        source.append(flange[:, :3, :3] @ found[marker][:3] + flange[:, :3, 3])
+        target.append(block.y[:, :3])
+        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
+        weight.append(1 / np.broadcast_to(variance, len(flange)))
+    q = np.concatenate(weight)
+    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), found
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
