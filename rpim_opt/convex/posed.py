@@ -16,6 +16,8 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
+from rpim_opt.convex.rows import rows_of
+from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
@@ -137,6 +139,27 @@ class Posed:
             return None
         which = np.unique(self.groups, return_inverse=True)[1]
         return Quadratic(form.L[which], np.zeros(len(which)), form.constant)  # p_k v_k^2 = p_k |r_k|^2
+
+    @cached_property
+    def separated(self) -> Separated | None:
+        """The sum over equations or configurations, in their `order`, that the loss is; None for other losses."""
+        if self.limited or self.inner or self.loss_form is not None:
+            return None
+        rows = rows_of(self._loss_term.expression, self._loss_term.variable)
+        if rows is None:
+            return None
+        starts = None
+        if self.formulation.loss_over == "configuration":
+            starts = np.flatnonzero(np.diff(self.groups[self.order], prepend=-1))
+        made = Separated(rows, starts, len(self.groups))
+        if made.count == self.r.size and made.holds:
+            return made
+        return None
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """(m,) equations in the order of their configurations."""
+        return np.argsort(self.groups, kind="stable")
 
     @cached_property
     def penalty_form(self) -> Quadratic | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cvxpy as cp
@@ -13,6 +13,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.convex.by_rows import Near, by_rows
 from rpim_opt.convex.closed import minimum, minimum_between, path_between, shares, values
 from rpim_opt.convex.conflict import advice, conflict
 from rpim_opt.convex.formulation import Formulation
@@ -100,6 +101,8 @@ class Program(Objective):
     (97, 100)
     """
 
+    _near: list[Near] = field(default_factory=list, repr=False)  # the last minimum of a loss over rows, of all `on`
+
     def __reduce__(self) -> Any:
         return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
 
@@ -166,7 +169,7 @@ class Program(Objective):
             z, multipliers = minimum_between(self, box, weight, damping, minimum(self, weight, None), None)
             estimate = self._at(z, weight, shares(self, box, z, multipliers))
         else:
-            estimate = self._by_interior_point(weight, damping)
+            estimate = self._by_rows(weight, damping) or self._by_interior_point(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     @one_blas_thread
@@ -200,6 +203,16 @@ class Program(Objective):
         if not self.quadratic:  # a quadratic is finite everywhere
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
+
+    def _by_rows(self, weight: float, damping: Damping | None) -> Estimate | None:
+        """Return the minimum of a loss that is a sum over rows, by Newton's method from the last one."""
+        near = self._near[-1] if self._near else None
+        ended = by_rows(self, weight, damping, near)
+        if ended is None:
+            return None
+        found, near = ended
+        self._near[:] = [near]
+        return self._judged(found, weight)
 
     def _by_interior_point(self, weight: float, damping: Damping | None) -> Estimate:
         """Return what Clarabel finds in our terms, and where it finds nothing, in CVXPY's."""

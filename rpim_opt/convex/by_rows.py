@@ -1,0 +1,80 @@
+"""Programs whose loss is a sum over rows or configurations, and whose penalty a square: solved by Newton's method."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.phases import phase
+from rpim_opt.convex.closed import shares
+from rpim_opt.convex.interior import Found
+from rpim_opt.convex.newton import Coordinates, Ended, Kinked, Newton, coordinates
+from rpim_opt.convex.objective import Damping, Objective
+from rpim_opt.convex.quadratic import ridge
+from rpim_opt.convex.structure import Quadratic
+
+
+class Near(NamedTuple):
+    """A minimum of a program like the one that is asked for: z (n,), and the state of the loss's kinks."""
+
+    z: Array
+    kinked: Kinked
+
+
+def by_rows(objective: Objective, weight: float, damping: Damping | None, near: Near | None) -> tuple[Found, Near] | None:
+    """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
+
+    Parameters
+    ----------
+    objective
+        The program.
+    weight
+        Of the penalty.
+    damping
+        A term that keeps the solution near a point.
+    near
+        The minimum of a neighbour: another weight, or a linearization nearby.
+    """
+    loss = objective.separated
+    if loss is None:
+        return None
+    at = objective.coordinates
+    if damping is not None:
+        at = _damped(objective, weight, damping)
+        weight = 1.0
+    box = objective.box if objective.constrained else None
+    if not at.rows.shape[1] or (box is not None and at.B.shape[0] != at.B.shape[1]):
+        return None
+    newton = Newton(loss, at, weight, box)
+    with phase("solve"), np.errstate(all="ignore"):
+        ended = _ended(newton, near)
+    if ended is None or not ended.good:
+        return None
+    duals = ()
+    if box is not None:
+        duals = shares(objective, box, ended.z, newton.multipliers(ended))
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked)
+
+
+def _ended(newton: Newton, near: Near | None) -> Ended | None:
+    """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
+    if near is not None:
+        ended = newton.minimum(near.z, near.kinked)
+        if ended.good:
+            return ended
+    return newton.minimum(newton.of_squares())
+
+
+def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinates:
+    """Return coordinates in which penalty and damping are one penalty."""
+    form = objective.penalty_form
+    L = [np.diag(damping.size)]
+    c = [damping.size * damping.centre]
+    if form is not None and weight > 0:
+        L.append(np.sqrt(weight) * form.matrix)
+        c.append(np.sqrt(weight) * form.c)
+    both = Quadratic(np.vstack(L), np.concatenate(c))
+    model = objective.model
+    return coordinates(ridge(model, both), model.A, model.b, objective.order)

@@ -1,0 +1,325 @@
+"""Minima of losses that are sums over rows: Newton's method on whitened unknowns, ended by a duality gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.active_set import minimum_in_box
+from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.convex.separated import Curvature, Separated, Smoothed
+
+SOUGHT, ACCEPTED = 1e-13, 1e-10
+"""Duality gap, relative to the objective, that the method goes on to while it makes progress, and that it must reach."""
+MOST = 100
+"""Steps of Newton's, after which another method is asked."""
+SHARPER, SHARPEST = 10.0, 1e9
+"""By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
+FLAT = 1e-10
+"""Curvature that unknowns have at least, where the data have about one."""
+FAR = 100.0
+"""No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
+ENOUGH = 0.3
+"""A search ends where the slope is this part of the first."""
+SETTLED = 0.1
+"""Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
+VAIN = 3
+"""Steps that lower the gap no more, after which a good one is taken."""
+
+_potrf: Any
+_potrs: Any
+_potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """z = offset + B a, with the penalty weight |a_k|^2 on some of the a (p,), and rows A B sorted by groups.
+
+    Parameters
+    ----------
+    offset, B
+        (n,) and (n, p).
+    rows, b
+        (m, p) = A B, and (m,) = b - A offset.
+    penalized
+        (p,) which a the penalty sees.
+    gram
+        (p, p) = rows'rows.
+    """
+
+    offset: Array
+    B: Array
+    rows: Array
+    b: Array
+    penalized: np.ndarray
+    gram: Array
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(p, n) of the coordinates by z - offset."""
+        return np.linalg.pinv(self.B)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """(p,) squared lengths of the columns of rows."""
+        return np.diag(self.gram).copy()
+
+
+def coordinates(form: Ridge, A: Array, b: Array, order: np.ndarray) -> Coordinates:
+    """Return the coordinates in which data and penalty are both diagonal; ``order`` (m,) sorts equations by groups."""
+    B = np.hstack([form.B, form.free])
+    rows = (A @ B)[order]
+    penalized = np.arange(B.shape[1]) < form.B.shape[1]
+    return Coordinates(form.offset, B, rows, (b - A @ form.offset)[order], penalized, rows.T @ rows)
+
+
+class Point(NamedTuple):
+    """Where the method is: z (n,), coordinates a (p,), residual (m,), and the smoothed loss there."""
+
+    z: Array
+    a: Array
+    r: Array
+    smooth: Smoothed
+
+
+class Kinked(NamedTuple):
+    """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
+
+    multipliers: list[Array]
+    sharpness: float
+
+
+class Ended(NamedTuple):
+    """Where the method ended: z (n,), duality gap, objective, steps, slope by z (n,) in a box, the kinks' state."""
+
+    z: Array
+    gap: float
+    objective: float
+    steps: int
+    slope: Array | None
+    kinked: Kinked
+
+    @property
+    def good(self) -> bool:
+        """Whether the gap says that this is a minimum."""
+        return self.gap <= ACCEPTED * max(1.0, abs(self.objective))
+
+
+@dataclass(frozen=True, eq=False)
+class Newton:
+    """minimize  sum_i f_i(A_i z - b_i) + weight |L z - c|^2  in a box, by Newton's method.
+
+    In unknowns that whiten data and penalty together the second derivative of a loss about the identity is well
+    conditioned whatever the weight, so that a Cholesky factor of it serves. A step is followed by a search along it.
+    A loss with kinks is smoothed about multipliers (`Separated`), which then take a step themselves. In a box the step
+    is the minimum of the quadratic there, by the active set.
+
+    With y the slope of the loss (the smoothed one's is a subgradient) at z, g = A'y + penalty'(z) and Fenchel's
+    inequality, no point has an objective lower by more than ::
+
+        gap = (what the kinks miss) + sum_k g_k^2 / (4 weight)
+
+    over penalized coordinates; those without penalty add |g_k| times `FAR` of their size. Of the components on a
+    bound only those slopes count that lead inwards.
+
+    Parameters
+    ----------
+    loss
+        f.
+    at
+        The coordinates.
+    weight
+        Of the penalty.
+    box
+        Lower and upper (n,), or None.
+    """
+
+    loss: Separated
+    at: Coordinates
+    weight: float
+    box: tuple[Array, Array] | None = None
+
+    @cached_property
+    def pull(self) -> Array:
+        """(p,) weight of every coordinate's square."""
+        return np.where(self.at.penalized, self.weight, 0.0)
+
+    @cached_property
+    def unit(self) -> Array:
+        """(p,) size of every coordinate, of which the data and the penalty together make one."""
+        size = self.at.lengths + self.pull
+        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0)
+
+    def of_squares(self) -> Array:
+        """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
+        z = self.at.offset + self.at.B @ (self.unit**2 * (self.at.rows.T @ self.at.b))
+        if self.box is None:
+            return z
+        return np.clip(z, *self.box)
+
+    def multipliers(self, ended: Ended) -> Array:
+        """Return by how much the objective would fall per unit by which a bound were loosened, (n,)."""
+        if ended.slope is None:
+            return np.zeros_like(ended.z)
+        return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
+
+    def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
+        """Return the minimum, begun at z (n,) and with the multipliers of a neighbour."""
+        if self.box is not None:
+            z = np.clip(z, *self.box)
+        a = self.at.inverse @ (z - self.at.offset)
+        if self.box is None:
+            z = self.at.offset + self.at.B @ a
+        r = self.at.rows @ a - self.at.b
+        if self.loss.kinks and kinked is None:
+            kinked = self._begun(r)
+        kinked = kinked or Kinked([], 1.0)
+        point = Point(z, a, r, self.loss.smoothed(r, *kinked))
+        best = self._judged(point, kinked, 0)
+        vain = 0
+        for steps in range(1, MOST):
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+                break
+            slope = self._slope(point)
+            if self.loss.kinks and self._bound(point, slope)[0] <= SETTLED * point.smooth.missing:
+                sharper = min(SHARPER * kinked.sharpness, SHARPEST)
+                kinked = Kinked(point.smooth.multipliers, sharper)
+                point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
+            else:
+                point = self._stepped(point, slope, kinked)
+            ended = self._judged(point, kinked, steps)
+            vain += 1
+            if ended.gap < best.gap:
+                best = ended
+                vain = 0
+        return best
+
+    def _begun(self, r: Array) -> Kinked:
+        """Return multipliers of zero, and kinks as blunt as the residuals are large."""
+        sizes = [np.median(np.abs(a * r + c)) for _, (a, c) in self.loss.kinks]
+        factors = [np.median(factor) for factor, _ in self.loss.kinks]
+        sharpness = max(f / max(s, 1e-9) for f, s in zip(factors, sizes, strict=True))
+        return Kinked([np.zeros_like(r) for _ in self.loss.kinks], float(sharpness))
+
+    def _slope(self, point: Point) -> Array:
+        """Return the slope of the smoothed objective by the coordinates in their units, (p,)."""
+        return self.unit * (self.at.rows.T @ point.smooth.slope + 2 * self.pull * point.a)
+
+    def _bound(self, point: Point, slope: Array) -> tuple[float, Array | None]:
+        """Return by how much the smoothed objective may fall at most, and its slope by z (n,) in a box."""
+        by_z = None
+        if self.box is not None:
+            by_z = self.back.T @ slope
+            slope = (self.at.B * self.unit).T @ np.where(self.held(point.z, by_z), 0.0, by_z)
+        held = self.pull > 0
+        g = np.divide(slope, self.unit, out=np.zeros_like(slope), where=self.unit > 0)
+        gap = float(np.sum(g[held] ** 2 / (4 * self.pull[held])))
+        return gap + FAR * float(np.abs(slope[~held]) @ (1 + np.abs(point.a[~held]))), by_z
+
+    def held(self, z: Array, slope: Array) -> np.ndarray:
+        """Return which components of z (n,) a bound holds, for a slope (n,)."""
+        assert self.box is not None
+        lower, upper = self.box
+        return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
+
+    def _judged(self, point: Point, kinked: Kinked, steps: int) -> Ended:
+        gap, by_z = self._bound(point, self._slope(point))
+        objective = self.loss.value(point.r) + float(self.pull @ point.a**2)
+        state = Kinked(point.smooth.multipliers, kinked.sharpness)
+        return Ended(point.z, gap + point.smooth.missing, objective, steps, by_z, state)
+
+    @cached_property
+    def back(self) -> Array:
+        """(p, n) inverse of the coordinates in their units."""
+        return self.at.inverse / self.unit[:, None]
+
+    def _stepped(self, point: Point, slope: Array, kinked: Kinked) -> Point:
+        """Return the point after a step of Newton's."""
+        H = self._hessian(self.loss.curvature(point.r, *kinked))
+        factor, failed = _potrf(H)
+        if failed:
+            factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
+        if self.box is None:
+            step = -self.unit * _potrs(factor, slope)[0]
+            return self._searched(point, point.z, step, kinked)
+        u = self.back @ (point.z - self.at.offset)
+        R = np.triu(factor)
+        target = R @ u - solve_triangular(R, slope, trans=1)
+        z, _ = minimum_in_box(R @ self.back, target + R @ (self.back @ self.at.offset), *self.box, point.z)
+        step = self.unit * (self.back @ (z - point.z))
+        return self._searched(point, z, step, kinked)
+
+    def _hessian(self, curvatures: list[Curvature]) -> Array:
+        """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
+        rows = self.at.rows
+        across = sum(c.across for c in curvatures) + np.zeros(len(rows))
+        usual = np.partition(across, len(across) // 2)[len(across) // 2]
+        other = np.flatnonzero(across != usual)
+        if 2 * len(other) > len(rows):
+            X = np.sqrt(across)[:, None] * rows
+            H = X.T @ X
+        else:
+            X = rows[other]
+            H = usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+        for curvature in curvatures:
+            if curvature.along is not None:
+                H += self._along(curvature)
+        H = self.unit[:, None] * H * self.unit
+        H[np.diag_indices_from(H)] += 2 * self.pull * self.unit**2 + FLAT
+        return H
+
+    def _along(self, curvature: Curvature) -> Array:
+        """Return what the curvatures along the groups' directions add."""
+        _, along, u = curvature
+        bent = np.flatnonzero(along)
+        X = self.loss.projected(self.at.rows, u, bent)
+        return X.T @ (along[bent][:, None] * X)
+
+    def _searched(self, point: Point, z: Array, step: Array, kinked: Kinked) -> Point:
+        """Return the point along a step where the smoothed objective is about least."""
+        ahead = self.at.rows @ step
+
+        def at(t: float) -> Point:
+            a, r = point.a + t * step, point.r + t * ahead
+            place = self.at.offset + self.at.B @ a
+            if self.box is not None:
+                place = np.clip(point.z + t * (z - point.z), *self.box)
+            return Point(place, a, r, self.loss.smoothed(r, *kinked))
+
+        def rise(p: Point) -> float:
+            slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)
+            if np.isfinite(slope) and np.isfinite(p.smooth.value):
+                return slope
+            return np.inf
+
+        return searched(at, rise, point, self.box is None)
+
+
+def searched(at, rise, point, longer):
+    """Return a point on a line where a convex function has a small slope."""
+    first = rise(point)
+    low, slope_low, high, slope_high = 0.0, first, np.inf, np.inf
+    t, best = 1.0, point
+    for _ in range(30):
+        there = at(t)
+        slope = rise(there)
+        if abs(slope) <= ENOUGH * abs(first):
+            return there
+        if slope < 0:
+            low, slope_low, best = t, slope, there
+            if not longer and t >= 1: return there
+        else:
+            high, slope_high = t, slope
+        if not np.isfinite(high):
+            t = 2 * t
+        elif np.isfinite(slope_high):
+            share = slope_low / (slope_low - slope_high)
+            t = low + (high - low) * min(max(share, 0.05), 0.95)
+        else:
+            t = (low+high)/2
+    return best
