@@ -15,12 +15,41 @@ from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
 
+MOST = 100
+"""Weights whose minima are kept."""
+TINY = 1e-300
+"""Stands for a weight of zero, whose logarithm is asked for."""
+
 
 class Near(NamedTuple):
-    """A minimum of a program like the one that is asked for: z (n,), and the state of the loss's kinks."""
+    """A minimum of a program like the one that is asked for.
+
+    z (n,), the state of the loss's kinks, and the loss's slope (m,), equations in the order of their configurations.
+    """
 
     z: Array
     kinked: Kinked
+    slope: Array
+
+
+class Met:
+    """The last minima at some weights, from which those of another weight or linearization are near."""
+
+    def __init__(self) -> None:
+        self._at: dict[float, Near] = {}
+
+    def nearest(self, weight: float) -> Near | None:
+        """Return the minimum at the nearest weight."""
+        if weight in self._at or not self._at:
+            return self._at.get(weight)
+        return self._at[min(self._at, key=lambda other: abs(np.log((other + TINY) / (weight + TINY))))]
+
+    def keep(self, weight: float, near: Near) -> None:
+        """Keep a minimum; of too many weights the one that was met first goes."""
+        self._at.pop(weight, None)
+        self._at[weight] = near
+        if len(self._at) > MOST:
+            del self._at[next(iter(self._at))]
 
 
 def by_rows(objective: Objective, weight: float, damping: Damping | None, near: Near | None) -> tuple[Found, Near] | None:
@@ -45,9 +74,9 @@ def by_rows(objective: Objective, weight: float, damping: Damping | None, near: 
         at = _damped(objective, weight, damping)
         weight = 1.0
     box = objective.box if objective.constrained else None
-    if not at.rows.shape[1] or (box is not None and at.B.shape[0] != at.B.shape[1]):
-        return None
     newton = Newton(loss, at, weight, box)
+    if not at.rows.shape[1] or (box is not None and not newton.whole):
+        return None
     with phase("solve"), np.errstate(all="ignore"):
         ended = _ended(newton, near)
     if ended is None or not ended.good:
@@ -55,7 +84,7 @@ def by_rows(objective: Objective, weight: float, damping: Damping | None, near: 
     duals = ()
     if box is not None:
         duals = shares(objective, box, ended.z, newton.multipliers(ended))
-    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked)
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
 
 
 def _ended(newton: Newton, near: Near | None) -> Ended | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,21 +13,28 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
 
 SOUGHT, ACCEPTED = 1e-13, 1e-10
 """Duality gap, relative to the objective, that the method goes on to while it makes progress, and that it must reach."""
-MOST = 100
-"""Steps of Newton's, after which another method is asked."""
+MOST, SOON = 100, 15
+"""Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
+BLUNT = 10.0
+"""How sharp they then are, relative to those that a loss without multipliers begins with."""
 SHARPER, SHARPEST = 10.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
 FAR = 100.0
 """No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
+UNSEEN = RANK_TOLERANCE**2
+"""Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
 ENOUGH = 0.3
 """A search ends where the slope is this part of the first."""
-SETTLED = 0.1
+TRIES, MARGIN = 30, 0.05
+"""Points of a search at most, and how near to an end of the bracket, relative to it, the next one may lie."""
+SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good one is taken."""
@@ -95,14 +103,16 @@ class Kinked(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Where the method ended: z (n,), duality gap, objective, steps, slope by z (n,) in a box, the kinks' state."""
+    """Where the method ended: z (n,), duality gap, objective, steps, the kinks' state, slopes by z (n,) in a box, and of the
+    loss by the residual (m,)."""
 
     z: Array
     gap: float
     objective: float
     steps: int
-    slope: Array | None
     kinked: Kinked
+    slope: Array | None
+    of_loss: Array
 
     @property
     def good(self) -> bool:
@@ -151,9 +161,15 @@ class Newton:
 
     @cached_property
     def unit(self) -> Array:
-        """(p,) size of every coordinate, of which the data and the penalty together make one."""
+        """(p,) size of every coordinate, of which the data and the penalty together make one; zero where they see none."""
         size = self.at.lengths + self.pull
-        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0)
+        seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
+        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
+
+    @property
+    def whole(self) -> bool:
+        """Whether the coordinates say all of z, as a box asks for."""
+        return len(self.unit) == len(self.at.offset) and bool((self.unit > 0).all())
 
     def of_squares(self) -> Array:
         """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
@@ -168,11 +184,21 @@ class Newton:
             return np.zeros_like(ended.z)
         return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
 
-    def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
-        """Return the minimum, begun at z (n,) and with the multipliers of a neighbour."""
+    def minimum(self, z: Array, kinked: Kinked | None = None, most: int = MOST) -> Ended:
+        """Return the minimum, or the best point of so many steps, begun at z (n,) with the multipliers of a neighbour.
+
+        Where the neighbour was too far for kinks as sharp as there, they begin blunter.
+        """
+        if self.loss.kinks and kinked is not None and most == MOST:
+            ended = self.minimum(z, kinked, SOON)
+            if ended.good:
+                return ended
+            blunt = self._begun(self.at.rows @ (self.at.inverse @ (ended.z - self.at.offset)) - self.at.b)
+            sharpness = min(BLUNT * blunt.sharpness, kinked.sharpness)
+            return self.minimum(ended.z, Kinked(ended.kinked.multipliers, sharpness), MOST - 1)
         if self.box is not None:
             z = np.clip(z, *self.box)
-        a = self.at.inverse @ (z - self.at.offset)
+        a = np.where(self.unit > 0, self.at.inverse @ (z - self.at.offset), 0.0)
         if self.box is None:
             z = self.at.offset + self.at.B @ a
         r = self.at.rows @ a - self.at.b
@@ -182,7 +208,7 @@ class Newton:
         point = Point(z, a, r, self.loss.smoothed(r, *kinked))
         best = self._judged(point, kinked, 0)
         vain = 0
-        for steps in range(1, MOST):
+        for steps in range(1, most):
             if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
                 break
             slope = self._slope(point)
@@ -219,7 +245,8 @@ class Newton:
         held = self.pull > 0
         g = np.divide(slope, self.unit, out=np.zeros_like(slope), where=self.unit > 0)
         gap = float(np.sum(g[held] ** 2 / (4 * self.pull[held])))
-        return gap + FAR * float(np.abs(slope[~held]) @ (1 + np.abs(point.a[~held]))), by_z
+        free = ~held & (self.unit > 0)
+        return gap + FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free]))), by_z
 
     def held(self, z: Array, slope: Array) -> np.ndarray:
         """Return which components of z (n,) a bound holds, for a slope (n,)."""
@@ -231,7 +258,7 @@ class Newton:
         gap, by_z = self._bound(point, self._slope(point))
         objective = self.loss.value(point.r) + float(self.pull @ point.a**2)
         state = Kinked(point.smooth.multipliers, kinked.sharpness)
-        return Ended(point.z, gap + point.smooth.missing, objective, steps, by_z, state)
+        return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
 
     @cached_property
     def back(self) -> Array:
@@ -300,26 +327,44 @@ class Newton:
         return searched(at, rise, point, self.box is None)
 
 
-def searched(at, rise, point, longer):
-    """Return a point on a line where a convex function has a small slope."""
-    first = rise(point)
-    low, slope_low, high, slope_high = 0.0, first, np.inf, np.inf
-    t, best = 1.0, point
-    for _ in range(30):
+def searched(at: Callable[[float], Point], rise: Callable[[Point], float], begin: Point, longer: bool) -> Point:
+    """Return a point on a line where a convex function has a small slope, by the secant in a bracket.
+
+    Parameters
+    ----------
+    at, rise
+        The point at a number t, and the function's slope by t there.
+    begin
+        The point at zero, where the function falls.
+    longer
+        Whether t may exceed 1.
+    """
+    first = rise(begin)
+    if not first < 0:
+        return begin
+    low, slope_low, below = 0.0, first, begin
+    high, slope_high = np.inf, np.inf
+    t = 1.0
+    for _ in range(TRIES):
         there = at(t)
         slope = rise(there)
         if abs(slope) <= ENOUGH * abs(first):
             return there
         if slope < 0:
-            low, slope_low, best = t, slope, there
-            if not longer and t >= 1: return there
+            low, slope_low, below = t, slope, there
+            if not longer and t >= 1:
+                return there
         else:
             high, slope_high = t, slope
-        if not np.isfinite(high):
-            t = 2 * t
-        elif np.isfinite(slope_high):
-            share = slope_low / (slope_low - slope_high)
-            t = low + (high - low) * min(max(share, 0.05), 0.95)
-        else:
-            t = (low+high)/2
-    return best
+        t = _between(low, slope_low, high, slope_high)
+    return below
+
+
+def _between(low: float, slope_low: float, high: float, slope_high: float) -> float:
+    """Return where to look next between a falling and a rising slope."""
+    if not np.isfinite(high):
+        return 2 * low
+    share = 0.5
+    if np.isfinite(slope_high):
+        share = min(max(slope_low / (slope_low - slope_high), MARGIN), 1 - MARGIN)
+    return low + share * (high - low)

@@ -26,6 +26,8 @@ from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (cp.sum_squares, cp.norm2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its triangular factor."""
+TINY = 1e-150
+"""Norms below have no direction."""
 FEW = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
@@ -246,9 +248,15 @@ class Posed:
             return None
         if self.formulation.loss is cp.sum_squares:  # of the residual or of its configurations' norms
             return 2 * r
-        if self.formulation.loss_over == "equation":
-            return self._loss_term.slope(r)
-        return self._loss_of_r.slope(r)
+        seen = self.seen(r)
+        slope = self.slope_seen(seen)
+        if slope is None or self.formulation.loss_over == "equation":
+            return slope
+        return (slope / np.maximum(seen, TINY))[self.groups] * r
+
+    def slope_seen(self, seen: Array) -> Array | None:
+        """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
+        return self._loss_term.slope(seen)
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
@@ -278,10 +286,6 @@ class Posed:
         if self._declared is not None:
             return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
         return self._penalty_of_z.slope(z)
-
-    @cached_property
-    def _loss_of_r(self) -> Term:
-        return apart(self.loss, self.r)
 
     @cached_property
     def _penalty_of_z(self) -> Term:
