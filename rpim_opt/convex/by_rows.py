@@ -52,7 +52,9 @@ class Met:
             del self._at[next(iter(self._at))]
 
 
-def by_rows(objective: Objective, weight: float, damping: Damping | None, near: Near | None) -> tuple[Found, Near] | None:
+def by_rows(
+    objective: Objective, weight: float, damping: Damping | None, near: Near | None
+) -> tuple[Found, Near] | None:
     """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
 
     Parameters

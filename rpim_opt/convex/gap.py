@@ -1,4 +1,4 @@
-"""A bound on what a point of a program lacks of the minimum: a duality gap, from the functions' own values and slopes."""
+"""A bound on what a point lacks of a program's minimum: a duality gap, from the functions' own values and slopes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ RANK = 1e-10
 def duality_gap(objective: Objective, z: Array, weight: float, proposed: Array | None = None) -> float:
     """Return by how much the objective at z (n,) may lie above the minimum; infinite where that is not known.
 
-    With y_i a slope (subgradient) of the convex loss at residuals r~, and a squared penalty, for every z' of the box::
+    With y a slope (subgradient) of the convex loss at residuals r~, and a squared penalty, for every z' of the box::
 
         loss(A z' - b) + weight penalty(z') >= loss(r~) + y'(A z' - b - r~) + weight penalty(z')
 
-    whose least value over z' is known: y'A is a linear function, the penalty a square. (Fenchel's inequality:
-    y'r~ - loss(r~) is the loss's conjugate at y.) r~ is A z - b, and zero where the proposed y_i lies between the
-    slopes on both sides of a kink there. Nothing else is taken from a solver, and a wrong proposal makes the gap larger. In directions that the
+    whose least value over z' is known: a linear function and a square. (Fenchel's inequality: y'r~ - loss(r~) is the
+    loss's conjugate at y.) r~ is A z - b, and zero where the proposed y_i lies between the slopes on both sides of a
+    kink there. Nothing else is taken from a solver, and a wrong proposal makes the gap larger. In directions that the
     penalty leaves free, the minimum is taken to lie within `FAR` times (1 + |z|) of z.
 
     Parameters

@@ -13,11 +13,11 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.quadratic import Ridge
-from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
+from rpim_opt.problem.linear import RANK_TOLERANCE
 
 SOUGHT, ACCEPTED = 1e-13, 1e-10
-"""Duality gap, relative to the objective, that the method goes on to while it makes progress, and that it must reach."""
+"""Duality gap, relative to the objective, that the method goes on to while that falls, and that it must reach."""
 MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
@@ -70,7 +70,7 @@ class Coordinates:
     @cached_property
     def inverse(self) -> Array:
         """(p, n) of the coordinates by z - offset."""
-        return np.linalg.pinv(self.B)
+        return np.asarray(np.linalg.pinv(self.B), dtype=float)
 
     @cached_property
     def lengths(self) -> Array:
@@ -103,8 +103,10 @@ class Kinked(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Where the method ended: z (n,), duality gap, objective, steps, the kinks' state, slopes by z (n,) in a box, and of the
-    loss by the residual (m,)."""
+    """Where the method ended.
+
+    z (n,), duality gap, objective, steps, the kinks' state, the slope by z (n,) in a box, and the loss's (m,).
+    """
 
     z: Array
     gap: float
@@ -161,7 +163,7 @@ class Newton:
 
     @cached_property
     def unit(self) -> Array:
-        """(p,) size of every coordinate, of which the data and the penalty together make one; zero where they see none."""
+        """(p,) size of a coordinate of which data and penalty together make one; zero where they do not see it."""
         size = self.at.lengths + self.pull
         seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
         return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
@@ -250,8 +252,7 @@ class Newton:
 
     def held(self, z: Array, slope: Array) -> np.ndarray:
         """Return which components of z (n,) a bound holds, for a slope (n,)."""
-        assert self.box is not None
-        lower, upper = self.box
+        lower, upper = self.box or (-np.inf, np.inf)
         return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
 
     def _judged(self, point: Point, kinked: Kinked, steps: int) -> Ended:
@@ -294,7 +295,7 @@ class Newton:
             X = rows[other]
             H = usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
         for curvature in curvatures:
-            if curvature.along is not None:
+            if len(curvature.along):
                 H += self._along(curvature)
         H = self.unit[:, None] * H * self.unit
         H[np.diag_indices_from(H)] += 2 * self.pull * self.unit**2 + FLAT

@@ -101,7 +101,7 @@ def _huber(bound: float) -> Curve:
         slope = 2 * np.clip(x, -bound, bound)
         return slope * (x - slope / 4), slope
 
-    return Curve(both, lambda x: 2.0 * (np.abs(x) <= bound))
+    return Curve(both, lambda x: np.where(np.abs(x) <= bound, 2.0, 0.0))
 
 
 def _power(p: float) -> Curve:
@@ -242,7 +242,8 @@ class _Reading:
 
     def _root(self, e: Any, factor: Any) -> Parts | None:
         """Return Euclidean norms of columns, each of which holds one component."""
-        norm = isinstance(e, cp.Pnorm) and e.p == 2 and e.axis == 0 and not e.keepdims
+        kind = type(e).__name__
+        norm = kind.startswith("Pnorm") and e.p == 2 and e.axis == 0 and not e.keepdims
         if not norm or type(e.args[0]).__name__ != "Vstack":
             return None
         parts = [self.affine(arg) for arg in e.args[0].args]

@@ -15,13 +15,18 @@ NEAR_ZERO = 1e-150
 """Norms below have no direction."""
 
 
+NONE: Array = np.empty(0)
+
+
 class Curvature(NamedTuple):
-    """Second derivative of a group's part: ``across`` (m,) times 1, plus ``along`` (N,) times u u', u (m,) a unit
-    vector in every group; ``along`` is None where there is one equation a group."""
+    """Second derivative by the residual: ``across`` (m,) times 1, and ``along`` (N,) times u u' by groups.
+
+    u (m,) is a unit vector in every group; both are empty where there is one equation a group.
+    """
 
     across: Array
-    along: Array | None = None
-    u: Array | None = None
+    along: Array = NONE
+    u: Array = NONE
 
 
 class Smoothed(NamedTuple):
@@ -38,8 +43,8 @@ class Separated:
     """sum_i f_i(|r_i|) over groups of equations, or sum_i f_i(r_i) over equations, r (m,) ordered by groups.
 
     A kink k |s| of s = a r + c is replaced by its Moreau envelope about multipliers y: the least over t of
-    k |t| + sharpness / 2 |t - s - y / sharpness|^2 (augmented Lagrangian; Rockafellar 1976, Math. Oper. Res. 1:97). Its slope is the
-    multiplier anew, and with that one the smoothed loss touches the loss where y is its slope.
+    k |t| + sharpness / 2 |t - s - y / sharpness|^2 (augmented Lagrangian; Rockafellar 1976, Math. Oper. Res. 1:97). Its
+    slope is the multiplier anew: one that stays what it is makes the minimum that of the loss itself.
 
     Parameters
     ----------
@@ -60,6 +65,13 @@ class Separated:
         if self.starts is None:
             return np.ones(self.count, dtype=int)
         return np.diff(np.append(self.starts, self.count))
+
+    @property
+    def _begin(self) -> np.ndarray:
+        """The first equation of every group, of one equation each where the loss gets those."""
+        if self.starts is None:
+            return np.arange(self.count)
+        return self.starts
 
     @cached_property
     def which(self) -> np.ndarray:
@@ -101,7 +113,7 @@ class Separated:
         if np.ptp(sizes) == 0:
             k = sizes[0]
             return np.einsum("nk,nkp->np", u.reshape(-1, k)[groups], rows.reshape(len(sizes), k, -1)[groups])
-        return np.add.reduceat(u[:, None] * rows, self.starts)[groups]
+        return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
 
     def _norms(self, s: Array) -> Array:
         if self.starts is None:
