@@ -208,23 +208,22 @@ class Newton:
             kinked = self._begun(r)
         kinked = kinked or Kinked([], 1.0)
         point = Point(z, a, r, self.loss.smoothed(r, *kinked))
-        best = self._judged(point, kinked, 0)
+        best = None
         vain = 0
-        for steps in range(1, most):
+        for steps in range(most):
+            slope = self._slope(point)
+            ended = self._judged(point, kinked, slope, steps)
+            vain += 1
+            if best is None or ended.gap < best.gap:
+                best = ended
+                vain = 0
             if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
                 break
-            slope = self._slope(point)
-            if self.loss.kinks and self._bound(point, slope)[0] <= SETTLED * point.smooth.missing:
-                sharper = min(SHARPER * kinked.sharpness, SHARPEST)
-                kinked = Kinked(point.smooth.multipliers, sharper)
+            if self.loss.kinks and ended.gap - point.smooth.missing <= SETTLED * point.smooth.missing:
+                kinked = Kinked(point.smooth.multipliers, min(SHARPER * kinked.sharpness, SHARPEST))
                 point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
             else:
                 point = self._stepped(point, slope, kinked)
-            ended = self._judged(point, kinked, steps)
-            vain += 1
-            if ended.gap < best.gap:
-                best = ended
-                vain = 0
         return best
 
     def _begun(self, r: Array) -> Kinked:
@@ -255,9 +254,9 @@ class Newton:
         lower, upper = self.box or (-np.inf, np.inf)
         return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
 
-    def _judged(self, point: Point, kinked: Kinked, steps: int) -> Ended:
-        gap, by_z = self._bound(point, self._slope(point))
-        objective = self.loss.value(point.r) + float(self.pull @ point.a**2)
+    def _judged(self, point: Point, kinked: Kinked, slope: Array, steps: int) -> Ended:
+        gap, by_z = self._bound(point, slope)
+        objective = point.smooth.loss + float(self.pull @ point.a**2)
         state = Kinked(point.smooth.multipliers, kinked.sharpness)
         return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
 

@@ -241,7 +241,7 @@ class Program(Objective):
             return None
         found, near = ended
         self._met.keep(weight, near)
-        return self._judged(found, weight)
+        return Estimate(near.z, weight, *self.value(near.z, weight), found.duals, iterations=found.iterations)
 
     def _by_interior_point(self, weight: float, damping: Damping | None) -> Estimate:
         """Return what Clarabel finds in our terms, and where it finds nothing, in CVXPY's."""

@@ -30,9 +30,13 @@ class Curvature(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """A loss with kinks smoothed: value, slope (m,), the kinks' multipliers anew, and what the kinks miss by them."""
+    """A loss with kinks smoothed: value, slope (m,), the kinks' multipliers anew, and what the kinks miss by them.
+
+    ``loss`` is its value without smoothing.
+    """
 
     value: float
+    loss: float
     slope: Array
     multipliers: list[Array]
     missing: float
@@ -132,32 +136,29 @@ class Separated:
             return self.rows.both(r)
         v = self._norms(r)
         value, slope = self.rows.both(v)
-        slope = slope + self._tilt(v)
-        value += self._tilted(v)
+        if self._tilted:
+            slope = slope + self._tilt
+            value += float(np.sum(self._tilt * v))
         return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
 
-    def _tilt(self, v: Array) -> Any:
-        """Return what kinks at norms zero and above add to the slope of the pieces, without the kink that is apart."""
+    @cached_property
+    def _tilt(self) -> Any:
+        """What kinks at zero add to the slope of the pieces, without the kink that is apart."""
         tilt: Any = -self.at_zero
         for factor, of in self.rows.kinks:
             tilt = tilt + factor * np.abs(of.a)
         return tilt
 
-    def _tilted(self, v: Array) -> float:
-        return float(np.sum(self._tilt(v) * v))
-
-    def value(self, r: Array) -> float:
-        """Return the loss."""
-        total = self._smooth(r)[0]
-        for factor, (a, c) in self.kinks:
-            total += float(np.sum(factor * self._norms(a * r + c)))
-        return total
+    @cached_property
+    def _tilted(self) -> bool:
+        return bool(np.any(self._tilt))
 
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
         value, slope = self._smooth(r)
         anew = []
         missing = 0.0
+        loss = value
         for (factor, (a, c)), old in zip(self.kinks, y, strict=True):
             s = a * r + c
             t = sharpness * s + old
@@ -166,8 +167,10 @@ class Separated:
             anew.append(new)
             slope = slope + a * new
             value += float(new @ s - (new - old) @ (new - old) / (2 * sharpness))
-            missing += float(np.sum(factor * self._norms(s)) - new @ s)
-        return Smoothed(value, slope, anew, missing)
+            bent = float(np.sum(factor * self._norms(s)))
+            loss += bent
+            missing += bent - float(new @ s)
+        return Smoothed(value, loss, slope, anew, missing)
 
     def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
         """Return the second derivative of the smoothed loss, as a sum."""
@@ -187,7 +190,7 @@ class Separated:
         if self.starts is None:
             return Curvature(self.rows.bend(r))
         v = self._norms(r)
-        slope = self.rows.both(v)[1] + self._tilt(v)
+        slope = self.rows.both(v)[1] + self._tilt
         bend = self.rows.bend(v)
         small = v <= NEAR_ZERO
         across = np.where(small, bend, slope / np.where(small, 1.0, v))
