@@ -9,8 +9,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
 from rpim_opt.convex.closed import shares
+from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
-from rpim_opt.convex.newton import Coordinates, Ended, Kinked, Newton, coordinates
+from rpim_opt.convex.newton import Ended, Kinked, Newton
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,7 +11,8 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
-from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.convex.coordinates import Coordinates
+from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
@@ -30,10 +30,6 @@ FAR = 100.0
 """No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
 UNSEEN = RANK_TOLERANCE**2
 """Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
-ENOUGH = 0.3
-"""A search ends where the slope is this part of the first."""
-TRIES, MARGIN = 30, 0.05
-"""Points of a search at most, and how near to an end of the bracket, relative to it, the next one may lie."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 VAIN = 3
@@ -42,48 +38,6 @@ VAIN = 3
 _potrf: Any
 _potrs: Any
 _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
-
-
-@dataclass(frozen=True, eq=False)
-class Coordinates:
-    """z = offset + B a, with the penalty weight |a_k|^2 on some of the a (p,), and rows A B sorted by groups.
-
-    Parameters
-    ----------
-    offset, B
-        (n,) and (n, p).
-    rows, b
-        (m, p) = A B, and (m,) = b - A offset.
-    penalized
-        (p,) which a the penalty sees.
-    gram
-        (p, p) = rows'rows.
-    """
-
-    offset: Array
-    B: Array
-    rows: Array
-    b: Array
-    penalized: np.ndarray
-    gram: Array
-
-    @cached_property
-    def inverse(self) -> Array:
-        """(p, n) of the coordinates by z - offset."""
-        return np.asarray(np.linalg.pinv(self.B), dtype=float)
-
-    @cached_property
-    def lengths(self) -> Array:
-        """(p,) squared lengths of the columns of rows."""
-        return np.diag(self.gram).copy()
-
-
-def coordinates(form: Ridge, A: Array, b: Array, order: np.ndarray) -> Coordinates:
-    """Return the coordinates in which data and penalty are both diagonal; ``order`` (m,) sorts equations by groups."""
-    B = np.hstack([form.B, form.free])
-    rows = (A @ B)[order]
-    penalized = np.arange(B.shape[1]) < form.B.shape[1]
-    return Coordinates(form.offset, B, rows, (b - A @ form.offset)[order], penalized, rows.T @ rows)
 
 
 class Point(NamedTuple):
@@ -208,7 +162,7 @@ class Newton:
             kinked = self._begun(r)
         kinked = kinked or Kinked([], 1.0)
         point = Point(z, a, r, self.loss.smoothed(r, *kinked))
-        best = None
+        best: Any = None
         vain = 0
         for steps in range(most):
             slope = self._slope(point)
@@ -325,46 +279,3 @@ class Newton:
             return np.inf
 
         return searched(at, rise, point, self.box is None)
-
-
-def searched(at: Callable[[float], Point], rise: Callable[[Point], float], begin: Point, longer: bool) -> Point:
-    """Return a point on a line where a convex function has a small slope, by the secant in a bracket.
-
-    Parameters
-    ----------
-    at, rise
-        The point at a number t, and the function's slope by t there.
-    begin
-        The point at zero, where the function falls.
-    longer
-        Whether t may exceed 1.
-    """
-    first = rise(begin)
-    if not first < 0:
-        return begin
-    low, slope_low, below = 0.0, first, begin
-    high, slope_high = np.inf, np.inf
-    t = 1.0
-    for _ in range(TRIES):
-        there = at(t)
-        slope = rise(there)
-        if abs(slope) <= ENOUGH * abs(first):
-            return there
-        if slope < 0:
-            low, slope_low, below = t, slope, there
-            if not longer and t >= 1:
-                return there
-        else:
-            high, slope_high = t, slope
-        t = _between(low, slope_low, high, slope_high)
-    return below
-
-
-def _between(low: float, slope_low: float, high: float, slope_high: float) -> float:
-    """Return where to look next between a falling and a rising slope."""
-    if not np.isfinite(high):
-        return 2 * low
-    share = 0.5
-    if np.isfinite(slope_high):
-        share = min(max(slope_low / (slope_low - slope_high), MARGIN), 1 - MARGIN)
-    return low + share * (high - low)

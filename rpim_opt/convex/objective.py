@@ -11,8 +11,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex import feasible
+from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.newton import Coordinates, coordinates
 from rpim_opt.convex.posed import Posed, configuration_norms
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.separated import Separated

@@ -16,7 +16,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
-from rpim_opt.convex.rows import rows_of
 from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
@@ -147,6 +146,8 @@ class Posed:
         """The sum over equations or configurations, in their `order`, that the loss is; None for other losses."""
         if self.limited or self.inner or self.loss_form is not None:
             return None
+        from rpim_opt.convex.tree import rows_of  # CVXPY's tree is read where a loss is none of the squares
+
         rows = rows_of(self._loss_term.expression, self._loss_term.variable)
         if rows is None:
             return None
