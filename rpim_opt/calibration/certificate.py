@@ -69,7 +69,7 @@ def certified(
     violation = program.violation(z)
     gradient = _gradient(program, slope, z, weight)
     try:
-        best = program.inside(program.solve(weight).z, z, weight)
+        best = program.inside(program.proven(weight).z, z, weight)
     except NoSolutionFound:
         return Certificate(gradient, float("inf"), violation, None)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))

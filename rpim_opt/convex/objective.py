@@ -11,9 +11,11 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex import feasible
+from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import Posed, configuration_norms
 from rpim_opt.convex.quadratic import Ridge, ridge
+from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.trust import Trusted, outlying
 from rpim_opt.problem.linear import LinearModel
@@ -156,6 +158,32 @@ class Objective:
             A.append(np.diag(damping.size))
             b.append(damping.size * damping.centre)
         return np.vstack(A), np.concatenate(b)
+
+    @cached_property
+    def separated(self) -> Separated | None:
+        """The loss as a sum over rows or configurations, where penalty and constraints let Newton's method serve.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+        >>> [ro.convex.pose(f, model).separated is not None for f in (ro.robust, ro.sum_of_norms, ro.minimax)]
+        [True, True, False]
+        """
+        if not self.linear_penalty or (self.constrained and self.box is None):
+            return None
+        return self._posed.separated
+
+    @property
+    def order(self) -> np.ndarray:
+        """(m,) equations in the order of their configurations."""
+        return self._posed.order
+
+    @cached_property
+    def coordinates(self) -> Coordinates:
+        """Coordinates of z in which the squares of data and penalty are diagonal, of a loss that is no square."""
+        form = ridge(self.model, self.penalty_form)
+        return coordinates(form, self.model.A, self.model.b, self.order)
 
     # --- values ------------------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
+from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
@@ -24,6 +25,8 @@ from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (cp.sum_squares, cp.norm2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its triangular factor."""
+TINY = 1e-150
+"""Norms below have no direction."""
 FEW = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
@@ -139,6 +142,29 @@ class Posed:
         return Quadratic(form.L[which], np.zeros(len(which)), form.constant)  # p_k v_k^2 = p_k |r_k|^2
 
     @cached_property
+    def separated(self) -> Separated | None:
+        """The sum over equations or configurations, in their `order`, that the loss is; None for other losses."""
+        if self.limited or self.inner or self.loss_form is not None:
+            return None
+        from rpim_opt.convex.tree import rows_of  # CVXPY's tree is read where a loss is none of the squares
+
+        rows = rows_of(self._loss_term.expression, self._loss_term.variable)
+        if rows is None:
+            return None
+        starts = None
+        if self.formulation.loss_over == "configuration":
+            starts = np.flatnonzero(np.diff(self.groups[self.order], prepend=-1))
+        made = Separated(rows, starts, len(self.groups))
+        if made.count == self.r.size and made.holds:
+            return made
+        return None
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """(m,) equations in the order of their configurations."""
+        return np.argsort(self.groups, kind="stable")
+
+    @cached_property
     def penalty_form(self) -> Quadratic | None:
         """The quadratic of z that the penalty is."""
         if self._penalty_term is None:
@@ -223,9 +249,15 @@ class Posed:
             return None
         if self.formulation.loss is cp.sum_squares:  # of the residual or of its configurations' norms
             return 2 * r
-        if self.formulation.loss_over == "equation":
-            return self._loss_term.slope(r)
-        return self._loss_of_r.slope(r)
+        seen = self.seen(r)
+        slope = self.slope_seen(seen)
+        if slope is None or self.formulation.loss_over == "equation":
+            return slope
+        return (slope / np.maximum(seen, TINY))[self.groups] * r
+
+    def slope_seen(self, seen: Array) -> Array | None:
+        """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
+        return self._loss_term.slope(seen)
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
@@ -255,10 +287,6 @@ class Posed:
         if self._declared is not None:
             return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
         return self._penalty_of_z.slope(z)
-
-    @cached_property
-    def _loss_of_r(self) -> Term:
-        return apart(self.loss, self.r)
 
     @cached_property
     def _penalty_of_z(self) -> Term:

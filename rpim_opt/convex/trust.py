@@ -21,17 +21,23 @@ SMALL = 1e-6
 """Residuals are taken as no smaller, in sigmas: below, a norm has no slope of its own."""
 
 
+def _quantiles(beyond: float, count: np.ndarray) -> Array:
+    """Return which chi-squared numbers with ``count`` (N,) degrees of freedom exceed with a probability."""
+    several, which = np.unique(count, return_inverse=True)
+    return chi2.isf(beyond, several)[which]
+
+
 def noise_level(norms: Array, count: np.ndarray) -> float:
     """Return the noise that whitened norms (N,) with ``count`` equations show: median(norm / median of chi_k).
 
     At least 1, which is the declared noise.
     """
-    return max(1.0, float(np.median(norms / np.sqrt(chi2.ppf(0.5, count)))))
+    return max(1.0, float(np.median(norms / np.sqrt(_quantiles(0.5, count)))))
 
 
 def limits(noise: float, configurations: int, count: np.ndarray) -> Array:
     """Return above which norm one of so many configurations with ``count`` equations is an outlier."""
-    return noise * np.sqrt(chi2.ppf(1 - RARE / configurations, count))
+    return noise * np.sqrt(_quantiles(RARE / configurations, count))
 
 
 def outlying(norms: Array, count: np.ndarray) -> Array:

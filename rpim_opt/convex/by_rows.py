@@ -1,0 +1,112 @@
+"""Programs whose loss is a sum over rows or configurations, and whose penalty a square: solved by Newton's method."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.phases import phase
+from rpim_opt.convex.closed import shares
+from rpim_opt.convex.coordinates import Coordinates, coordinates
+from rpim_opt.convex.interior import Found
+from rpim_opt.convex.newton import Ended, Kinked, Newton
+from rpim_opt.convex.objective import Damping, Objective
+from rpim_opt.convex.quadratic import ridge
+from rpim_opt.convex.structure import Quadratic
+
+MOST = 100
+"""Weights whose minima are kept."""
+TINY = 1e-300
+"""Stands for a weight of zero, whose logarithm is asked for."""
+
+
+class Near(NamedTuple):
+    """A minimum of a program like the one that is asked for.
+
+    z (n,), the state of the loss's kinks, and the loss's slope (m,), equations in the order of their configurations.
+    """
+
+    z: Array
+    kinked: Kinked
+    slope: Array
+
+
+class Met:
+    """The last minima at some weights, from which those of another weight or linearization are near."""
+
+    def __init__(self) -> None:
+        self._at: dict[float, Near] = {}
+
+    def nearest(self, weight: float) -> Near | None:
+        """Return the minimum at the nearest weight."""
+        if weight in self._at or not self._at:
+            return self._at.get(weight)
+        return self._at[min(self._at, key=lambda other: abs(np.log((other + TINY) / (weight + TINY))))]
+
+    def keep(self, weight: float, near: Near) -> None:
+        """Keep a minimum; of too many weights the one that was met first goes."""
+        self._at.pop(weight, None)
+        self._at[weight] = near
+        if len(self._at) > MOST:
+            del self._at[next(iter(self._at))]
+
+
+def by_rows(
+    objective: Objective, weight: float, damping: Damping | None, near: Near | None
+) -> tuple[Found, Near] | None:
+    """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
+
+    Parameters
+    ----------
+    objective
+        The program.
+    weight
+        Of the penalty.
+    damping
+        A term that keeps the solution near a point.
+    near
+        The minimum of a neighbour: another weight, or a linearization nearby.
+    """
+    loss = objective.separated
+    if loss is None:
+        return None
+    at = objective.coordinates
+    if damping is not None:
+        at = _damped(objective, weight, damping)
+        weight = 1.0
+    box = objective.box if objective.constrained else None
+    newton = Newton(loss, at, weight, box)
+    if not at.rows.shape[1] or (box is not None and not newton.whole):
+        return None
+    with phase("solve"), np.errstate(all="ignore"):
+        ended = _ended(newton, near)
+    if ended is None or not ended.good:
+        return None
+    duals = ()
+    if box is not None:
+        duals = shares(objective, box, ended.z, newton.multipliers(ended))
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
+
+
+def _ended(newton: Newton, near: Near | None) -> Ended | None:
+    """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
+    if near is not None:
+        ended = newton.minimum(near.z, near.kinked)
+        if ended.good:
+            return ended
+    return newton.minimum(newton.of_squares())
+
+
+def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinates:
+    """Return coordinates in which penalty and damping are one penalty."""
+    form = objective.penalty_form
+    L = [np.diag(damping.size)]
+    c = [damping.size * damping.centre]
+    if form is not None and weight > 0:
+        L.append(np.sqrt(weight) * form.matrix)
+        c.append(np.sqrt(weight) * form.c)
+    both = Quadratic(np.vstack(L), np.concatenate(c))
+    model = objective.model
+    return coordinates(ridge(model, both), model.A, model.b, objective.order)

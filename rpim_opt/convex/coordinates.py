@@ -1,0 +1,53 @@
+"""Unknowns in which the squares of data and penalty are diagonal together, and the rows of the data by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.quadratic import Ridge
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """z = offset + B a, with the penalty weight |a_k|^2 on some of the a (p,), and rows A B sorted by groups.
+
+    Parameters
+    ----------
+    offset, B
+        (n,) and (n, p).
+    rows, b
+        (m, p) = A B, and (m,) = b - A offset.
+    penalized
+        (p,) which a the penalty sees.
+    gram
+        (p, p) = rows'rows.
+    """
+
+    offset: Array
+    B: Array
+    rows: Array
+    b: Array
+    penalized: np.ndarray
+    gram: Array
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(p, n) of the coordinates by z - offset."""
+        return np.asarray(np.linalg.pinv(self.B), dtype=float)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """(p,) squared lengths of the columns of rows."""
+        return np.diag(self.gram).copy()
+
+
+def coordinates(form: Ridge, A: Array, b: Array, order: np.ndarray) -> Coordinates:
+    """Return the coordinates in which data and penalty are both diagonal; ``order`` (m,) sorts equations by groups."""
+    B = np.hstack([form.B, form.free])
+    rows = (A @ B)[order]
+    penalized = np.arange(B.shape[1]) < form.B.shape[1]
+    return Coordinates(form.offset, B, rows, (b - A @ form.offset)[order], penalized, rows.T @ rows)

@@ -1,0 +1,281 @@
+"""Minima of losses that are sums over rows: Newton's method on whitened unknowns, ended by a duality gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs, solve_triangular
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.active_set import minimum_in_box
+from rpim_opt.convex.coordinates import Coordinates
+from rpim_opt.convex.line_search import searched
+from rpim_opt.convex.separated import Curvature, Separated, Smoothed
+from rpim_opt.problem.linear import RANK_TOLERANCE
+
+SOUGHT, ACCEPTED = 1e-13, 1e-10
+"""Duality gap, relative to the objective, that the method goes on to while that falls, and that it must reach."""
+MOST, SOON = 100, 15
+"""Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
+BLUNT = 10.0
+"""How sharp they then are, relative to those that a loss without multipliers begins with."""
+SHARPER, SHARPEST = 10.0, 1e9
+"""By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
+FLAT = 1e-10
+"""Curvature that unknowns have at least, where the data have about one."""
+FAR = 100.0
+"""No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
+UNSEEN = RANK_TOLERANCE**2
+"""Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
+SETTLED = 0.3
+"""Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
+VAIN = 3
+"""Steps that lower the gap no more, after which a good one is taken."""
+
+_potrf: Any
+_potrs: Any
+_potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
+
+
+class Point(NamedTuple):
+    """Where the method is: z (n,), coordinates a (p,), residual (m,), and the smoothed loss there."""
+
+    z: Array
+    a: Array
+    r: Array
+    smooth: Smoothed
+
+
+class Kinked(NamedTuple):
+    """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
+
+    multipliers: list[Array]
+    sharpness: float
+
+
+class Ended(NamedTuple):
+    """Where the method ended.
+
+    z (n,), duality gap, objective, steps, the kinks' state, the slope by z (n,) in a box, and the loss's (m,).
+    """
+
+    z: Array
+    gap: float
+    objective: float
+    steps: int
+    kinked: Kinked
+    slope: Array | None
+    of_loss: Array
+
+    @property
+    def good(self) -> bool:
+        """Whether the gap says that this is a minimum."""
+        return self.gap <= ACCEPTED * max(1.0, abs(self.objective))
+
+
+@dataclass(frozen=True, eq=False)
+class Newton:
+    """minimize  sum_i f_i(A_i z - b_i) + weight |L z - c|^2  in a box, by Newton's method.
+
+    In unknowns that whiten data and penalty together the second derivative of a loss about the identity is well
+    conditioned whatever the weight, so that a Cholesky factor of it serves. A step is followed by a search along it.
+    A loss with kinks is smoothed about multipliers (`Separated`), which then take a step themselves. In a box the step
+    is the minimum of the quadratic there, by the active set.
+
+    With y the slope of the loss (the smoothed one's is a subgradient) at z, g = A'y + penalty'(z) and Fenchel's
+    inequality, no point has an objective lower by more than ::
+
+        gap = (what the kinks miss) + sum_k g_k^2 / (4 weight)
+
+    over penalized coordinates; those without penalty add |g_k| times `FAR` of their size. Of the components on a
+    bound only those slopes count that lead inwards.
+
+    Parameters
+    ----------
+    loss
+        f.
+    at
+        The coordinates.
+    weight
+        Of the penalty.
+    box
+        Lower and upper (n,), or None.
+    """
+
+    loss: Separated
+    at: Coordinates
+    weight: float
+    box: tuple[Array, Array] | None = None
+
+    @cached_property
+    def pull(self) -> Array:
+        """(p,) weight of every coordinate's square."""
+        return np.where(self.at.penalized, self.weight, 0.0)
+
+    @cached_property
+    def unit(self) -> Array:
+        """(p,) size of a coordinate of which data and penalty together make one; zero where they do not see it."""
+        size = self.at.lengths + self.pull
+        seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
+        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
+
+    @property
+    def whole(self) -> bool:
+        """Whether the coordinates say all of z, as a box asks for."""
+        return len(self.unit) == len(self.at.offset) and bool((self.unit > 0).all())
+
+    def of_squares(self) -> Array:
+        """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
+        z = self.at.offset + self.at.B @ (self.unit**2 * (self.at.rows.T @ self.at.b))
+        if self.box is None:
+            return z
+        return np.clip(z, *self.box)
+
+    def multipliers(self, ended: Ended) -> Array:
+        """Return by how much the objective would fall per unit by which a bound were loosened, (n,)."""
+        if ended.slope is None:
+            return np.zeros_like(ended.z)
+        return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
+
+    def minimum(self, z: Array, kinked: Kinked | None = None, most: int = MOST) -> Ended:
+        """Return the minimum, or the best point of so many steps, begun at z (n,) with the multipliers of a neighbour.
+
+        Where the neighbour was too far for kinks as sharp as there, they begin blunter.
+        """
+        if self.loss.kinks and kinked is not None and most == MOST:
+            ended = self.minimum(z, kinked, SOON)
+            if ended.good:
+                return ended
+            blunt = self._begun(self.at.rows @ (self.at.inverse @ (ended.z - self.at.offset)) - self.at.b)
+            sharpness = min(BLUNT * blunt.sharpness, kinked.sharpness)
+            return self.minimum(ended.z, Kinked(ended.kinked.multipliers, sharpness), MOST - 1)
+        if self.box is not None:
+            z = np.clip(z, *self.box)
+        a = np.where(self.unit > 0, self.at.inverse @ (z - self.at.offset), 0.0)
+        if self.box is None:
+            z = self.at.offset + self.at.B @ a
+        r = self.at.rows @ a - self.at.b
+        if self.loss.kinks and kinked is None:
+            kinked = self._begun(r)
+        kinked = kinked or Kinked([], 1.0)
+        point = Point(z, a, r, self.loss.smoothed(r, *kinked))
+        best: Any = None
+        vain = 0
+        for steps in range(most):
+            slope = self._slope(point)
+            ended = self._judged(point, kinked, slope, steps)
+            vain += 1
+            if best is None or ended.gap < best.gap:
+                best = ended
+                vain = 0
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+                break
+            if self.loss.kinks and ended.gap - point.smooth.missing <= SETTLED * point.smooth.missing:
+                kinked = Kinked(point.smooth.multipliers, min(SHARPER * kinked.sharpness, SHARPEST))
+                point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
+            else:
+                point = self._stepped(point, slope, kinked)
+        return best
+
+    def _begun(self, r: Array) -> Kinked:
+        """Return multipliers of zero, and kinks as blunt as the residuals are large."""
+        sizes = [np.median(np.abs(a * r + c)) for _, (a, c) in self.loss.kinks]
+        factors = [np.median(factor) for factor, _ in self.loss.kinks]
+        sharpness = max(f / max(s, 1e-9) for f, s in zip(factors, sizes, strict=True))
+        return Kinked([np.zeros_like(r) for _ in self.loss.kinks], float(sharpness))
+
+    def _slope(self, point: Point) -> Array:
+        """Return the slope of the smoothed objective by the coordinates in their units, (p,)."""
+        return self.unit * (self.at.rows.T @ point.smooth.slope + 2 * self.pull * point.a)
+
+    def _bound(self, point: Point, slope: Array) -> tuple[float, Array | None]:
+        """Return by how much the smoothed objective may fall at most, and its slope by z (n,) in a box."""
+        by_z = None
+        if self.box is not None:
+            by_z = self.back.T @ slope
+            slope = (self.at.B * self.unit).T @ np.where(self.held(point.z, by_z), 0.0, by_z)
+        held = self.pull > 0
+        g = np.divide(slope, self.unit, out=np.zeros_like(slope), where=self.unit > 0)
+        gap = float(np.sum(g[held] ** 2 / (4 * self.pull[held])))
+        free = ~held & (self.unit > 0)
+        return gap + FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free]))), by_z
+
+    def held(self, z: Array, slope: Array) -> np.ndarray:
+        """Return which components of z (n,) a bound holds, for a slope (n,)."""
+        lower, upper = self.box or (-np.inf, np.inf)
+        return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
+
+    def _judged(self, point: Point, kinked: Kinked, slope: Array, steps: int) -> Ended:
+        gap, by_z = self._bound(point, slope)
+        objective = point.smooth.loss + float(self.pull @ point.a**2)
+        state = Kinked(point.smooth.multipliers, kinked.sharpness)
+        return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
+
+    @cached_property
+    def back(self) -> Array:
+        """(p, n) inverse of the coordinates in their units."""
+        return self.at.inverse / self.unit[:, None]
+
+    def _stepped(self, point: Point, slope: Array, kinked: Kinked) -> Point:
+        """Return the point after a step of Newton's."""
+        H = self._hessian(self.loss.curvature(point.r, *kinked))
+        factor, failed = _potrf(H)
+        if failed:
+            factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
+        if self.box is None:
+            step = -self.unit * _potrs(factor, slope)[0]
+            return self._searched(point, point.z, step, kinked)
+        u = self.back @ (point.z - self.at.offset)
+        R = np.triu(factor)
+        target = R @ u - solve_triangular(R, slope, trans=1)
+        z, _ = minimum_in_box(R @ self.back, target + R @ (self.back @ self.at.offset), *self.box, point.z)
+        step = self.unit * (self.back @ (z - point.z))
+        return self._searched(point, z, step, kinked)
+
+    def _hessian(self, curvatures: list[Curvature]) -> Array:
+        """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
+        rows = self.at.rows
+        across = sum(c.across for c in curvatures) + np.zeros(len(rows))
+        usual = np.partition(across, len(across) // 2)[len(across) // 2]
+        other = np.flatnonzero(across != usual)
+        if 2 * len(other) > len(rows):
+            X = np.sqrt(across)[:, None] * rows
+            H = X.T @ X
+        else:
+            X = rows[other]
+            H = usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+        for curvature in curvatures:
+            if len(curvature.along):
+                H += self._along(curvature)
+        H = self.unit[:, None] * H * self.unit
+        H[np.diag_indices_from(H)] += 2 * self.pull * self.unit**2 + FLAT
+        return H
+
+    def _along(self, curvature: Curvature) -> Array:
+        """Return what the curvatures along the groups' directions add."""
+        _, along, u = curvature
+        bent = np.flatnonzero(along)
+        X = self.loss.projected(self.at.rows, u, bent)
+        return X.T @ (along[bent][:, None] * X)
+
+    def _searched(self, point: Point, z: Array, step: Array, kinked: Kinked) -> Point:
+        """Return the point along a step where the smoothed objective is about least."""
+        ahead = self.at.rows @ step
+
+        def at(t: float) -> Point:
+            a, r = point.a + t * step, point.r + t * ahead
+            place = self.at.offset + self.at.B @ a
+            if self.box is not None:
+                place = np.clip(point.z + t * (z - point.z), *self.box)
+            return Point(place, a, r, self.loss.smoothed(r, *kinked))
+
+        def rise(p: Point) -> float:
+            slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)
+            if np.isfinite(slope) and np.isfinite(p.smooth.value):
+                return slope
+            return np.inf
+
+        return searched(at, rise, point, self.box is None)

@@ -1,0 +1,197 @@
+"""A loss that is a sum over rows or configurations, of the residual: value, slope and curvature, kinks smoothed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.rows import Affine, Kink, Rows
+
+NEAR_ZERO = 1e-150
+"""Norms below have no direction."""
+
+
+NONE: Array = np.empty(0)
+
+
+class Curvature(NamedTuple):
+    """Second derivative by the residual: ``across`` (m,) times 1, and ``along`` (N,) times u u' by groups.
+
+    u (m,) is a unit vector in every group; both are empty where there is one equation a group.
+    """
+
+    across: Array
+    along: Array = NONE
+    u: Array = NONE
+
+
+class Smoothed(NamedTuple):
+    """A loss with kinks smoothed: value, slope (m,), the kinks' multipliers anew, and what the kinks miss by them.
+
+    ``loss`` is its value without smoothing.
+    """
+
+    value: float
+    loss: float
+    slope: Array
+    multipliers: list[Array]
+    missing: float
+
+
+@dataclass(frozen=True, eq=False)
+class Separated:
+    """sum_i f_i(|r_i|) over groups of equations, or sum_i f_i(r_i) over equations, r (m,) ordered by groups.
+
+    A kink k |s| of s = a r + c is replaced by its Moreau envelope about multipliers y: the least over t of
+    k |t| + sharpness / 2 |t - s - y / sharpness|^2 (augmented Lagrangian; Rockafellar 1976, Math. Oper. Res. 1:97). Its
+    slope is the multiplier anew: one that stays what it is makes the minimum that of the loss itself.
+
+    Parameters
+    ----------
+    rows
+        f_i.
+    starts
+        (N,) the first equation of every group; None where the loss gets equations.
+    count
+        Equations m.
+    """
+
+    rows: Rows
+    starts: np.ndarray | None
+    count: int
+
+    @cached_property
+    def _sizes(self) -> np.ndarray:
+        if self.starts is None:
+            return np.ones(self.count, dtype=int)
+        return np.diff(np.append(self.starts, self.count))
+
+    @property
+    def _begin(self) -> np.ndarray:
+        """The first equation of every group, of one equation each where the loss gets those."""
+        if self.starts is None:
+            return np.arange(self.count)
+        return self.starts
+
+    @cached_property
+    def which(self) -> np.ndarray:
+        """(m,) the group of every equation."""
+        return np.repeat(np.arange(len(self._sizes)), self._sizes)
+
+    @cached_property
+    def at_zero(self) -> Any:
+        """Slopes (N,) of f_i at the norm zero, or one number: the kinks there."""
+        if self.starts is None:
+            return 0.0
+        slope = self.rows.both(np.zeros(len(self.starts)))[1]
+        for factor, of in self.rows.kinks:
+            slope = slope + factor * np.abs(of.a)
+        if np.ptp(slope) == 0:
+            return float(slope[0])
+        return slope
+
+    @cached_property
+    def kinks(self) -> list[Kink]:
+        """The kinks, as norms of groups or as absolute values of equations."""
+        if self.starts is None:
+            return list(self.rows.kinks)
+        if np.all(self.at_zero == 0):
+            return []
+        return [Kink(self.at_zero, Affine(1.0, 0.0))]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the sum is one that can be separated: its kinks over norms all at zero, and no slope falling."""
+        finite = np.all(np.isfinite(self.at_zero)) and np.all(np.asarray(self.at_zero) >= 0)
+        if self.starts is None:
+            return True
+        return bool(finite and all(np.all(of.c == 0) for _, of in self.rows.kinks))
+
+    def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
+        """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
+        sizes = self._sizes
+        if np.ptp(sizes) == 0:
+            k = sizes[0]
+            return np.einsum("nk,nkp->np", u.reshape(-1, k)[groups], rows.reshape(len(sizes), k, -1)[groups])
+        return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
+
+    def _norms(self, s: Array) -> Array:
+        if self.starts is None:
+            return np.abs(s)
+        return np.sqrt(np.add.reduceat(s * s, self.starts))
+
+    def _spread(self, v: Any) -> Any:
+        """Return numbers of groups (N,) by equation (m,)."""
+        if self.starts is None or np.ndim(v) == 0:
+            return v
+        return v[self.which]
+
+    def _smooth(self, r: Array) -> tuple[float, Array]:
+        """Return value and slope (m,) of what is no kink."""
+        if self.starts is None:
+            return self.rows.both(r)
+        v = self._norms(r)
+        value, slope = self.rows.both(v)
+        if self._tilted:
+            slope = slope + self._tilt
+            value += float(np.sum(self._tilt * v))
+        return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
+
+    @cached_property
+    def _tilt(self) -> Any:
+        """What kinks at zero add to the slope of the pieces, without the kink that is apart."""
+        tilt: Any = -self.at_zero
+        for factor, of in self.rows.kinks:
+            tilt = tilt + factor * np.abs(of.a)
+        return tilt
+
+    @cached_property
+    def _tilted(self) -> bool:
+        return bool(np.any(self._tilt))
+
+    def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
+        """Return the loss with its kinks smoothed about multipliers, (m,) each."""
+        value, slope = self._smooth(r)
+        anew = []
+        missing = 0.0
+        loss = value
+        for (factor, (a, c)), old in zip(self.kinks, y, strict=True):
+            s = a * r + c
+            t = sharpness * s + old
+            length = self._norms(t)
+            new = self._spread(np.minimum(1.0, factor / np.maximum(length, NEAR_ZERO))) * t
+            anew.append(new)
+            slope = slope + a * new
+            value += float(new @ s - (new - old) @ (new - old) / (2 * sharpness))
+            bent = float(np.sum(factor * self._norms(s)))
+            loss += bent
+            missing += bent - float(new @ s)
+        return Smoothed(value, loss, slope, anew, missing)
+
+    def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
+        """Return the second derivative of the smoothed loss, as a sum."""
+        found = [self._smooth_curvature(r)]
+        for (factor, (a, c)), old in zip(self.kinks, y, strict=True):
+            t = sharpness * (a * r + c) + old
+            length = np.maximum(self._norms(t), NEAR_ZERO)
+            inside = length <= factor
+            if self.starts is None:
+                found.append(Curvature(a**2 * sharpness * inside))
+                continue
+            across = sharpness * np.minimum(1.0, factor / length)
+            found.append(Curvature(self._spread(across), np.where(inside, 0.0, -across), t / self._spread(length)))
+        return found
+
+    def _smooth_curvature(self, r: Array) -> Curvature:
+        if self.starts is None:
+            return Curvature(self.rows.bend(r))
+        v = self._norms(r)
+        slope = self.rows.both(v)[1] + self._tilt
+        bend = self.rows.bend(v)
+        small = v <= NEAR_ZERO
+        across = np.where(small, bend, slope / np.where(small, 1.0, v))
+        return Curvature(self._spread(across), bend - across, r / self._spread(np.where(small, 1.0, v)))

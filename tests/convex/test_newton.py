@@ -1,0 +1,184 @@
+"""Losses that are sums over rows: the same minimum as an interior point's, with a gap that bounds what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex.gap import duality_gap
+from rpim_opt.convex.interior import interior
+from rpim_opt.convex.objective import Damping
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.tree import rows_of
+from tests.convex.test_formulation import model
+
+MODEL = model(condition=30.0).scaled(np.geomspace(0.3, 30.0, 30))
+EQUATIONS: dict[str, Any] = {
+    "huber": lambda r: cp.sum(cp.huber(r, 1.5)),
+    "absolute": cp.norm1,
+    "quantile": lambda r: cp.sum(cp.maximum(0.9 * r, -0.1 * r)),
+    "pseudo-Huber": lambda r: cp.sum(cp.norm(cp.vstack([r, np.ones(r.size)]), axis=0)),
+    "log cosh": lambda r: cp.sum(2 * cp.logistic(2 * r) - 2 * r),
+    "weighed": lambda r: cp.sum(cp.multiply(np.linspace(1, 2, r.size), cp.huber(r))) / 3,
+    "one-sided": lambda r: cp.sum(cp.square(cp.pos(r))) + 0.1 * cp.sum(cp.abs(r)),
+}
+NORMS: dict[str, Any] = {
+    "huber": ro.huber(1.0),
+    "norms": cp.sum,
+    "half and half": lambda v: cp.sum(cp.huber(v)) + 0.5 * cp.sum(v),
+    "pseudo-Huber": lambda v: cp.sum(cp.norm(cp.vstack([v, 2 * np.ones(v.size)]), axis=0)),
+}
+CASES = [(name, "equation") for name in EQUATIONS] + [(name, "configuration") for name in NORMS]
+
+
+def stated(name: str, over: str) -> ro.Formulation:
+    loss = (EQUATIONS if over == "equation" else NORMS)[name]
+    return ro.Formulation(name, loss=loss, penalty=cp.sum_squares, loss_over=over)
+
+
+def by_interior_point(program: Program, weight: float, damping: Damping | None = None) -> np.ndarray:
+    found = interior(program, weight, damping)
+    assert found.z is not None
+    return found.z
+
+
+@pytest.mark.parametrize(("name", "over"), CASES)
+@pytest.mark.parametrize("weight", [1e-6, 1.0, 1e3])
+def test_the_minimum_is_that_of_an_interior_point(name: str, over: str, weight: float) -> None:
+    program = ro.convex.pose(stated(name, over), MODEL)
+    assert program.separated is not None
+    found = program.solve(weight)
+    best = program.objective(by_interior_point(program, weight), weight)
+    assert found.objective == pytest.approx(best, rel=1e-9)
+    assert found.objective <= best * (1 + 1e-11)
+
+
+@pytest.mark.parametrize(("name", "over"), CASES)
+def test_the_minimum_is_that_of_the_written_problem(name: str, over: str) -> None:
+    program = ro.convex.pose(stated(name, over), MODEL)
+    accurate = {"tol_gap_rel": 1e-10, "tol_gap_abs": 1e-10, "tol_feas": 1e-10}
+    written = program.problem(0.7).solve(solver="CLARABEL", **accurate)
+    assert program.solve(0.7).objective == pytest.approx(written, rel=1e-8)
+
+
+@pytest.mark.parametrize(("name", "over"), CASES)
+def test_no_point_lies_lower_than_the_gap_allows(name: str, over: str) -> None:
+    """At points of all kinds, some near the minimum, objective - gap is a lower bound."""
+    program = ro.convex.pose(stated(name, over), MODEL)
+    best = program.proven(0.7)
+    assert np.isclose(best.objective, program.solve(0.7).objective, rtol=1e-9)
+    for k, noise in enumerate(np.random.default_rng(3).normal(size=(8, 12))):
+        z = best.z + 10.0**-k * noise
+        lower = program.objective(z, 0.7) - duality_gap(program, z, 0.7)
+        assert lower <= best.objective * (1 + 1e-10)
+
+
+@pytest.mark.parametrize("name", ["huber", "pseudo-Huber", "log cosh", "weighed"])
+def test_the_gap_of_a_smooth_loss_vanishes_at_its_minimum_alone(name: str) -> None:
+    program = ro.convex.pose(stated(name, "equation"), MODEL)
+    best = program.solve(0.7)
+    assert duality_gap(program, best.z, 0.7) <= 1e-10 * best.objective
+    assert duality_gap(program, best.z * 1.01, 0.7) > 1e-4 * best.objective
+
+
+def test_a_slope_that_is_none_proves_nothing() -> None:
+    """Of a sum of norms every vector within the unit ball is a slope at zero; others than the minimum's prove less."""
+    few = model(condition=30.0)
+    program = ro.convex.pose(stated("norms", "configuration"), few)
+    z = program.solve(1.0).z
+    near = program._met.nearest(1.0)
+    assert near is not None
+    slope = np.empty(len(few.b))
+    slope[program.order] = near.slope
+    tight = duality_gap(program, z, 1.0, slope)
+    assert tight <= 1e-9 * program.objective(z, 1.0)
+    for wrong in (-slope, np.zeros_like(slope)):
+        assert duality_gap(program, z, 1.0, wrong) > 1e3 * max(tight, 1e-12)
+
+
+@pytest.mark.parametrize(("name", "over"), CASES)
+def test_a_box_holds_and_its_multipliers_are_the_slopes(name: str, over: str) -> None:
+    """The sign of every parameter is stated: about half of them end at zero."""
+    boxed = replace(stated(name, over), constraints=(ro.convex.constraints.signed(1, "*"),))
+    program = ro.convex.pose(boxed, MODEL)
+    assert program.separated is not None
+    found = program.solve(0.1)
+    best = program.objective(np.maximum(by_interior_point(program, 0.1), 0.0), 0.1)
+    assert found.objective == pytest.approx(best, rel=1e-7)
+    assert found.objective <= best * (1 + 1e-10)
+    assert found.z.min() == 0.0
+    gradient = program.gradient(found.z, 0.1)
+    if not program.separated.kinks and gradient is not None:
+        assert found.duals[0] == pytest.approx(np.where(found.z == 0, gradient, 0.0), abs=1e-6 * np.abs(gradient).max())
+
+
+def test_damping_is_a_term_of_the_objective() -> None:
+    program = ro.convex.pose(stated("huber", "configuration"), MODEL)
+    damping = Damping(np.full(12, 0.5), np.linspace(1, 30, 12))
+    for weight in (0.0, 0.3):
+        found = program.solve(weight, damping=damping)
+        other = by_interior_point(program, weight, damping)
+        assert found.z == pytest.approx(other, abs=1e-6)
+
+
+def test_neighbours_change_where_the_method_begins_and_not_where_it_ends() -> None:
+    for name, over in [("huber", "equation"), ("quantile", "equation"), ("norms", "configuration")]:
+        weights = np.geomspace(1e-3, 1e3, 7)
+        warm = ro.convex.pose(stated(name, over), MODEL).path(weights)
+        for estimate in warm[::3]:
+            cold = ro.convex.pose(stated(name, over), MODEL).solve(estimate.weight)
+            assert estimate.objective == pytest.approx(cold.objective, rel=1e-9)
+
+
+def test_rows_without_data_and_a_weight_of_zero() -> None:
+    """Left-out configurations are rows of zeros; without a penalty, what the data do not see stays nominal."""
+    kept = MODEL.scaled(np.where(MODEL.group % 3 == 0, 0.0, 1.0))
+    for name, over in [("huber", "equation"), ("quantile", "equation"), ("norms", "configuration")]:
+        program = ro.convex.pose(stated(name, over), kept)
+        found = program.solve(0.5)
+        assert found.objective == pytest.approx(program.objective(by_interior_point(program, 0.5), 0.5), rel=1e-9)
+    blind = replace(MODEL, A=MODEL.A * (np.arange(12) != 4))
+    z = ro.convex.pose(stated("huber", "equation"), blind).solve(0.0).z
+    assert abs(z[4]) <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("loss", "over"),
+    [
+        (cp.max, "configuration"),
+        (cp.norm2, "equation"),
+        (lambda r: cp.sum(cp.huber(r[:20])), "equation"),
+        (lambda r: cp.sum(r) + 1e-6 * cp.max(r), "configuration"),
+        (lambda r: cp.sum(cp.huber(r)) + cp.norm_inf(r), "equation"),
+        (lambda v: cp.sum(cp.maximum(v, 3.0)), "configuration"),
+    ],
+)
+def test_what_is_no_sum_or_has_kinks_elsewhere_is_left_to_the_interior_point(loss: Any, over: str) -> None:
+    formulation = ro.Formulation("other", loss=loss, penalty=cp.sum_squares, loss_over=over)
+    program = ro.convex.pose(formulation, MODEL)
+    assert program.separated is None
+    assert program.solve(1.0).iterations > 0
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) -> None:
+    r = cp.Variable(9)
+    expression = EQUATIONS[name](r)
+    rows = rows_of(expression, r)
+    assert rows is not None
+    v = np.random.default_rng(2).normal(size=9)
+    value, slope = rows.both(v)
+    for factor, (a, c) in rows.kinks:
+        value += float(np.sum(factor * np.abs(a * v + c)))
+        slope = slope + factor * a * np.sign(a * v + c)
+    r.value = v
+    assert value == pytest.approx(expression.value, rel=1e-12)
+    assert slope == pytest.approx(np.asarray(expression.grad[r].todense()).ravel(), rel=1e-9)
+    h = 1e-5
+    bend = (rows.both(v + h)[1] - rows.both(v - h)[1]) / (2 * h)
+    assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
