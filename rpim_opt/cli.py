@@ -449,9 +449,7 @@ def study(
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on where an interrupted run was.")] = False,
     redraw: Annotated[bool, typer.Option(help="Only write the report anew, from the last run's replicates.")] = False,
-    gate: Annotated[
-        bool, typer.Option(help="Fail when a metric is worse than baselines.json beside it allows.")
-    ] = False,
+    gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
     as_json: Json = False,
 ) -> None:

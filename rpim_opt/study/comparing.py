@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -33,8 +33,8 @@ def compare(
     *,
     methods: Any = (),
     splits: Any = FOLDER,
-    counts: int | Sequence[int] | None = None,
-    noise: float | Sequence[float] = 1.0,
+    counts: Any = None,
+    noise: Any = 1.0,
     seeds: int | Iterable[int] = 1,
     metrics: Any = USUAL,
     options: Mapping[str, Any] | None = None,
@@ -205,7 +205,7 @@ class Plan:
         return {name: ", ".join(values) for name, values in axes.items()}
 
 
-def _counts(stated: int | Sequence[int] | None) -> tuple[int | None, ...]:
+def _counts(stated: Any) -> tuple[int | None, ...]:
     if stated is None:
         return (None,)
     return _whole("counts", stated, 1)
@@ -226,7 +226,7 @@ def _whole(where: str, stated: Any, least: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(int(v) for v in values))
 
 
-def _factors(stated: float | Sequence[float]) -> tuple[float, ...]:
+def _factors(stated: Any) -> tuple[float, ...]:
     values = list(stated) if isinstance(stated, Iterable) else [stated]
     numbers = [isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values]
     if not values or not all(numbers) or not all(np.isfinite(v) and v >= 1 for v in values):

@@ -119,7 +119,7 @@ class Comparison:
         """
         from rpim_opt.study.page import write_page
 
-        return write_page(self, Path(folder), self.summary(metric, against))
+        return write_page(Path(folder), self.rows, self.summary(metric, against), self.asked, self.made)
 
     def reference(self, metric: str | None = None, against: str | None = None) -> str:
         """Return the label of the method that others are compared with; arguments as for `summary`."""

@@ -18,7 +18,7 @@ FARTHEST = 30.0
 SHOWN = 6
 """Methods with a profile of their own; the others are grey."""
 BROADEST = 10.0
-"""Largest ratio of the profiles."""
+"""Largest ratio of the profiles; less where all that are named are done before."""
 
 
 def drawn(rows: Sequence[Mapping[str, Any]], summary: Summary) -> Any:
@@ -86,7 +86,7 @@ def _profiles(ax: Any, rows: Sequence[Mapping[str, Any]], summary: Summary) -> N
     for k, name in enumerate(ranked[:SHOWN]):
         _step(ax, of[name], color=f"C{k}", lw=1.6, label=name)
     ax.set_xscale("log")
-    ax.set_xlim(1, BROADEST)
+    ax.set_xlim(1, _end([of[name] for name in ranked[:SHOWN]]))
     ax.set_ylim(0, 1.02)
     _round_ticks(ax)
     ax.grid(alpha=0.25)
@@ -105,6 +105,12 @@ def _area(over: Any) -> float:
     return float(np.mean(np.maximum(np.log(BROADEST) - np.log(over), 0)))
 
 
+def _end(named: Sequence[Any]) -> float:
+    """Return where the axis of the profiles ends: a little beyond the last step of those that are named."""
+    finite = np.concatenate([over[np.isfinite(over)] for over in named])
+    return float(np.clip(1.1 * finite.max(initial=1.0), 1.2, BROADEST))
+
+
 def _step(ax: Any, over: Any, **style: Any) -> None:
     share = np.arange(1, len(over) + 1) / len(over)
     finite = np.isfinite(over)
@@ -115,8 +121,15 @@ def _step(ax: Any, over: Any, **style: Any) -> None:
 
 def _round_ticks(ax: Any) -> None:
     """Mark ratios by numbers that people say."""
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+    from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.xaxis.set_major_formatter(ScalarFormatter())
+    low, high = ax.get_xlim()
+    if high / low > 3:
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    else:
+        ax.xaxis.set_major_locator(LogLocator(subs=[k / 10 for k in range(10, 100)]))
+    if 1.2 < high / low <= 3:
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 1.2, 1.5, 2, 2.5, 3, 5, 6, 7, 8, 9)))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())

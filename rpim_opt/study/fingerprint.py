@@ -14,8 +14,11 @@ from typing import Any
 
 import numpy as np
 
-LIBRARIES = tuple({str(Path(sysconfig.get_path(key)).resolve()) for key in ("stdlib", "platstdlib", "purelib")})
 OURS = "rpim_opt"
+PLACES = [Path(sysconfig.get_path(key)) for key in ("stdlib", "platstdlib", "purelib")]
+PLACES += [Path(file).parents[1] for file in (__file__, np.__file__)]
+LIBRARIES = tuple({str(place.resolve()) for place in PLACES})
+"""Where code lies whose version a journal knows."""
 Seen = dict[int, tuple[int, Any]]
 """Things that were met, by their ids, with their numbers; they are kept, so that an id is theirs alone."""
 
@@ -94,7 +97,10 @@ def _of_code(thing: Any, seen: Seen) -> Iterator[bytes]:
     if isinstance(thing, ModuleType):
         module = thing.__name__
     yield getattr(thing, "__qualname__", module).encode()
-    if isinstance(thing, BuiltinFunctionType) or _of_library(module):
+    known = _of_library(module)
+    if isinstance(thing, FunctionType):  # what a script executes may say that it is of any module
+        known = thing.__code__.co_filename.startswith(LIBRARIES)
+    if isinstance(thing, BuiltinFunctionType) or known:
         yield module.encode()
     elif isinstance(thing, ModuleType):
         yield sha256(Path(str(thing.__file__)).read_bytes()).digest()

@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from rpim_opt.study.drawing import drawn
 from rpim_opt.study.replicate import NUMBERS
 from rpim_opt.study.standing import Summary, number
 
-if TYPE_CHECKING:
-    from rpim_opt.study.comparison import Comparison
-
 STEPS = (1.02, 1.1, 1.3, 2.0, 5.0)
 """Ratios to the best of a problem between which a cell's shade changes."""
 CAPTION = (
@@ -30,13 +27,18 @@ CAPTION = (
 )
 
 
-def write_page(comparison: Comparison, folder: Path, summary: Summary) -> Path:
+Rows = Sequence[Mapping[str, Any]]
+Said = Mapping[str, str]
+"""What was asked, or made the rows: names with what is said of them."""
+
+
+def write_page(folder: Path, rows: Rows, summary: Summary, asked: Said, made: Said) -> Path:
     """Write the page, the replicates and the figure into a folder: all of them, or none; return the page's path."""
-    figure = drawn(comparison.rows, summary)
+    figure = drawn(rows, summary)
     vector = _saved(figure, "svg", {"Date": None})
     files = {
-        "index.html": _html(comparison, summary, vector).encode(),
-        "replicates.csv": _csv(comparison.rows).encode(),
+        "index.html": _html(rows, summary, vector, asked, made).encode(),
+        "replicates.csv": _csv(rows).encode(),
         "comparison.svg": vector,
         "comparison.png": _saved(figure, "png", None),
     }
@@ -54,27 +56,28 @@ def _saved(figure: Any, kind: str, metadata: Any) -> bytes:
     return stream.getvalue()
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+def _csv(rows: Rows) -> str:
     names = list(rows[0])
     cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
     return csv_text(names, cells)
 
 
-def _html(comparison: Comparison, summary: Summary, vector: bytes) -> str:
-    methods = len(comparison.methods)
-    heading = f"{methods} methods on {', '.join(comparison.problems)}"
-    if len(comparison.problems) > 3:
-        heading = f"{methods} methods on {len(comparison.problems)} problems"
+def _html(rows: Rows, summary: Summary, vector: bytes, asked: Said, made: Said) -> str:
+    methods = len({row["method"] for row in rows})
+    problems = _problems(rows)
+    heading = f"{methods} methods on {', '.join(problems)}"
+    if len(problems) > 3:
+        heading = f"{methods} methods on {len(problems)} problems"
     parts = [
         tag("p", lead(summary), class_="lead"),
         _figure(vector),
         *section("Methods", data_table(_title(summary), summary.header, summary.cells()), *bullets(summary.notes[:3])),
-        *_by_problem(comparison, summary),
-        *_without(comparison),
-        *section("How it was made", facts([*comparison.asked.items(), *comparison.made.items()])),
+        *_by_problem(rows, summary),
+        *_without(rows),
+        *section("How it was made", facts([*asked.items(), *made.items()])),
     ]
-    made = comparison.made.get("Made", "")[:10]
-    return page(f"Comparison: {heading}", f"Comparison of calibrations, {made}", heading, parts, images=True)
+    kind = f"Comparison of calibrations, {made.get('Made', '')[:10]}"
+    return page(f"Comparison: {heading}", kind, heading, parts, images=True)
 
 
 def lead(summary: Summary) -> str:
@@ -106,10 +109,10 @@ def _figure(vector: bytes) -> Element:
     return tag("figure", image, tag("figcaption", CAPTION))
 
 
-def _by_problem(comparison: Comparison, summary: Summary) -> list[Element]:
+def _by_problem(rows: Rows, summary: Summary) -> list[Element]:
     """Return the median of every method on every problem, shaded by how near it is to the best there."""
     of: dict[tuple[str, str], list[float]] = {}
-    for row in comparison.rows:
+    for row in rows:
         if row.get(summary.metric) is not None:
             of.setdefault((row["method"], row["problem"]), []).append(row[summary.metric])
     medians = {key: float(np.median(values)) for key, values in of.items()}
@@ -118,9 +121,9 @@ def _by_problem(comparison: Comparison, summary: Summary) -> list[Element]:
         best[problem] = min(value, best.get(problem, np.inf))
     body = []
     for method in (each.method for each in summary.standings):
-        cells = [_cell(medians.get((method, problem)), best.get(problem)) for problem in comparison.problems]
+        cells = [_cell(medians.get((method, problem)), best.get(problem)) for problem in _problems(rows)]
         body.append(tag("tr", tag("th", method, scope="row"), *cells))
-    head = tag("tr", *(tag("th", name, scope="col") for name in ("method", *comparison.problems)))
+    head = tag("tr", *(tag("th", name, scope="col") for name in ("method", *_problems(rows))))
     title = f"Median {summary.metric} by problem; darker is farther from the best"
     grid = tag("table", tag("caption", title), tag("thead", head), tag("tbody", *body))
     return section("By problem", tag("div", grid, class_="wide", tabindex="0", role="region", aria_label=title))
@@ -133,18 +136,28 @@ def _cell(value: float | None, best: float | None) -> Element:
     return tag("td", number(value), class_=f"shade{shade}")
 
 
-def _without(comparison: Comparison) -> list[Element]:
+def _without(rows: Rows) -> list[Element]:
     """Return the replicates without figures, by method and reason."""
     counts: dict[tuple[str, str, str], dict[str, int]] = {}
-    for row in comparison.rows:
+    for row in rows:
         if row["status"] not in NUMBERS:
             where = counts.setdefault((row["method"], row["status"], row["reason"]), {})
             where[row["problem"]] = where.get(row["problem"], 0) + 1
     if not counts:
         return []
-    rows = [
-        [method, status, str(sum(where.values())), ", ".join(where), reason]
+    lines = [
+        [method, status, str(sum(where.values())), _where(where, rows), reason]
         for (method, status, reason), where in counts.items()
     ]
     header = ["method", "status", "replicates", "problems", "reason"]
-    return section("What could not be computed", data_table("Replicates without a figure", header, rows, prose=True))
+    return section("What could not be computed", data_table("Replicates without a figure", header, lines, prose=True))
+
+
+def _problems(rows: Rows) -> list[str]:
+    return list(dict.fromkeys(row["problem"] for row in rows))
+
+
+def _where(problems: Mapping[str, int], rows: Rows) -> str:
+    if len(problems) == len(_problems(rows)):
+        return "all"
+    return ", ".join(problems)

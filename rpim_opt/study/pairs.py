@@ -164,7 +164,7 @@ def _parts(label: str, ratios: Mapping[Pair, float], drawn: AbstractSet[str]) ->
     for pair, ratio in own.items():
         part = (pair[-1],) if by_seed else (pair[-1], *pair[1:3])
         parts.setdefault(part, []).append(ratio)
-    return np.array([np.mean(each) for each in parts.values()])
+    return np.array([float(np.mean(each)) for each in parts.values()])
 
 
 def _ends(means: Array, count: int) -> tuple[float, float]:

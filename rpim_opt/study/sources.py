@@ -99,25 +99,25 @@ def _of_path(path: str | Path) -> Iterator[Source]:
     yield Source(label or str(path), load(path))
 
 
-def _labelled(label: str, problem: Any) -> Source:
-    if isinstance(problem, str | Path):
-        return Source(label, load(problem))
-    made = _instance(problem, label)
+def _labelled(label: str, given: Any) -> Source:
+    if isinstance(given, str | Path):
+        return Source(label, load(given))
+    made = _instance(given, label)
     if made is not None:
         return Source(label, made)
-    if callable(problem):
-        return Source(label, problem)
-    if isinstance(problem, Program):
+    if callable(given):
+        return Source(label, given)
+    if isinstance(given, Program):
         raise InputError("problems", "a program", f"{ACCEPTED}; ro.select.compare compares selectors on a program")
-    raise InputError("problems", f"a {type(problem).__name__}", ACCEPTED)
+    raise InputError("problems", f"a {type(given).__name__}", ACCEPTED)
 
 
-def _name(problem: Any) -> str:
-    if isinstance(problem, Instance):
-        return problem.title
-    if isinstance(problem, CalibrationProblem):
-        return problem.robot.name
-    return getattr(problem, "__name__", type(problem).__name__)
+def _name(given: Any) -> str:
+    if isinstance(given, Instance):
+        return given.title
+    if isinstance(given, CalibrationProblem):
+        return given.robot.name
+    return getattr(given, "__name__", type(given).__name__)
 
 
 def _instance(made: Any, label: str) -> Instance | None:

@@ -55,7 +55,10 @@ class Summary:
     def header(self) -> tuple[str, ...]:
         """What the columns are called."""
         over = f"over {self.reference}"
-        return ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse", "no figure")
+        columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse")
+        if self._some_missing:
+            return (*columns, "no figure")
+        return columns
 
     def cells(self) -> list[list[str]]:
         """Return the table's rows as text."""
@@ -65,10 +68,14 @@ class Summary:
         against = [number(each.ratio), _between(each), f"{each.wins}/{each.ties}/{each.losses}"]
         if each.method == self.reference:
             against = ["1", "reference", ""]
-        missing = f"{each.missing} of {each.replicates}"
-        if not each.missing:
-            missing = ""
-        return [each.method, number(each.median), number(each.worst), *against, missing]
+        missing = []
+        if self._some_missing:
+            missing = [f"{each.missing} of {each.replicates}"]
+        return [each.method, number(each.median), number(each.worst), *against, *missing]
+
+    @property
+    def _some_missing(self) -> bool:
+        return any(each.missing for each in self.standings)
 
     def __str__(self) -> str:
         """Return the table and the notes."""
