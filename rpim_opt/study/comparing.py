@@ -62,9 +62,9 @@ def compare(
         Names, selectors, numbers, ``"learned"``, ``"folder"``; likewise. A formulation without penalty has no weight
         and is there once, with the selector ``none``.
     methods
-        Other methods: baselines by name (``"levenberg_marquardt"``, ``"nominal"``) and functions of the problem that
-        return deviations (n,) [SI], a calibration, or a function from joint values (N, dof) to positions (N, 3) [m];
-        in a list or by names of your own.
+        Other methods: baselines by name (``"levenberg_marquardt"``; ``"nominal"`` fits frames alone) and functions of
+        the problem that return deviations (n,) [SI], a calibration, or a function from joint values (N, dof) to
+        positions (N, 3) [m]; in a list or by names of your own.
     splits
         What is held out, always whole configurations: ``"folder"``, the validation data of the problem; a part of its
         data (``0.25``); in how many folds (``5``), one replicate a fold; or several of them.
@@ -106,7 +106,7 @@ def compare(
     ...     print(row["problem"], row["method"], row["status"], row["rms_mm"] and round(row["rms_mm"], 3))
     position tikhonov, learned ok 0.026
     position tikhonov, reml ok 0.026
-    position lasso, learned ok 0.024
+    position lasso, learned ok 0.026
     position lasso, reml impossible None
     >>> len(found.to_frame()), found.metric
     (8, 'rms_mm')
@@ -119,6 +119,7 @@ def compare(
         _factors(noise),
         _seeds(seeds),
         metrics_of(metrics),
+        options or {},
     )
     cases = plan.cases()
     made = provenance()
@@ -142,6 +143,8 @@ class Plan:
     ----------
     sources, methods, splits, counts, factors, seeds, metrics
         One entry a value of each axis; a count of None is all configurations.
+    options
+        Of every calibration.
     """
 
     sources: tuple[Source, ...]
@@ -151,6 +154,7 @@ class Plan:
     factors: tuple[float, ...]
     seeds: tuple[int, ...]
     metrics: Mapping[str, Callable[..., Any]]
+    options: Mapping[str, Any]
 
     def cases(self) -> list[dict[str, Any]]:
         """Return one plain table a replicate."""
@@ -201,8 +205,10 @@ class Plan:
             "Configurations": counts,
             "Noise factors": [f"{factor:g}" for factor in self.factors],
             "Seeds": [str(seed) for seed in self.seeds],
+            "Metrics": list(self.metrics),
+            "Options": [f"{name} = {value}" for name, value in self.options.items()],
         }
-        return {name: ", ".join(values) for name, values in axes.items()}
+        return {name: ", ".join(values) for name, values in axes.items() if values}
 
 
 def _counts(stated: Any) -> tuple[int | None, ...]:

@@ -43,9 +43,11 @@ class Comparison:
     >>> found = ro.compare(arms, selectors=["learned", "reml"], seeds=5)
     >>> found
     Comparison: 2 methods on 1 problem, 10 replicates (10 ok)
+    >>> found.metric, found.reference(), found.methods, found.problems
+    ('rms_mm', 'tikhonov, learned', ('tikhonov, learned', 'tikhonov, reml'), ('arms',))
     >>> best = found.summary().standings[0]
-    >>> best.method, best.wins
-    ('tikhonov, learned', 0)
+    >>> best.method, len(found.to_frame()), len(found.plot("max_mm").axes)
+    ('tikhonov, learned', 10, 2)
     >>> page = found.report("arms_compared")
     >>> page.name, sorted(path.name for path in page.parent.iterdir())
     ('index.html', ['comparison.png', 'comparison.svg', 'index.html', 'replicates.csv'])

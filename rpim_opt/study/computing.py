@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack
 from typing import Any
 
@@ -82,4 +83,7 @@ def _in_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[str, di
     except ImportError:
         raise InputError("workers", "no package joblib", "pip install 'rpim-opt[studies]'") from None
     finished: Any = Parallel(n_jobs=workers, return_as="generator_unordered")(delayed(_done)(*task) for task in tasks)
-    yield from finished
+    try:
+        yield from finished
+    except BrokenExecutor as error:
+        raise RpimError(f"A process ended before its replicate was done: {error} What was finished is kept.") from None

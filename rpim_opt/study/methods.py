@@ -16,6 +16,7 @@ from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_o
 from rpim_opt.convex.named import LEARNED, weight_of
 from rpim_opt.convex.select import SELECTORS
 from rpim_opt.convex.selection import require_weight
+from rpim_opt.problem.frames import fitted_frames
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.instances import Instance
 from rpim_opt.study.splits import FOLDER
@@ -26,24 +27,21 @@ Predictor = Callable[[Array], Array]
 """From joint values (N, dof) to predicted positions (N, 3) [m]."""
 
 
-def nominal(problem: CalibrationProblem) -> Array:
-    """Return no deviations (n,) at all."""
-    return np.zeros(len(problem.parameters.free))
-
-
 BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
-    "nominal": nominal,
+    "nominal": fitted_frames,
     **{name: getattr(baselines, name) for name in baselines.__all__},
 }
+"""Methods without convex programming; ``nominal`` fits base and tools alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method says of a problem: deviations (n,), a calibration with them, or how it predicts positions."""
+    """What a method says of a problem: deviations (n,), perhaps of a problem of its own; how it predicts positions."""
 
     x: Array | None = None
     result: Calibration | None = None
     predict: Predictor | None = None
+    problem: CalibrationProblem | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +109,18 @@ class Foreign:
 def answer_of(found: Any, problem: CalibrationProblem, label: str) -> Answer:
     """Return what a function of a problem returned: a calibration, a baseline, x (n,), or a function of q (N, dof).
 
+    Instead of x alone it may be a problem that identifies other parameters, and x.
+
     Raises
     ------
     InputError
         For anything else.
     """
     where = f"method {label}"
+    own = None
+    match found:
+        case (CalibrationProblem() as own, found):
+            problem = own
     n = len(problem.parameters.free)
     if isinstance(found, Calibration):
         return Answer(found.x, found)
@@ -129,7 +133,7 @@ def answer_of(found: Any, problem: CalibrationProblem, label: str) -> Answer:
         raise InputError(where, f"a {type(found).__name__}", _returns(n)) from None
     if x.shape != (n,) or not np.isfinite(x).all():
         raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", _returns(n))
-    return Answer(x)
+    return Answer(x, problem=own)
 
 
 def _returns(n: int) -> str:

@@ -38,7 +38,9 @@ class Fitted:
     >>> import rpim_opt as ro
     >>> def p95_mm(fitted):
     ...     return 1e3 * float(np.percentile(fitted.errors(), 95))
-    >>> found = ro.compare("position", "tikhonov", "reml", metrics={"p95_mm": p95_mm})
+    >>> def over_fit(fitted):
+    ...     return float(fitted.errors().mean() / fitted.fit_errors().mean())
+    >>> found = ro.compare("position", "tikhonov", "reml", metrics=[p95_mm, over_fit])
     >>> round(found.rows[0]["p95_mm"], 3)
     0.039
     """
@@ -60,7 +62,8 @@ class Fitted:
         if self.answer.result is not None:
             return self.answer.result.errors(data, dimension)
         if self.answer.x is not None:
-            return self.problem.on(data).errors(self.answer.x, dimension)
+            problem = self.answer.problem or self.problem
+            return problem.on(data).errors(self.answer.x, dimension)
         if dimension != "length":
             return np.full(len(data), np.nan)
         return self._missed(data)

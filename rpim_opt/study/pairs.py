@@ -49,8 +49,8 @@ class Standing:
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5)
     >>> second = found.summary().standings[1]
-    >>> second.method, second.replicates, second.wins + second.ties + second.losses
-    ('least_squares', 5, 5)
+    >>> second.method, second.replicates, second.wins + second.ties + second.losses, second.different
+    ('least_squares', 5, 5, False)
     """
 
     method: str

@@ -35,7 +35,9 @@ class Summary:
     >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
     >>> summary = found.summary(against="tikhonov, 1")
     >>> [each.method for each in summary.standings]
-    ['tikhonov, reml', 'tikhonov, 1', 'lasso, 1']
+    ['tikhonov, 1', 'tikhonov, reml', 'lasso, 1']
+    >>> summary.header[:2], summary.cells()[0][3:]
+    (('method', 'median rms_mm'), ['1', 'reference', ''])
     >>> summary.notes[-1]
     "lasso, reml: impossible, 5 of 5 replicates. Selector reml: found formulation 'lasso', accepted: ..."
     >>> len(summary.to_frame())

@@ -77,7 +77,8 @@ def test_foreign_methods_are_compared_as_ours_are() -> None:
     of = {row["method"]: row for row in found.rows}
     assert of["x"]["rms_mm"] == pytest.approx(of["tikhonov, 1"]["rms_mm"], rel=1e-12)
     assert of["positions"]["rms_mm"] == pytest.approx(of["tikhonov, 1"]["rms_mm"], rel=1e-9)
-    assert of["nominal"]["rms_mm"] > 1
+    nominal = 1e3 * POSITION.calibrate().nominal_errors(POSITION.validation)
+    assert of["nominal"]["rms_mm"] == pytest.approx(np.sqrt(np.mean(nominal**2)), rel=1e-6)
     assert (of["broken"]["status"], of["broken"]["reason"]) == ("failed", "ZeroDivisionError: of course")
     assert of["short"]["status"] == "impossible"
     assert "34 finite deviations [SI]" in of["short"]["reason"]
