@@ -63,7 +63,7 @@ _MOVED = {
         "write_ur_kinematics",
         "write_urdf",
     ),
-    "select": ("Selection", "compare"),
+    "select": ("Selection",),
     "show": ("write_report",),
     "store": ("Instance", "new_problem"),
     "study": ("Metric", "Report"),

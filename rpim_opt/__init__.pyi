@@ -51,5 +51,6 @@ from .robot import robots as robots
 from .show import plot as plot
 from .store import load as load
 from .store import load_result as load_result
+from .study import compare as compare
 from .use import read_measurements as read_measurements
 from .use import read_targets as read_targets

@@ -441,13 +441,15 @@ def design(
 
 @app.command()
 def study(
-    name: Annotated[str, typer.Argument(help="A file of the folder studies, without its ending.")],
+    name: Annotated[
+        str, typer.Argument(help="A file mine.py, a folder with study.py, or a study of the checkout by its name.")
+    ],
     quick: Annotated[bool, typer.Option(help="The small version.")] = False,
     workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on where an interrupted run was.")] = False,
     redraw: Annotated[bool, typer.Option(help="Only write the report anew, from the last run's replicates.")] = False,
-    gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than studies/baselines.json allows.")] = False,
+    gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -455,19 +457,12 @@ def study(
 
     With --gate exit code 1 if a metric got worse.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+    from rpim_opt.basics.progress import shown
     from rpim_opt.study.report import regressions
     from rpim_opt.study.runner import run_study
 
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=as_json) as bar:
-        task = bar.add_task(name)
-        report, folder = run_study(
-            name, quick, workers, scheduler, resume, redraw, out,
-            progress=lambda done, every: bar.update(task, completed=done, total=every),
-        )  # fmt: skip
+    with shown(name, not as_json) as say:
+        report, folder = run_study(name, quick, workers, scheduler, resume, redraw, out, progress=say)
     worse: list[str] = []
     if gate:
         worse = regressions(name, quick, report.metrics)
@@ -475,6 +470,54 @@ def study(
     show(text, {"report": report.text, "metrics": report.metrics, "worse": worse, "written": [folder]}, as_json)
     if worse:
         fail("\n".join(f"Worse: {line}" for line in worse), 1)
+
+
+@app.command()
+def compare(
+    problems: Annotated[
+        list[str], typer.Argument(help="Problem folders, names that come with rpim-opt, a folder of problem folders.")
+    ],
+    formulations: Annotated[
+        str, typer.Option(help="tikhonov,robust,...: ready ones, or folder for each folder's own.")
+    ] = "tikhonov",
+    selectors: Annotated[str, typer.Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
+    methods: Annotated[str, typer.Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
+    splits: Annotated[
+        str, typer.Option(help="What is held out: folder, a part (0.25), a number of folds (5); or several.")
+    ] = "folder",
+    counts: Annotated[str, typer.Option(help="Numbers of configurations to identify from: 10,25; all without.")] = "",
+    noise: Annotated[str, typer.Option(help="Factors on the noise of the data to fit: 1,3.")] = "1",
+    seeds: Annotated[int, typer.Option(min=1, help="How many draws of what is drawn.")] = 1,
+    metrics: Annotated[str, typer.Option(help="The first one is summed up: rms_mm,max_mm,...")] = "",
+    against: Annotated[str | None, typer.Option(help="Method that others are compared with: 'tikhonov, reml'.")] = None,
+    workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on where an interrupted run with the same --out was.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Folder for the page, the replicates and the figure.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare formulations, selectors and baselines on problems, in pairs, on configurations that they did not see.
+
+    With --out every replicate is written down when it is finished, and a page index.html in the end.
+    """
+    from rpim_opt.show.options import listed_numbers, listed_words
+    from rpim_opt.study.comparing import compare
+    from rpim_opt.study.metrics import USUAL
+
+    journal = None if out is None else out / "replicates.jsonl"
+    found = compare(
+        problems, listed_words(formulations), listed_numbers(selectors), methods=listed_words(methods),
+        splits=listed_numbers(splits), counts=listed_numbers(counts) or None, noise=listed_numbers(noise), seeds=seeds,
+        metrics=listed_words(metrics) or USUAL, workers=workers, scheduler=scheduler, journal=journal, resume=resume,
+        progress=not as_json,
+    )  # fmt: skip
+    summary = found.summary(against=against)
+    written: list[Path] = []
+    if out is not None and journal is not None:
+        written = [found.report(out, against=against)]
+        journal.unlink()
+    text = "\n".join([repr(found), "", str(summary), *(f"\nWritten: {path}" for path in written)])
+    show(text, {"replicates": found.rows, "made": found.made, "notes": summary.notes, "written": written}, as_json)
 
 
 @app.command()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+Named = TypeVar("Named")
 LONGEST = 1000
 """Characters of a part of a sentence."""
 
@@ -205,3 +206,10 @@ def choices(found: str, known: Iterable[str], many: int = 24) -> str:
     listed = ", ".join(shown) if names else "nothing"
     more = f" and {len(names) - len(shown)} others" if len(shown) < len(names) else ""
     return f"{listed}{more} (did you mean {' or '.join(close)}?)" if close else listed + more
+
+
+def pick(known: Mapping[str, Named], name: str, where: str, file: object = None, also: str = "") -> Named:
+    """Return ``known[name]``, or list what there is."""
+    if name not in known:
+        raise InputError(where, f"'{name}'", also + choices(name, known), file)
+    return known[name]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
 import re
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -193,3 +195,18 @@ def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:
         if not text.isprintable():
             raise InputError(f"row {number}, column {column}", repr(text[:40]), "printable text")
     return result
+
+
+def frame_of(rows: Sequence[dict[str, Any]]) -> Any:
+    """Return rows as a data frame of pandas, or of polars where that is missing.
+
+    Raises
+    ------
+    InputError
+        Where neither is installed.
+    """
+    with contextlib.suppress(ImportError):
+        return import_module("pandas").DataFrame(list(rows))
+    with contextlib.suppress(ImportError):
+        return import_module("polars").DataFrame(list(rows), infer_schema_length=None)
+    raise InputError("the data frame", "neither pandas nor polars", "pip install 'rpim-opt[studies]'")

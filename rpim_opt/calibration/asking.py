@@ -17,6 +17,7 @@ from rpim_opt.calibration.outcome import Iteration
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.weighed import calibrated, require_passes
 from rpim_opt.convex.formulation import Formulation, tikhonov
+from rpim_opt.convex.named import formulation_of, weight_of
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.select import Selector
 from rpim_opt.problem.frames import relocated
@@ -37,7 +38,7 @@ ELSEWHERE = " Frames were stated far from where the data put them; their deviati
 @one_blas_thread
 def calibrate(
     problem: Source,
-    formulation: Formulation = tikhonov,
+    formulation: Formulation | str = tikhonov,
     weight: float | str | Selector | Mapping[str, Any] | None = None,
     *,
     prior: Prior | None = None,
@@ -70,12 +71,12 @@ def calibrate(
     problem
         What was measured, and what is to be identified.
     formulation
-        The convex program of a pass; its functions are asked now.
+        The convex program of a pass, or the name of a ready one (``"robust"``); its functions are asked now.
     weight
-        None: sizes are learned. A number, or a selector (or its name) over the stated scales, which sees identification
-        data only; it is asked anew until the steps become small, then the weight stays, and one that takes turns
-        between weights is answered, with a sentence. Several weights by patterns, kinds or links of parameters:
-        ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
+        None or ``"learned"``: sizes are learned. A number, or a selector (or its name) over the stated scales, which
+        sees identification data only; it is asked anew until the steps become small, then the weight stays, and one
+        that takes turns between weights is answered, with a sentence. Several weights by patterns, kinds or links of
+        parameters: ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
     prior
         What is believed of the deviations before the data, beyond the scales of the parameters.
     model
@@ -113,7 +114,11 @@ def calibrate(
     0.024 mm. Converged after 1 pass.
     >>> print(ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml).message)
     Converged after 4 passes.
+    >>> ro.calibrate(instance.problem, "robust", "reml").formulation.name  # ready ones by their names
+    'Huber'
     """
+    formulation = formulation_of(formulation)
+    weight = weight_of(weight)
     how = {
         "max_iterations": max_iterations,
         "tolerance": tolerance,

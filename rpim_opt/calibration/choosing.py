@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
+from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.select import SELECTORS, Selection, Selector
+from rpim_opt.convex.select import Selection, Selector
 from rpim_opt.convex.selection import require_weight
 
 SETTLED = 1e-3
@@ -116,9 +117,7 @@ def choosing(weight: float | str | Selector, penalized: bool) -> Choosing:
         For anything else.
     """
     if isinstance(weight, str):
-        if weight not in SELECTORS:
-            raise InputError("weight", f"'{weight}'", f"a number, a selector, or one of {choices(weight, SELECTORS)}")
-        weight = SELECTORS[weight]
+        weight = selector_of(weight, also="a number, a selector, ")
     if callable(weight):
         return Choosing(weight, settled=not penalized, final=not penalized)
     if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):

@@ -10,7 +10,7 @@ import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
 from rpim_opt.robot.parameters import Parameters
 
@@ -257,3 +257,25 @@ FORMULATIONS = {
     "lasso": lasso,
     "group_lasso": group_lasso,
 }
+
+
+def formulation_of(stated: Formulation | str) -> Formulation:
+    """Return a formulation, or the ready one of that name.
+
+    Raises
+    ------
+    InputError
+        For a name that no ready formulation has, and for what is no formulation.
+
+    Examples
+    --------
+    >>> from rpim_opt.convex.formulation import formulation_of
+    >>> formulation_of("robust").name
+    'Huber'
+    """
+    if isinstance(stated, str):
+        return pick(FORMULATIONS, stated, "formulation")
+    if not isinstance(stated, Formulation):
+        accepted = f"a Formulation, or the name of a ready one: {', '.join(FORMULATIONS)}"
+        raise InputError("formulation", f"a {type(stated).__name__}", accepted)
+    return stated

@@ -16,7 +16,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.by_rows import Met, by_rows
 from rpim_opt.convex.closed import minimum, minimum_between, path_between, shares, values
 from rpim_opt.convex.conflict import advice, conflict
-from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.gap import duality_gap
 from rpim_opt.convex.interior import Found, interior
 from rpim_opt.convex.objective import Damping, Objective
@@ -266,13 +266,13 @@ class Program(Objective):
         raise NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
 
 
-def pose(formulation: Formulation, model: LinearModel) -> Program:
+def pose(formulation: Formulation | str, model: LinearModel) -> Program:
     """Return the program of a formulation on a linear model; the formulation's functions are asked now, once.
 
     Parameters
     ----------
     formulation
-        What is stated.
+        What is stated, or the name of a ready formulation.
     model
         Equations A z ~ b.
 
@@ -290,6 +290,7 @@ def pose(formulation: Formulation, model: LinearModel) -> Program:
     >>> program.closed_form, len(program.path([1e-3, 1.0]))
     (True, 2)
     """
+    formulation = formulation_of(formulation)
     if not formulation.solvable:
         return Program(formulation, model, Unposed(formulation, model))
     return Program(formulation, model, posed(formulation, model))

@@ -79,3 +79,22 @@ def asked_of(units: str, *, columns: str, key: str, quaternion: str, rotation: s
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
     return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key)
+
+
+def listed_words(text: str) -> list[str]:
+    """Return the words of a list with commas, ``tikhonov,robust``."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def listed_numbers(text: str) -> list[str | int | float]:
+    """Return the words of a list with commas, of which those that are numbers are numbers."""
+    return [_number_or_word(word) for word in listed_words(text)]
+
+
+def _number_or_word(word: str) -> str | int | float:
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            continue
+    return word

@@ -2,25 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from rpim_opt.basics.markup import Element, table, tag
+from rpim_opt.basics.markup import Element, tag
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.show.svg import Chart
-
-
-def section(name: str, *content: Element | str) -> list[Element]:
-    """Return a section with its heading."""
-    key = name.lower().replace(" ", "-")
-    return [tag("section", tag("h2", name, id=key), *content, aria_labelledby=key)]
-
-
-def data_table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]], prose: bool = False) -> Element:
-    """Return a table that scrolls by itself where it is too wide; with ``prose`` its last column is running text."""
-    grid = table(header, rows)
-    grid.insert(0, tag("caption", caption))
-    return tag("div", grid, class_="wide prose" if prose else "wide", tabindex="0", role="region", aria_label=caption)
 
 
 def figure(chart: Chart, caption: str, *legend: tuple[str, str]) -> Element:
@@ -28,13 +13,6 @@ def figure(chart: Chart, caption: str, *legend: tuple[str, str]) -> Element:
     keys = [tag("span", tag("i", class_=f"key {name}"), text) for name, text in legend]
     head = [tag("div", *keys, class_="legend")] if keys else []
     return tag("figure", *head, chart.element(), tag("figcaption", caption))
-
-
-def bullets(lines: Sequence[str], class_: str = "") -> list[Element]:
-    """Return a list, or nothing where it would be empty."""
-    if not lines:
-        return []
-    return [tag("ul", *(tag("li", line) for line in lines), class_=class_)]
 
 
 def mm(value: float) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from rpim_opt.basics.markup import html, tag
+from rpim_opt.basics.page import page as whole
 from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -75,27 +73,7 @@ def page(result: Calibration) -> str:
         *convergence_section(result),
         *provenance_section(result),
     ]
-    style = (HERE / "report.css").read_text(encoding="utf-8")
     script = (HERE / "report.js").read_text(encoding="utf-8")
-    embedded = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no text can end the script element
-    policy = f"default-src 'none'; style-src {_hash(style)}; script-src {_hash(script)}"
-    head = tag(
-        "head",
-        tag("meta", charset="utf-8"),
-        tag("meta", http_equiv="Content-Security-Policy", content=policy),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="color-scheme", content="light dark"),
-        tag("title", f"Calibration: {title}"),
-        tag("style", style),
-    )
-    main = tag(
-        "main",
-        tag("header", tag("p", f"Robot calibration, {result.record.made[:10]}", class_="kind"), tag("h1", title)),
-        *parts,
-    )
-    body = tag("body", main, tag("script", embedded, id="data", type="application/json"), tag("script", script))
-    return "<!doctype html>\n" + html(tag("html", head, body, lang="en")) + "\n"
-
-
-def _hash(text: str) -> str:
-    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
+    embedded = json.dumps(data, allow_nan=False)
+    kind = f"Robot calibration, {result.record.made[:10]}"
+    return whole(f"Calibration: {title}", kind, title, parts, script, embedded)

@@ -8,10 +8,11 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.pieces import BEFORE_AFTER, data_table, figure, mm, section, sets
+from rpim_opt.show.pieces import BEFORE_AFTER, figure, mm, sets
 from rpim_opt.show.scales import error_bins
 from rpim_opt.show.svg import Axis, Chart
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import RpimError
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import bullets, data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.observability import combination, observe
-from rpim_opt.show.pieces import bullets, data_table, figure, mm, section
+from rpim_opt.show.pieces import figure, mm
 from rpim_opt.show.svg import Axis, Chart
 
 

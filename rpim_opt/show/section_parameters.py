@@ -7,10 +7,11 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.show.pieces import data_table, figure, section
+from rpim_opt.show.pieces import figure
 from rpim_opt.show.svg import Axis, Chart
 
 

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.show.pieces import data_table, section, sets
+from rpim_opt.show.pieces import sets
 from rpim_opt.store.definition import definition
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import section
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import mm, section, sets
+from rpim_opt.show.pieces import mm, sets
 from rpim_opt.show.scales import magnification
 
 MOST = 2000

@@ -6,10 +6,11 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import bullets, mm, quantity, repeated, sets
+from rpim_opt.show.pieces import mm, quantity, repeated, sets
 
 
 def summary_section(result: Calibration) -> list[Element]:

@@ -11,11 +11,12 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import NoSolutionFound
 from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.program import Estimate
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
-from rpim_opt.show.pieces import data_table, figure, mm, section, sets
+from rpim_opt.show.pieces import figure, mm, sets
 from rpim_opt.show.svg import Axis, Chart
 
 TITLE = "Weight of the penalty"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
+from rpim_opt.convex.named import LEARNED
 from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.selection import require_weight
 
-Named = TypeVar("Named")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -37,11 +35,7 @@ def find(name: str | Path) -> Path:
 
 def named_formulation(text: str, file: Path | None = None) -> Formulation:
     """Return the ready formulation of that name."""
-    return pick(FORMULATIONS, text, "formulation", file)
-
-
-LEARNED = "learned"
-"""What a file or a command says for sizes that are learned from the data, and no weight."""
+    return pick(FORMULATIONS, text, "key formulation", file)
 
 
 def named_weight(text: str, file: Path | None = None) -> float | Selector | None:
@@ -51,12 +45,5 @@ def named_weight(text: str, file: Path | None = None) -> float | Selector | None
     try:
         value = float(text)
     except ValueError:
-        return pick(SELECTORS, text, "selector", file, f"a number, {LEARNED}, ")
+        return pick(SELECTORS, text, "key selector", file, f"a number, {LEARNED}, ")
     return require_weight(value, "selector", file)
-
-
-def pick(known: Mapping[str, Named], name: str, what: str, file: Path | None = None, also: str = "") -> Named:
-    """Return ``known[name]``, or list what there is."""
-    if name not in known:
-        raise InputError(f"key {what}", f"'{name}'", also + choices(name, known), file)
-    return known[name]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.units import split_unit
@@ -25,7 +25,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.named import find, named_formulation, named_weight, pick
+from rpim_opt.store.named import find, named_formulation, named_weight
 from rpim_opt.store.prior_table import PriorTable
 from rpim_opt.store.proposal import proposed
 
@@ -155,7 +155,7 @@ def read_problem(
     table, placed = _tables(read_toml(path), variant, kinds, path)
     observations = _observations(table, path)
     for each in observations:
-        pick(kinds, each.measurement, "measurement", path)
+        pick(kinds, each.measurement, "key measurement", path)
         _require_inside(each, path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)

@@ -1,4 +1,9 @@
 from .arms import SimulatedArm as SimulatedArm
 from .arms import simulated_arm as simulated_arm
+from .comparing import compare as compare
+from .comparison import Comparison as Comparison
+from .metrics import Fitted as Fitted
+from .pairs import Standing as Standing
 from .report import Metric as Metric
 from .report import Report as Report
+from .standing import Summary as Summary

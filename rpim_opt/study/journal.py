@@ -20,27 +20,27 @@ Row = dict[str, Any]
 class Journal:
     """A file with one line a finished replicate, written at once: what was computed is not lost.
 
-    Its first line says which code computes; only that code goes on with it.
+    Its first line says which code computes; only that code goes on with it. Without a path nothing is written.
     """
 
-    def __init__(self, path: Path, cases: Sequence[Mapping[str, Any]], code: Mapping[str, str], resume: bool):
+    def __init__(self, path: Path | None, cases: Sequence[Mapping[str, Any]], code: Mapping[str, str], resume: bool):
         self.path = path
         self.code = dict(code)
         self.cases = [(json.dumps(case, sort_keys=True), case) for case in cases]
         self.done: dict[str, Row] = {}
-        if resume and (path.exists() or path.is_symlink()):
-            self.done = self._finished()
+        if path is not None and resume and (path.exists() or path.is_symlink()):
+            self.done = self._finished(path)
         else:
             self.close()
             self._write({"code": self.code})
 
-    def _finished(self) -> dict[str, Row]:
+    def _finished(self, path: Path) -> dict[str, Row]:
         """Return the replicates of an interrupted run; a line cut off by its end is left out, and taken away."""
-        content = read_bytes(self.path, LARGEST_DATA)
+        content = read_bytes(path, LARGEST_DATA)
         whole = content.rfind(b"\n") + 1
         if whole < len(content):
-            with refused(self.path):
-                os.truncate(self.path, whole)
+            with refused(path):
+                os.truncate(path, whole)
         lines = [self._entry(line, number) for number, line in enumerate(content[:whole].splitlines(), start=1)]
         if not lines:
             self._write({"code": self.code})
@@ -96,6 +96,8 @@ class Journal:
         self.done[key] = found
 
     def _write(self, entry: Mapping[str, Any]) -> None:
+        if self.path is None:
+            return
         with refused(self.path), self.path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(entry) + "\n")
             stream.flush()
@@ -103,6 +105,8 @@ class Journal:
 
     def close(self) -> None:
         """Remove the file: everything is where it belongs."""
+        if self.path is None:
+            return
         with refused(self.path):
             self.path.unlink(missing_ok=True)
 

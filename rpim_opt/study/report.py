@@ -12,7 +12,7 @@ from typing import Any
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import json_text
 from rpim_opt.basics.writing import refused, write_files
-from rpim_opt.study.grid import find_study, load_study, studies_folder
+from rpim_opt.study.grid import find_study, load_study, name_of
 
 
 @dataclass(frozen=True)
@@ -86,16 +86,17 @@ def _drawn(title: str, figure: Any) -> dict[str, bytes]:
     return {f"{title}.svg": vector.getvalue(), f"{title}.png": pixels.getvalue()}
 
 
-def regressions(name: str, quick: bool, metrics: Mapping[str, float]) -> list[str]:
-    """Return a sentence for every metric that is worse than the committed baseline allows."""
-    path = studies_folder() / "baselines.json"
+def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:
+    """Return a sentence for every metric that is worse than ``baselines.json`` beside the study allows."""
+    file = find_study(name)
+    path = file.parent / "baselines.json"
     known: dict[str, dict[str, float]] = {}
     if path.is_file():
         known = json.loads(path.read_text(encoding="utf-8"))
-    label = f"{name}-quick" if quick else name
+    label = f"{name_of(file)}-quick" if quick else name_of(file)
     if label not in known:
         raise InputError("baseline", f"none for '{label}'", choices(label, known), path)
-    rules = load_study(find_study(name)).METRICS
+    rules = load_study(file).METRICS
     worse = []
     for metric, baseline in known[label].items():
         rule = rules[metric]

@@ -49,7 +49,7 @@ def report(rows):
 def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "studies"
     folder.mkdir()
-    for module in (grid, provenance, report):
+    for module in (grid, provenance):
         monkeypatch.setattr(module, "studies_folder", lambda: folder)
 
     def write(stop: bool = False) -> Path:
@@ -221,7 +221,7 @@ def report(rows):
 
 @pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (grid, provenance, report):
+    for module in (grid, provenance):
         monkeypatch.setattr(module, "studies_folder", lambda: tmp_path)
     (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
     here, _ = run_study("monte_carlo", out=tmp_path / "here")
@@ -379,16 +379,21 @@ def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> N
         subprocess.run(command, check=True, capture_output=True)
 
     (tmp_path / "studies").mkdir()
-    monkeypatch.setattr(provenance, "studies_folder", lambda: tmp_path / "studies")
+    for module in (grid, provenance):
+        monkeypatch.setattr(module, "studies_folder", lambda: tmp_path / "studies")
+
+    def made_by_toy() -> str:
+        return provenance.made_by(tmp_path / "studies" / "toy.py", False, 1)
+
     git("init")
     git("commit", "--allow-empty", "-m", "first")
-    assert "dirty" not in provenance.made_by("toy", False, 1)
+    assert "dirty" not in made_by_toy()
     (tmp_path / "notes.txt").write_text("nobody runs this")
     (tmp_path / "studies" / "results").mkdir()
     (tmp_path / "studies" / "results" / "README.md").write_text("of another study")
-    assert "dirty" not in provenance.made_by("toy", False, 1)
+    assert "dirty" not in made_by_toy()
     (tmp_path / "studies" / "toy.py").write_text("QUESTION = 1")
-    assert "-dirty" in provenance.made_by("toy", False, 1)
+    assert "-dirty" in made_by_toy()
 
 
 def test_a_broken_table_of_replicates_is_one_sentence(toy, tmp_path: Path) -> None:

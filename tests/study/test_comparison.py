@@ -1,0 +1,400 @@
+"""One call for a comparison: its grid, its pairs, and the same rows whoever computes them and however often killed."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.study.fingerprint import fingerprint
+from tests import ROOT
+
+TWO = ["position", "seven_axis"]
+POSITION = ro.load("position")
+
+
+def timeless(found: ro.study.Comparison) -> list[dict]:
+    """Return the rows without what the clock says."""
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in found.rows]
+
+
+def test_a_grid_has_one_row_a_replicate() -> None:
+    found = ro.compare(TWO, ["tikhonov", "lasso", "least_squares"], ["learned", "reml", 1.0], progress=False)
+    assert len(found.rows) == 2 * (3 + 3 + 1)  # least squares has no weight
+    assert found.methods[-1] == "least_squares"
+    assert found.problems == tuple(TWO)
+    for row in found.rows:
+        if (row["formulation"], row["selector"]) == ("lasso", "reml"):
+            assert row["status"] == "impossible"
+            assert row["reason"].startswith("selector reml: found formulation 'lasso', accepted: a quadratic penalty")
+            assert row["rms_mm"] is None
+        else:
+            assert row["status"] == "ok"
+            assert 0 < row["mean_mm"] < row["rms_mm"] < row["max_mm"] < 0.1
+    frame = found.to_frame()
+    assert len(frame) == len(found.rows)
+    assert {"problem", "method", "split", "seed", "status", "reason", "rms_mm", "seconds"} < set(frame.columns)
+
+
+def test_a_row_is_what_a_script_computes() -> None:
+    found = ro.compare("position", "robust", "reml", progress=False)
+    result = POSITION.calibrate(formulation=ro.robust, weight=ro.reml)
+    errors = 1e3 * result.errors(POSITION.validation)
+    row = found.rows[0]
+    assert row["rms_mm"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-12)
+    assert row["max_mm"] == pytest.approx(errors.max(), rel=1e-12)
+    assert row["weight"] == result.weight
+    assert (row["configurations"], row["parameters"]) == (40, 34)
+
+
+def mine(problem: ro.CalibrationProblem) -> np.ndarray:
+    return ro.calibrate(problem, ro.tikhonov, 1.0).x
+
+
+def predicting(problem: ro.CalibrationProblem):
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    return lambda q: result.forward(q)[:, :3, 3]
+
+
+def broken(_: ro.CalibrationProblem) -> np.ndarray:
+    raise ZeroDivisionError("of course")
+
+
+def test_foreign_methods_are_compared_as_ours_are() -> None:
+    methods = {
+        "x": mine,
+        "positions": predicting,
+        "broken": broken,
+        "short": lambda problem: [1.0, 2.0],
+        "nominal": "nominal",
+    }
+    found = ro.compare("position", selectors=1.0, methods=methods, progress=False)
+    of = {row["method"]: row for row in found.rows}
+    assert of["x"]["rms_mm"] == pytest.approx(of["tikhonov, 1"]["rms_mm"], rel=1e-12)
+    assert of["positions"]["rms_mm"] == pytest.approx(of["tikhonov, 1"]["rms_mm"], rel=1e-9)
+    nominal = 1e3 * POSITION.calibrate().nominal_errors(POSITION.validation)
+    assert of["nominal"]["rms_mm"] == pytest.approx(np.sqrt(np.mean(nominal**2)), rel=1e-6)
+    assert (of["broken"]["status"], of["broken"]["reason"]) == ("failed", "ZeroDivisionError: of course")
+    assert of["short"]["status"] == "impossible"
+    assert "34 finite deviations [SI]" in of["short"]["reason"]
+
+
+def test_all_baselines_run_by_their_names() -> None:
+    found = ro.compare("position", selectors=1.0, methods=list(ro.baselines.__all__), progress=False)
+    assert {row["status"] for row in found.rows} == {"ok"}
+    assert max(row["rms_mm"] for row in found.rows if row["method"] != "gradient_descent") < 0.1
+
+
+def test_problems_come_in_every_form(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        for file in (ROOT / "problems" / "position").iterdir():
+            (folder / file.name).write_bytes(file.read_bytes())
+    pair = (POSITION.problem, POSITION.validation)
+    every = {"folder": ROOT / "problems" / "position", "name": "position", "loaded": POSITION, "pair": pair}
+    every["family"] = lambda seed: POSITION
+    found = ro.compare(every, selectors=1.0, progress=False)
+    assert found.problems == tuple(every)
+    assert len({row["rms_mm"] for row in found.rows}) == 1
+    assert ro.compare(tmp_path, selectors=1.0, progress=False).problems == ("a", "b")
+    assert ro.compare([POSITION], selectors=1.0, progress=False).problems == (POSITION.title,)
+
+
+def test_without_validation_data_a_row_says_so() -> None:
+    found = ro.compare(POSITION.problem, selectors=1.0, progress=False)
+    assert found.rows[0]["status"] == "impossible"
+    assert "no validation data" in found.rows[0]["reason"]
+    with pytest.raises(ro.InputError, match="no replicate with figures; impossible: splits: found no validation data"):
+        found.summary()
+
+
+def test_folds_hold_every_configuration_out_once() -> None:
+    seen: list[tuple[int, ...]] = []
+
+    def configurations(fitted: ro.study.Fitted) -> float:
+        assert not set(fitted.held_out.label) & set(fitted.problem.data.label)
+        seen.append(tuple(np.unique(fitted.held_out.configuration)))
+        return 1.0
+
+    ro.compare("markers", selectors=1.0, splits=4, metrics={"n": configurations}, progress=False)  # three rows each
+    assert sorted(k for fold in seen for k in fold) == sorted(np.unique(ro.load("markers").problem.data.configuration))
+    seen.clear()
+    ro.compare("markers", selectors=1.0, splits=0.2, seeds=3, metrics={"n": configurations}, progress=False)
+    assert [len(held) for held in seen] == [5, 5, 5]
+    assert len(set(seen)) == 3
+
+
+def test_seeds_repeat_only_what_they_change() -> None:
+    def arms(seed: int) -> ro.study.SimulatedArm:
+        return ro.study.simulated_arm(seed, count=12)
+
+    found = ro.compare([arms, "position"], selectors=["reml", 1.0], seeds=[3, 5], progress=False)
+    assert [(row["problem"], row["seed"]) for row in found.rows[::2]] == [("arms", 3), ("arms", 5), ("position", 3)]
+    counted = ro.compare("position", selectors=1.0, counts=[15, 30, 500], seeds=2, progress=False)
+    assert [row["configurations"] for row in counted.rows] == [15, 15, 30, 30, None, None]
+    assert counted.rows[-1]["reason"] == "count: found 500, accepted: 1 to 40 configurations."
+
+
+def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
+    from rpim_opt.study.splits import noisier
+
+    data = ro.load("pose").problem.data
+    draws = [noisier(data, 3.0, seed) for seed in range(60)]
+    block, after = data.blocks[0], draws[0].blocks[0]
+    np.testing.assert_allclose(after.covariance, 9 * block.covariance, rtol=1e-12)
+    moved = np.array([each.blocks[0].y[:, :3] - block.y[:, :3] for each in draws])
+    expected = np.sqrt(8 * block.covariance[0, 0, 0])
+    assert moved.std() == pytest.approx(expected, rel=0.03)  # 60 x 40 x 3 numbers: 0.9 % standard error
+    np.testing.assert_allclose(np.linalg.norm(after.y[:, 3:], axis=1), 1, rtol=1e-12)
+    found = ro.compare("position", selectors="reml", noise=[1, 5], seeds=3, progress=False)
+    errors = [row["rms_mm"] for row in found.rows]
+    assert len(errors) == 1 + 3
+    assert min(errors[1:]) > errors[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"formulations": "robsut"}, r"formulation: found 'robsut'.*did you mean robust"),
+        ({"selectors": "relm"}, "weight: found 'relm', accepted: a number, a selector, learned, reml"),
+        ({"selectors": [True]}, "selectors: found True"),
+        ({"selectors": -1.0}, "selectors: found '-1.0'"),
+        ({"methods": "newton"}, "methods: found 'newton', accepted: a function of the problem, nominal"),
+        ({"metrics": "rms"}, r"metrics: found 'rms', accepted: a function of a fit, rms_mm"),
+        ({"splits": 1}, "splits: found 1, accepted: 'folder', a part"),
+        ({"splits": "half"}, "splits: found 'half'"),
+        ({"noise": 0.5}, "noise: found 0.5, accepted: factors of 1 or more"),
+        ({"counts": 0}, "counts: found 0, accepted: whole numbers, 1 or more"),
+        ({"seeds": []}, r"seeds: found \[\], accepted: whole numbers"),
+        ({"problems": "positon"}, "did you mean position"),
+        ({"problems": ["position", POSITION, "position"]}, "'position' twice"),
+        ({"problems": 3}, "problems: found a int"),
+        ({"problems": POSITION.calibrate().program}, "ro.select.compare compares selectors on a program"),
+        ({"workers": 0}, "workers: found 0"),
+    ],
+)
+def test_what_cannot_be_asked_is_said_before_anything_is_computed(asked: dict, said: str) -> None:
+    asked = {"problems": "position", "progress": False, **asked}
+    with pytest.raises(ro.InputError, match=said):
+        ro.compare(**asked)
+
+
+# --- killed, resumed, elsewhere ------------------------------------------------------------------------------------
+
+GRID = {"problems": TWO, "formulations": ["tikhonov", "robust"], "selectors": ["learned", "reml"]}
+
+
+def stop_after(count: int):
+    def progress(done: int, _: int) -> None:
+        if done == count:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def test_a_killed_comparison_goes_on_with_equal_results(tmp_path: Path) -> None:
+    journal = tmp_path / "deep" / "journal.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        ro.compare(**GRID, journal=journal, progress=stop_after(3))
+    assert len(journal.read_text().splitlines()) == 1 + 3
+    with journal.open("a") as stream:
+        stream.write('{"case": {"seed": 5}, "fou')  # cut off while it was written
+    counts: list[int] = []
+    resumed = ro.compare(**GRID, journal=journal, progress=lambda done, _: counts.append(done))
+    assert counts == [3, 4, 5, 6, 7, 8]
+    fresh = ro.compare(**GRID, progress=False)
+    assert timeless(resumed) == timeless(fresh)
+    assert str(resumed.summary()) == str(fresh.summary())
+    again = ro.compare(**GRID, journal=journal, progress=False)  # nothing is left to compute
+    assert again.rows == resumed.rows
+    ro.compare(**GRID, journal=journal, splits=["folder", 0.3], progress=False)  # more is added to it
+    assert len(journal.read_text().splitlines()) == 1 + 16
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"formulations": ["tikhonov", "minimax"]}, "set of methods"),
+        ({"problems": ["position", "pose"]}, "set of problems given"),
+        ({"metrics": "max_mm"}, "set of metrics"),
+    ],
+)
+def test_a_journal_of_other_arguments_is_not_resumed(tmp_path: Path, change: dict, part: str) -> None:
+    journal = tmp_path / "journal.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        ro.compare(**GRID, journal=journal, progress=stop_after(2))
+    before = journal.read_text()
+    with pytest.raises(ro.InputError, match=f"resume: found replicates of another {part}"):
+        ro.compare(**{**GRID, **change}, journal=journal, progress=False)
+    assert journal.read_text() == before
+    with pytest.raises(KeyboardInterrupt):
+        ro.compare(**{**GRID, **change}, journal=journal, resume=False, progress=stop_after(1))
+    assert len(journal.read_text().splitlines()) == 1 + 1
+
+
+def test_a_journal_knows_the_package_that_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rpim_opt.study import comparing
+
+    journal = tmp_path / "journal.jsonl"
+    ro.compare("position", selectors=1.0, journal=journal, progress=False)
+    other = {**comparing.package_code(), "package": "0" * 64}
+    monkeypatch.setattr(comparing, "package_code", lambda: other)
+    with pytest.raises(ro.InputError, match="replicates of another package"):
+        ro.compare("position", selectors=1.0, journal=journal, progress=False)
+
+
+def test_functions_are_known_by_what_they_do() -> None:
+    def formulation(threshold: float) -> ro.Formulation:
+        return ro.Formulation("mine", loss=lambda r: cp.sum(cp.huber(r, threshold)), penalty=cp.sum_squares)
+
+    assert fingerprint(formulation(1.5)) == fingerprint(formulation(1.5))
+    assert fingerprint(formulation(1.5)) != fingerprint(formulation(2.0))
+    assert fingerprint(ro.load("pose")) == fingerprint(ro.load("pose"))
+    assert fingerprint(ro.load("pose")) != fingerprint(POSITION)
+    assert fingerprint(ro.reml) != fingerprint(ro.gcv)
+    spaces: list[dict] = [{}, {}, {}]
+    for space, body in zip(spaces, ("return a * 2", "return a * 3", "\n    return a * 2"), strict=True):
+        exec(f"def inner(a): {body}\ndef outer(a): return inner(a)\n", space)
+    first, other, lower = (fingerprint(space["outer"]) for space in spaces)
+    assert first != other  # the function that it calls
+    assert first == lower  # where it stands
+
+
+def test_two_processes_and_a_cluster_give_the_same(tmp_path: Path) -> None:
+    own = ro.Formulation("own", loss=lambda r: cp.sum(cp.huber(r, 1.5)), penalty=cp.sum_squares)
+    asked = {"problems": ["position"], "formulations": ["tikhonov", own], "selectors": ["reml", 1.0]}
+    asked["methods"] = {"mine": lambda problem: ro.calibrate(problem, "tikhonov", 1.0).x, "broken": broken}
+    here = ro.compare(**asked, progress=False)
+    processes = ro.compare(**asked, workers=2, progress=False)
+    assert timeless(processes) == timeless(here)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
+        from distributed import Client, LocalCluster
+
+        with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+            by_address = ro.compare(**asked, scheduler=cluster.scheduler_address, progress=False)
+            with Client(cluster) as client:
+                by_client = ro.compare(**asked, scheduler=client, progress=False)
+                assert client.status == "running"  # it is the caller's
+    assert timeless(by_address) == timeless(here)
+    assert timeless(by_client) == timeless(here)
+
+
+# --- what is read out ----------------------------------------------------------------------------------------------
+
+
+def rows_of(errors: dict[str, dict[str, float | None]]) -> tuple[dict, ...]:
+    """Return rows of methods on problems with given errors."""
+    common = {"split": "folder", "fold": 1, "count": None, "noise_factor": 1.0, "seed": 0}
+    return tuple(
+        {"problem": problem, "method": method, **common, "rms_mm": value, **said(value)}
+        for method, by_problem in errors.items()
+        for problem, value in by_problem.items()
+    )
+
+
+def said(value: float | None) -> dict[str, str]:
+    if value is None:
+        return {"status": "failed", "reason": "it broke"}
+    return {"status": "ok", "reason": ""}
+
+
+def test_ratios_are_of_pairs_and_failures_lose() -> None:
+    problems = [f"p{k}" for k in range(6)]
+    hard = [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
+    a = dict(zip(problems, hard, strict=True))
+    half = {problem: 0.5 * value for problem, value in a.items()}
+    some = {**half, "p5": None}
+    found = ro.study.Comparison(rows_of({"a": a, "half": half, "some": some}), ("rms_mm",))
+    of = {each.method: each for each in found.summary().standings}
+    assert of["half"].ratio == pytest.approx(0.5)
+    assert (of["half"].low, of["half"].high) == (pytest.approx(0.5), pytest.approx(0.5))  # in pairs nothing varies
+    assert (of["half"].wins, of["half"].ties, of["half"].losses) == (6, 0, 0)
+    assert (of["some"].wins, of["some"].losses, of["some"].missing) == (5, 1, 1)
+    assert of["half"].different
+    assert not of["a"].different
+    assert "some: failed, 1 of 6 replicates (p5). It broke" in found.summary().notes
+    against = {each.method: each.ratio for each in found.summary(against="half").standings}
+    assert against["a"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("count", [5, 8, 20])
+def test_intervals_of_other_problems_cover_as_they_say(count: int) -> None:
+    from rpim_opt.study.pairs import interval
+
+    covered = []
+    for seed in range(400):
+        rng = np.random.default_rng([seed, count])
+        problem = 0.1 + 0.3 * rng.standard_normal(count)  # what is true of each problem
+        ratios = {
+            (f"p{k}", "5 folds", fold, None, 1.0, 0): problem[k] + 0.1 * rng.standard_normal()
+            for k in range(count)
+            for fold in range(5)
+        }
+        _, low, high = interval(ratios, frozenset())
+        assert low is not None
+        assert high is not None
+        covered.append(low <= np.exp(0.1) <= high)
+    assert np.mean(covered) > 0.92  # folds taken for independent would give some 0.4
+    assert np.mean(covered) < 0.99
+
+
+def test_few_problems_say_that_intervals_are_of_these() -> None:
+    folds = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5, progress=False)
+    assert any("these problems alone" in note for note in folds.summary().notes)
+    once = ro.compare(TWO, ["tikhonov", "least_squares"], "reml", progress=False)
+    assert any("There are no intervals" in note for note in once.summary().notes)
+    assert all(each.low is None for each in once.summary().standings)
+
+
+def test_a_profile_counts_what_failed_as_never_near() -> None:
+    from rpim_opt.study.pairs import profiles
+
+    rows = rows_of({"a": {"p": 1.0, "q": 4.0}, "b": {"p": 2.0, "q": 2.0}, "c": {"p": 3.0, "q": None}})
+    of = profiles(rows, "rms_mm")
+    np.testing.assert_allclose(of["a"], [1.0, 2.0])
+    np.testing.assert_allclose(of["b"], [1.0, 2.0])
+    np.testing.assert_allclose(of["c"], [3.0, np.inf])
+
+
+def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
+    nasty = "<script>alert(1)</script>"
+    found = ro.compare({nasty: "position"}, ["tikhonov", "lasso"], ["learned", "reml"], splits=5, progress=False)
+    page = found.report(tmp_path / "out").read_text()
+    assert nasty not in page
+    assert "default-src 'none'" in page
+    for part in ("How it was made", "SHA-256", "selector reml: found formulation", "data:image/svg+xml;base64,"):
+        assert part in page
+    table = ro.read_columns(tmp_path / "out" / "replicates.csv") if hasattr(ro, "read_columns") else None
+    assert table is None
+    lines = (tmp_path / "out" / "replicates.csv").read_text().splitlines()
+    assert len(lines) == 1 + 20
+    before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    found.report(tmp_path / "out")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
+    assert len(found.plot("max_mm").axes) == 2
+    assert "<table>" in found._repr_html_()
+
+
+def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
+    from tests.test_cli import run
+
+    out = tmp_path / "out"
+    asked = ["compare", "position", "--formulations", "tikhonov,lasso", "--selectors", "reml,1.0", "--out", str(out)]
+    assert run(monkeypatch, *asked) == 0
+    said = capsys.readouterr().out
+    assert "Comparison: 4 methods on 1 problem, 4 replicates (3 ok, 1 impossible)" in said
+    assert sorted(path.name for path in out.iterdir()) == [
+        "comparison.png", "comparison.svg", "index.html", "replicates.csv",
+    ]  # fmt: skip
+    assert run(monkeypatch, *asked[:-2], "--splits", "4", "--seeds", "2", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["replicates"]) == 4 * 4 * 2
+    assert run(monkeypatch, "compare", "position", "--formulations", "robsut") == 2
+    assert "did you mean robust?" in capsys.readouterr().err
