@@ -111,7 +111,7 @@ def calibrate(
     >>> instance = ro.load("position")
     >>> result = ro.calibrate(instance.problem)
     >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm. {result.message}")
-    0.024 mm. Converged after 1 pass.
+    0.024 mm. Converged after 2 passes.
     >>> print(ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml).message)
     Converged after 4 passes.
     >>> ro.calibrate(instance.problem, "robust", "reml").formulation.name  # ready ones by their names
