@@ -54,3 +54,5 @@ from .store import load_result as load_result
 from .study import compare as compare
 from .use import read_measurements as read_measurements
 from .use import read_targets as read_targets
+
+__version__: str

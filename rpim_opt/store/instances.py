@@ -8,12 +8,12 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import cvxpy as cp
-
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.atoms import cp
+from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
@@ -188,7 +188,10 @@ def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> For
     formulation = named_formulation(table.formulation, path)
     formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
     for constraint in formulation.constraints:
-        constraint(cp.Variable(len(parameters.free)), parameters.free)
+        if isinstance(constraint, Box):
+            constraint.bounds(parameters.free)
+        else:
+            constraint(cp.Variable(len(parameters.free)), parameters.free)
     return formulation
 
 
