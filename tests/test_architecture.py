@@ -26,10 +26,9 @@ FLOORS: dict[str, set[str]] = {
     # clarabel, cvxpy: where a problem starts is the optimum of a relaxation, of which the programs above know nothing
     "problem": {"casadi", "clarabel", "cvxpy"},
     "convex": {"clarabel", "cvxpy"},
-    # casadi: a reflector's transform is a measurement, too; cvxpy: whether the loss is a sum of squares
-    "calibration": {"casadi", "cvxpy"},
-    # cvxpy: formulations are named by their functions in files
-    "store": {"cvxpy", "pydantic"},
+    # casadi: a reflector's transform is a measurement, too; pandas: a data frame, where one is asked for
+    "calibration": {"casadi", "pandas"},
+    "store": {"pydantic"},
     # casadi: compensation differentiates the tool's pose
     "use": {"casadi"},
     "study": {"distributed", "joblib", "matplotlib", "pyarrow"},

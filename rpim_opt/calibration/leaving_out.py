@@ -15,7 +15,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.terms import term
 from rpim_opt.convex.trust import SMALL
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_equations
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
 
@@ -23,6 +23,8 @@ TINY = 1e-300
 """Where numbers end that something may be divided by."""
 ALONE = 1e-9
 """A configuration decides a direction alone where it leaves less than this part of what is known of it to others."""
+UNSEEN = 1e-9
+"""Standard deviations below, in scales, are rounding: the data do not see the parameter, and nothing moves it."""
 BALANCED = 1e-4
 """What the slopes of weighted equations and penalty may leave of each other at the solution, relative to those of the
 data at nominal."""
@@ -49,7 +51,7 @@ class Influence:
     change
         (C, n) by how much every parameter would change without the configuration [SI]; NaN where no other decides it.
     deviation
-        (n,) standard deviations of the parameters from the noise [SI].
+        (n,) standard deviations of the parameters from the noise [SI]; zero where the data do not see one.
     weight
         (C,) what a robust loss gave the configuration at the end, against a squared loss; 1 for a squared one.
 
@@ -162,7 +164,8 @@ def influence(result: Calibration) -> Influence:
     if spare > 1e-6:
         variance = float(np.sum(squares)) / spare
     moved = change @ R[:, :-1].T
-    of_noise = R[:, :-1] @ T @ T.T
+    spread = np.sqrt(variance * np.sum((R[:, :-1] @ T @ T.T) ** 2, axis=0))
+    spread[spread < UNSEEN] = 0.0
     stated = result.problem.parameters.free
     return Influence(
         label=tuple(label for piece in pieces for label in piece.label),
@@ -172,7 +175,7 @@ def influence(result: Calibration) -> Influence:
         leverage=leverage,
         cook=np.sum(moved**2, axis=1) / (max(used, TINY) * max(variance, TINY)),
         change=change * stated.scale,
-        deviation=np.sqrt(variance * np.sum(of_noise**2, axis=0)) * stated.scale,
+        deviation=spread * stated.scale,
         weight=np.concatenate([piece.weight for piece in pieces]),
     )
 
@@ -239,7 +242,7 @@ def _triangle(models: list[LinearModel]) -> Array:
     """Return the triangle (n+1, n+1) of all weighted equations."""
     R = None
     for model in models:
-        R = reduced_rows(np.column_stack([model.A, model.b]), R)
+        R = reduced_equations(model.A, model.b, R)
     if R is None:
         raise InputError("data", "no row", "at least one")
     return R

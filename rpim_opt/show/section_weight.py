@@ -51,7 +51,9 @@ def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Elemen
         return section(TITLE, said)
     given = Selection(result.weight, "given", np.array([]), np.array([]), True)
     program, by_squares = _drawn(result)
-    chosen = {**compare(program), result.selector: result.selection or given}
+    chosen = {result.selector: result.selection or given}
+    if not _slow(program):
+        chosen = {**compare(program), **chosen}
     path = _path(result, program, chosen)
     places = {name: path.at(choice.weight) for name, choice in chosen.items() if choice.weight > 0}
     chart, x, y = _curve(path, places, result.selector)
@@ -85,10 +87,15 @@ def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Elemen
     return section(TITLE, said, tag("div", drawn, side, class_="figures"), table)
 
 
+def _slow(program: Program) -> bool:
+    """Whether many programs of this kind take longer than anybody waits for a report."""
+    return not program.quadratic and program.model.equations > MANY
+
+
 def _drawn(result: Calibration) -> tuple[Program, str]:
     """Return the program whose path is drawn, and a sentence where it is that of squares instead of the loss."""
     program = result.program
-    if program.loss_form is not None or program.model.equations <= MANY:
+    if program.loss_form is not None or not _slow(program):
         return program, ""
     try:
         trusted = result.linear
@@ -100,7 +107,12 @@ def _drawn(result: Calibration) -> tuple[Program, str]:
 
 def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]) -> Path:
     """Solve over a grid of weights and at those that were chosen."""
-    grid = weight_grid(program, 80 if program.closed_form else 30)
+    count = 80
+    if not program.closed_form:
+        count = 30
+    if _slow(program):
+        count = 10
+    grid = weight_grid(program, count)
     estimates: list[Estimate] = []
     for weight in np.unique([*grid, *(choice.weight for choice in chosen.values() if choice.weight > 0)]):
         with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
