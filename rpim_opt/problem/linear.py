@@ -99,8 +99,9 @@ class LinearModel:
         return replace(self, A=self.A * rows[:, None], b=self.b * rows)
 
 
-BLOCK = 12_288
-"""Equations that are reduced together: as many as a processor's cache holds."""
+BLOCK = 430_000
+"""Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
+triangles of the blocks cost little beside them."""
 _geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
 
 
@@ -123,16 +124,18 @@ def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
 
 
 def triangle_of(A: Array, b: Array) -> Array:
-    """Return the triangle (n+1, n+1) of [A b], A (m, n) and b (m,): that of every `BLOCK` rows, and of those by twos.
+    """Return the triangle (n+1, n+1) of [A b], A (m, n) and b (m,): that of every `BLOCK`, and of those by twos.
 
-    Blocks are reduced on all cores; which they are depends on the number of rows alone.
+    Blocks are reduced on all cores; which they are depends on the shape of A alone.
     """
+    columns = A.shape[1] + 1
+    most = max(8 * columns, BLOCK // columns)
 
     def block(start: int) -> Array:
-        part = slice(start, start + BLOCK)
+        part = slice(start, start + most)
         return reduced_equations(A[part], b[part])
 
-    return by_twos(on_all_cores(block, range(0, max(len(b), 1), BLOCK)))
+    return by_twos(on_all_cores(block, range(0, max(len(b), 1), most)))
 
 
 def by_twos(triangles: list[Array]) -> Array:
