@@ -148,7 +148,7 @@ class _Moved:
         T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
         for (alpha, a, theta, d, beta), angle in zip(self.robot.mdh, (q @ self.robot.joint_map.T).T, strict=True):
             turn = np.tile(np.eye(4), (len(q), 1, 1))
-            turn[:, :3, :3] = Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+            turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
             T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ _small(np.array([0, 0, d, 0, beta, 0]))
             frames.append(T)
         places = [frame[:, :3, 3] for frame in frames]
