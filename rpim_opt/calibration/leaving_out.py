@@ -76,7 +76,15 @@ class Influence:
 
     @property
     def standardized(self) -> Array:
-        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS)."""
+        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
+        >>> moved = ro.calibration.influence(result).standardized
+        >>> moved.shape, bool(np.abs(moved).max() > 0.5)
+        ((40, 34), True)
+        """
         return np.divide(self.change, self.deviation, out=np.zeros_like(self.change), where=self.deviation > 0)
 
     def strongest(self) -> dict[str, tuple[str, float]]:

@@ -485,12 +485,12 @@ class CalibrationProblem:
         if len(L) == 1 and np.count_nonzero(L[0] - np.diag(each)) == 0:
             # independent and the same for all rows: a product of numbers is several times faster than one of matrices
             r = (residual[:, 0] * each).ravel()
-            jacobian *= each[:, None] * scale  # in place: a copy of many rows costs as much as to evaluate them
+            jacobian *= each[:, None]  # in place: a copy of many rows costs as much as to evaluate them
             A = jacobian.reshape(-1, len(x))
         else:
             r = (L @ residual.transpose(0, 2, 1)).ravel()
             A = (L @ jacobian).reshape(-1, len(x))
-            A *= scale
+        A *= scale
         return A, r + A @ (x / scale)
 
     def _scattered(self, x: Array, most: int, constrained: bool) -> Iterator[LinearModel]:
