@@ -8,6 +8,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import optimize, transform
 
 Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
