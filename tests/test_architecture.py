@@ -151,7 +151,7 @@ UNUSED = {
     # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
     SMALL: {"cvxpy", "clarabel", "scipy.stats"},
     f"{SMALL} --variant bounded": {"cvxpy", "clarabel", "scipy.stats"},
-    "calibrate position --select learned": {"cvxpy", "clarabel", "scipy.stats"},
+    f"{SMALL} --select learned": {"cvxpy", "clarabel", "scipy.stats"},
     "inspect paper_arm": {"cvxpy", "clarabel", "scipy.stats"},
 }
 """What a command may not import: tables, plots and workers besides these, always."""
