@@ -99,8 +99,8 @@ class Uncertainty:
 
     @cached_property
     def at_bound(self) -> tuple[str, ...]:
-        """Parameters that a bound holds back: their intervals do not know of the bound."""
-        return tuple(h.name for h in self.result.held)
+        """Parameters that a bound or a statement holds back: their intervals do not know of it."""
+        return self.result.held_back
 
     def intervals(self) -> Array:
         """Return lower and upper ends (n, 2) [SI] of the deviations' intervals."""

@@ -141,6 +141,7 @@ def remarks(result: Outcome) -> list[str]:
     """Say what a reader must know besides the figures: blunders, bounds that hold, what did not converge."""
     lines = _distrust(result)
     lines += [_bound(result, held) for held in result.held[:MOST_BOUNDS]]
+    lines += [price.sentence() for price in result.prices]
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")
     return [*lines, result.message]

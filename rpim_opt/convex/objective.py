@@ -70,6 +70,11 @@ class Objective:
         return self._posed.constrained
 
     @property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return self._posed.predicts
+
+    @property
     def closed_form(self) -> bool:
         """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares).
 

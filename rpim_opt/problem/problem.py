@@ -14,6 +14,7 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.functions import Functions, Kept, Structure, asked
+from rpim_opt.problem.identified import Identified, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.loads import (
     Loads,
@@ -473,7 +474,12 @@ class CalibrationProblem:
                 part = slice(start, start + most)
                 A, b = self._equations(i, x, part)
                 group = np.repeat(self.data.configuration[block.row[part]], each)
-                yield LinearModel(A, b, group, self.parameters.free, constrained)
+                yield LinearModel(A, b, group, self._identified, constrained)
+
+    @cached_property
+    def _identified(self) -> Identified:
+        """The identified parameters, with what their positions are predicted from."""
+        return identified_of(self.robot, self.parameters, self.data)
 
     def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
         """Return whitened, scaled A and b of some rows of a block."""
@@ -505,7 +511,7 @@ class CalibrationProblem:
             residual, jacobian = problem._slopes(x)
             A = problem._whitened(jacobian) * scale
             r = problem._whitened(residual[:, None])[:, 0]
-            yield LinearModel(A, r + A @ (x / scale), problem.groups, self.parameters.free, constrained)
+            yield LinearModel(A, r + A @ (x / scale), problem.groups, self._identified, constrained)
 
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) [SI], evaluated together."""

@@ -8,19 +8,20 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import cvxpy as cp
-
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.given import Unknown, given
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import starting_parameters
+from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
@@ -150,7 +151,7 @@ def load(
     tables = read_tables(stated)
     try:
         problem = _problem(stated, tables)
-        formulation = _formulation(table, problem.parameters, path)
+        formulation = _formulation(stated, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
     except InputError as error:
         raise error.within(path) from None
@@ -183,12 +184,19 @@ def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
     return problem.scattered(stated_scatter(stated.table, stated.path))
 
 
-def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> Formulation:
+def _formulation(stated: Stated, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
+    table, path = stated.table, stated.path
     formulation = named_formulation(table.formulation, path)
-    formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
+    demands = table.constraints.all(problem.robot, problem.data)
+    formulation = replace(formulation, constraints=(*formulation.constraints, *demands))
+    parameters = identified_of(problem.robot, problem.parameters, problem.data)
+    z = Unknown(parameters.names)
     for constraint in formulation.constraints:
-        constraint(cp.Variable(len(parameters.free)), parameters.free)
+        constraint(z, given(z, parameters))
+    for demand in demands:
+        if isinstance(demand, Drawn):
+            demand.require_near(parameters)
     return formulation
 
 
