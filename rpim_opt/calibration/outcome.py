@@ -88,6 +88,10 @@ class Prediction(NamedTuple):
     coverage_factor: float = 1.0
     outside: Outside = Outside()
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"<Prediction of {len(self.position)} positions, coverage factor {self.coverage_factor:.3g}>"
+
     @property
     def standard(self) -> Array:
         """Standard uncertainties (N, 3) [m] of the coordinates."""

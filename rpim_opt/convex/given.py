@@ -100,7 +100,7 @@ class Deviations:
         return list(self._parameters.names)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Given(Identified):
     """The identified parameters as a constraint function gets them: with z, and what follows it.
 

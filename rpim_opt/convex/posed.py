@@ -20,7 +20,7 @@ from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.given import Given, Unknown
 from rpim_opt.convex.given import given as told
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
-from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
+from rpim_opt.convex.terms import Frozen, Term, apart, listed, reason, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
@@ -102,7 +102,7 @@ class Posed:
             live_penalty = scalar(f.penalty(given), f"{where}, penalty")
             self._penalty_term = Term(copy(live_penalty), given)
         known = told(self.z, self.parameters)
-        live = [self._listed(constraint, known, where) for constraint in f.constraints]
+        live = [self._listed(c, known, f"{where}, {called(c, k)}") for k, c in enumerate(f.constraints)]
         self.predicts = bool(known.asked)
         self.constraints = [[copy(each) for each in group] for group in live]
         self.own = copy.own
@@ -114,11 +114,11 @@ class Posed:
         for part, expression in (("loss", self.loss), ("penalty", self.penalty)):
             if expression is not None and not expression.is_convex():
                 found = "a program that is not convex"
-                raise InputError(f"{where}, {part}", found, "CVXPY's DCP rules: nondecreasing over norms")
+                accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+                raise InputError(f"{where}, {part}", found, accepted)
 
     def _listed(self, constraint: Any, known: Given, where: str) -> list[Any]:
-        name = getattr(constraint, "name", getattr(constraint, "__name__", "constraint"))
-        return listed(constraint(self.z, known), f"{where}, {name}")
+        return listed(constraint(self.z, known), where)
 
     def _over_r(self, expression: Any, seen: cp.Variable) -> Any:
         """Return the loss as a function of r."""
@@ -376,6 +376,14 @@ class Posed:
     def largest(self) -> Any:
         """The bound of the configurations' norms."""
         return norms(self.r, self.groups) <= self.formulation.largest
+
+
+def called(constraint: Any, k: int) -> str:
+    """Return what a person calls the constraint function number k."""
+    name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
+    if name == "<lambda>":
+        return f"constraint {k + 1}"
+    return str(name)
 
 
 def posed(formulation: Formulation, model: LinearModel) -> Posed:

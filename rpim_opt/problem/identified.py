@@ -13,7 +13,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Machine:
     """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
 
@@ -28,7 +28,7 @@ class Machine:
     farthest: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Identified(Parameters):
     """The n identified parameters of a problem.
 

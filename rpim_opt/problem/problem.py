@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.functions import Functions, Kept, Structure, asked
@@ -38,8 +40,8 @@ SOME, LARGE = 1000, 20_000
 """Rows from which on a compiled function is worth loading, and worth compiling."""
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationProblem(Tabled):
     """What was measured on which robot, and which parameters are to explain it.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
@@ -83,6 +85,13 @@ class CalibrationProblem:
     data: Dataset
     asked: Kept | None = field(default=None, repr=False)
     scatter: Scatter | None = None
+
+    def _short(self) -> str:
+        return f"of '{self.robot.name}': {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the identified parameters."""
+        return self.parameters.free._frame_rows()
 
     def __post_init__(self) -> None:
         p = self.parameters

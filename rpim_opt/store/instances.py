@@ -10,6 +10,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
+from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.drawn import Drawn
@@ -33,8 +34,8 @@ from rpim_opt.store.prior_table import prior_files, stated_prior
 from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
 
 
-@dataclass(frozen=True, eq=False)
-class Instance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Instance(Tabled):
     """A calibration problem as its folder states it.
 
     Parameters
@@ -87,6 +88,16 @@ class Instance:
     excluded: Mapping[str, str] = field(default_factory=dict)
     model: str = "geometry"
     noise: str = "robot"
+
+    def _short(self) -> str:
+        return f"'{shortened(self.title)}': {self.problem!r}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the identified parameters."""
+        return self.problem.parameters.free._frame_rows()
+
+    def _notes(self) -> list[str]:
+        return [self.source]
 
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration as the folder wants it, with its record.
