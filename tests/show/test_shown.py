@@ -85,7 +85,7 @@ def test_frames_hold_what_the_tables_say() -> None:
     ("formulation", "where", "why"),
     [
         (ro.Formulation("mine", loss=lambda r: -cp.sum_squares(r)), "loss", "concave"),
-        (ro.Formulation("mine", penalty=lambda z: cp.sum(cp.sqrt(cp.abs(z)))), "penalty", "power"),
+        (ro.Formulation("mine", penalty=lambda z: cp.sum(cp.sqrt(cp.abs(z)))), "penalty", "abs(z) convex"),
         (
             ro.Formulation("mine", constraints=(ro.in_ball(2.0, "*"), lambda z, p: cp.norm(z) >= 1)),
             "constraint 2",
