@@ -125,8 +125,8 @@ class Calibration(Outcome):
         ['parameter', 'unit', 'nominal', 'identified', 'deviation', 'std']
         >>> result.to_frame("errors").head(2).round(3)
           label  nominal_mm  identified_mm
-        0    c1       2.087          0.044
-        1    c2       1.498          0.049
+        0    c0       1.090          0.049
+        1    c1       1.886          0.025
         >>> len(result.to_frame("history")) == len(result.history)
         True
         """

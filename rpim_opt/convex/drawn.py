@@ -294,15 +294,15 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Drawn:
     >>> import cvxpy as cp
     >>> import numpy as np
     >>> import rpim_opt as ro
-    >>> statements = ("a3 + a4 = 824.0 +- 0.5 mm", "|alpha3 - alpha4| <= 0.2 mrad", "move at most 4 mm: home")
+    >>> statements = ("a3 + a4 = 824.0 +- 0.5 mm", "|theta4| <= 1 mrad", "move at most 2 mm: home")
     >>> drawing = [ro.constraints.parse(text, {"home": np.zeros(6)}) for text in statements]
     >>> stated = ro.Formulation("as drawn", penalty=cp.sum_squares, constraints=drawing)
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
     >>> for price in result.prices:
     ...     print(f"{price.text}: {price.multiplier:.2f} a {price.unit}")
-    a3 + a4 = 824.0 +- 0.5 mm: 19.93 a mm
-    |alpha3 - alpha4| <= 0.2 mrad: 0.88 a mrad
-    move at most 4 mm: home: 2.08 a mm
+    a3 + a4 = 824.0 +- 0.5 mm: 68.85 a mm
+    |theta4| <= 1 mrad: 2.88 a mrad
+    move at most 2 mm: home: 131.04 a mm
     """
     if where is not None and not isinstance(where, Mapping):
         raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")

@@ -104,6 +104,8 @@ class Deviations:
 class Given(Identified):
     """The identified parameters as a constraint function gets them: with z, and what follows it.
 
+    Other arguments as for `Parameters`.
+
     Parameters
     ----------
     z
