@@ -13,6 +13,9 @@ from .formulation import minimax as minimax
 from .formulation import robust as robust
 from .formulation import sum_of_norms as sum_of_norms
 from .formulation import tikhonov as tikhonov
+from .given import Given as Given
+from .given import Unknown as Unknown
+from .given import given as given
 from .prior import Prior as Prior
 from .program import Estimate as Estimate
 from .program import Program as Program

@@ -11,6 +11,7 @@ from cvxpy.constraints.nonpos import Inequality
 from cvxpy.constraints.zero import Equality
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.conic import ATTEMPTS
 from rpim_opt.convex.posed import Posed
 
 FEASIBLE = 1e-7
@@ -68,7 +69,8 @@ def nearest(posed: Posed, z: Array) -> Array:
     n = len(z)
     program = posed.projection
     lift = np.vstack([np.eye(n), np.zeros((posed.r.size, n))])
-    found = program.solve(lift, np.zeros(n + posed.r.size), 0.0, 2 * np.eye(n), -2 * z)
-    if found.status != cp.OPTIMAL:
-        return z
-    return found.u
+    for attempt in range(len(ATTEMPTS)):
+        found = program.solve(lift, np.zeros(n + posed.r.size), 0.0, 2 * np.eye(n), -2 * z, attempt=attempt)
+        if found.status == cp.OPTIMAL:
+            return found.u
+    return z

@@ -17,8 +17,10 @@ from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.separated import Separated
+from rpim_opt.convex.given import Given, Unknown
+from rpim_opt.convex.given import given as told
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
-from rpim_opt.convex.terms import Frozen, Term, apart, listed, scalar, term
+from rpim_opt.convex.terms import Frozen, Term, apart, listed, reason, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
@@ -61,6 +63,8 @@ class Posed:
         Expressions of r and z; penalty is None where there is none.
     constraints
         Of z, one list for every function.
+    predicts
+        Whether constraints asked for positions, which are linear about some point.
     own
         Variables that the functions brought along.
     loss_form, penalty_form
@@ -72,7 +76,7 @@ class Posed:
         self.n = shape.unknowns
         self.groups = shape.groups
         self.limited = bool(np.isfinite(formulation.largest))
-        self.z = cp.Variable(self.n, name="z")
+        self.z = Unknown(self.parameters.names)
         self.r = cp.Variable(shape.equations, name="r")
         self._lock = threading.Lock()
         self._ask()
@@ -97,7 +101,9 @@ class Posed:
         if f.penalty is not None:
             live_penalty = scalar(f.penalty(given), f"{where}, penalty")
             self._penalty_term = Term(copy(live_penalty), given)
-        live = [self._listed(constraint, where) for constraint in f.constraints]
+        known = told(self.z, self.parameters)
+        live = [self._listed(c, known, f"{where}, {called(c, k)}") for k, c in enumerate(f.constraints)]
+        self.predicts = bool(known.asked)
         self.constraints = [[copy(each) for each in group] for group in live]
         self.own = copy.own
         self.live = (self._over_r(live_loss, seen), self._over_z(live_penalty, given), live)
@@ -108,11 +114,11 @@ class Posed:
         for part, expression in (("loss", self.loss), ("penalty", self.penalty)):
             if expression is not None and not expression.is_convex():
                 found = "a program that is not convex"
-                raise InputError(f"{where}, {part}", found, "CVXPY's DCP rules: nondecreasing over norms")
+                accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+                raise InputError(f"{where}, {part}", found, accepted)
 
-    def _listed(self, constraint: Any, where: str) -> list[Any]:
-        name = getattr(constraint, "name", getattr(constraint, "__name__", "constraint"))
-        return listed(constraint(self.z, self.parameters), f"{where}, {name}")
+    def _listed(self, constraint: Any, known: Given, where: str) -> list[Any]:
+        return listed(constraint(self.z, known), where)
 
     def _over_r(self, expression: Any, seen: cp.Variable) -> Any:
         """Return the loss as a function of r."""
@@ -372,6 +378,14 @@ class Posed:
         return norms(self.r, self.groups) <= self.formulation.largest
 
 
+def called(constraint: Any, k: int) -> str:
+    """Return what a person calls the constraint function number k."""
+    name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
+    if name == "<lambda>":
+        return f"constraint {k + 1}"
+    return str(name)
+
+
 def posed(formulation: Formulation, model: LinearModel) -> Posed:
     """Return the formulation posed for the shape of a model; a ready one may have been posed before."""
     m, n = model.A.shape
@@ -469,7 +483,7 @@ class Unposed(Posed):
         self.n = model.A.shape[1]
         self.groups = np.unique(model.group, return_inverse=True)[1]
         self.z, self.r = cp.Variable(self.n), cp.Variable(len(model.b))
-        self.limited, self.constrained = False, True
+        self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []
         self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
         self._penalty_term = None
