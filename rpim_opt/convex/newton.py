@@ -22,7 +22,7 @@ MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
 """How sharp they then are, relative to those that a loss without multipliers begins with."""
-SHARPER, SHARPEST = 10.0, 1e9
+SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
@@ -171,13 +171,17 @@ class Newton:
             if best is None or ended.gap < best.gap:
                 best = ended
                 vain = 0
-            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or most == SOON)):
                 break
             if self.loss.kinks and ended.gap - point.smooth.missing <= SETTLED * point.smooth.missing:
                 kinked = Kinked(point.smooth.multipliers, min(SHARPER * kinked.sharpness, SHARPEST))
                 point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
-            else:
-                point = self._stepped(point, slope, kinked)
+                continue
+            ahead = self._stepped(point, slope, kinked)
+            if ahead is point and self.loss.kinks:  # no step is short enough for kinks so sharp
+                kinked = kinked._replace(sharpness=kinked.sharpness / SHARPER)
+                ahead = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
+            point = ahead
         return best
 
     def _begun(self, r: Array) -> Kinked:
