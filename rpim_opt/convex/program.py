@@ -146,7 +146,9 @@ class Program(Objective):
 
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
-        have a formula, in a box an active set; everything else is Clarabel's, on data that are dimensionless.
+        have a formula, in a box an active set; a loss that is a sum over rows or configurations (robust, sum of norms,
+        quantiles) with a squared penalty, in a box or without, has Newton's method, begun where the last minimum was
+        and ended by a duality gap; everything else is Clarabel's, on data that are dimensionless.
 
         Parameters
         ----------

@@ -177,7 +177,7 @@ class Separated:
             anew.append(new)
             slope = slope + a * new
             value += float(new @ s - (new - old) @ (new - old) / (2 * sharpness))
-            bent = float(np.sum(factor * self._norms(s)))
+            bent = float((factor * self._norms(s)).sum())
             loss += bent
             missing += bent - float(new @ s)
         return Smoothed(value, loss, slope, anew, missing)
