@@ -16,9 +16,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
-from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.given import Given, Unknown
 from rpim_opt.convex.given import given as told
+from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, reason, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
