@@ -249,7 +249,7 @@ def report(rows: list[dict[str, Any]]) -> Report:
     names = [f"{name}, distance" for name in CLOSED]
     determined = [row for row in rows if row["certified"] and not row["outliers"]]
     far = {"certified start": [_root(row["distance"]) for row in determined]}
-    far |= {name[:-10]: [_root(row[name]) for row in determined if name in row] for name in names}
+    far |= {name[:-10]: [_root(row[name]) for row in determined if row.get(name) is not None] for name in names}
     figure = distributions(far, "distance from the truth [standard deviations], no outliers")
     return Report(text + markdown(head, lines), metrics, {"distances": figure})
 
@@ -263,9 +263,9 @@ def _right(row: dict[str, Any]) -> bool:
 
 
 def _closed(row: dict[str, Any], what: str) -> list[float]:
-    """Return what closed forms have; a table of all cases says NaN where there is none."""
-    found = [float(row.get(f"{name}, {what}", np.nan)) for name in CLOSED]
-    return [each for each in found if np.isfinite(each)]
+    """Return what closed forms have that gave an answer."""
+    found = [row.get(f"{name}, {what}") for name in CLOSED]
+    return [float(each) for each in found if each is not None and np.isfinite(each)]
 
 
 def _best(row: dict[str, Any]) -> float:

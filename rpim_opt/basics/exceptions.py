@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 Named = TypeVar("Named")
@@ -101,12 +102,14 @@ class Conflict(NamedTuple):
     """What contradicts what: by how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
 
     Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
-    names of demands that cannot hold together, of which any one less would do.
+    names of demands that cannot hold together, of which any one less would do; ``stated`` says by how much [SI]
+    statements in words would have to give way.
     """
 
     parameters: dict[str, float]
     configurations: dict[Any, float]
     constraints: tuple[str, ...] = ()
+    stated: Mapping[str, float] = MappingProxyType({})
 
 
 class NoSolutionFound(RpimError):
@@ -183,16 +186,22 @@ def _contradiction(conflict: Conflict | None) -> str:
         parts.append(f"these cannot hold together: {', '.join(conflict.constraints)}")
     if conflict.parameters or conflict.configurations:
         parts.append(_loosening(conflict))
+    if conflict.stated:
+        parts.append(f"loosening {_by(conflict.stated)} would do")
     return "; ".join(parts)
 
 
 def _loosening(conflict: Conflict) -> str:
     """Say which bounds of parameters, or of configurations, would have to give way."""
-    bounds = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in conflict.parameters.items())
+    bounds = _by(conflict.parameters)
     rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in conflict.configurations.items())
     if bounds and rows:
         return f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}"
     return f"loosening {bounds or rows} would do"
+
+
+def _by(bounds: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
 
 
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.shown import Brief
 
 
 class Size(NamedTuple):
@@ -35,8 +36,8 @@ class LeftOut(NamedTuple):
     ratio: float
 
 
-@dataclass(frozen=True, eq=False)
-class Learned:
+@dataclass(frozen=True, eq=False, repr=False)
+class Learned(Brief):
     """What the data said of the sizes of deviations and of the noise.
 
     Parameters
@@ -80,6 +81,10 @@ class Learned:
     drift: Array
     added: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+
+    def _short(self) -> str:
+        sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.sizes.items())
+        return f"sizes: {sizes}; {len(self.left_out)} rows left out"
 
     @property
     def families(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from rpim_opt.convex.objective import Damping
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.select import Selector
 from rpim_opt.convex.trust import trusted_parts
+from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
@@ -110,13 +111,14 @@ class Loop:
     solver: Mapping[str, Any]
     tolerance: float
     most: int
+    about: tuple[Array | None, Array | None] = (None, None)
 
     def linearized(self, z: Array, before: Array | None = None) -> LinearModel:
         """Return the linear model at z (n,)."""
         reweigh = self.reweigh
         if reweigh is not None and before is not None:
             reweigh = reweigh.after(before)
-        return self.source.linearize(self.source.parameters.free.scale * z, reweigh)
+        return around(self.source.linearize(self.source.parameters.free.scale * z, reweigh), *self.about)
 
     def chosen(self, state: State) -> State:
         """Ask for the weight; the objective follows it."""
@@ -142,7 +144,8 @@ class Loop:
         if self.reweigh is None:
             return state.program
         x = self.source.parameters.free.scale * state.z
-        return state.program.on(self.source.linearize(x, trusted_parts(self.source, x, self.asked)))
+        model = self.source.linearize(x, trusted_parts(self.source, x, self.asked))
+        return state.program.on(around(model, *self.about))
 
     def advanced(self, state: State) -> State:
         """Return the state after one attempt at a step."""
@@ -303,14 +306,20 @@ def run(
     tolerance: float = 1e-8,
     progress: Callable[[Iteration], None] | None = None,
     how: Mapping[str, Any] = MappingProxyType({}),
+    about: Array | None = None,
+    farthest: Array | None = None,
 ) -> Ended:
-    """Run the loop from some deviations (n,) [SI] to its end; arguments as for `calibrate`."""
+    """Run the loop from some deviations (n,) [SI] to its end; arguments as for `calibrate`.
+
+    Positions that constraints ask for are linear about deviations ``about`` (n,) [SI]; of regions also those that move
+    farthest at ``farthest`` (n,) [SI].
+    """
     source = in_parts(problem.frozen())
     solved = formulation
     reweigh = None
     if not source.keeps_rows:
         solved, reweigh = on_triangles(formulation, _equations(source))
-    loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations)
+    loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations, (about, farthest))
     try:
         state = _begun(loop, solved, choosing(weight, formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= max_iterations:
@@ -389,7 +398,7 @@ def _certified(loop: Loop, formulation: Formulation, problem: Source, state: Sta
     if loop.reweigh is not None:
         solved, _ = on_triangles(formulation, model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last pass has to do
-        model = problem.frozen().linearize(loop.source.parameters.free.scale * state.z)
+        model = around(problem.frozen().linearize(loop.source.parameters.free.scale * state.z), *loop.about)
     return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor)
 
 

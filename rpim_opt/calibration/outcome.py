@@ -17,8 +17,10 @@ from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
 from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
 from rpim_opt.calibration.learned import Learned
+from rpim_opt.calibration.prices import Price, prices
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside
 from rpim_opt.calibration.spread import Spread
+from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge
@@ -86,6 +88,10 @@ class Prediction(NamedTuple):
     coverage_factor: float = 1.0
     outside: Outside = Outside()
 
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"<Prediction of {len(self.position)} positions, coverage factor {self.coverage_factor:.3g}>"
+
     @property
     def standard(self) -> Array:
         """Standard uncertainties (N, 3) [m] of the coordinates."""
@@ -101,13 +107,14 @@ class Kept(NamedTuple):
     """What the functions of a script said of a result, in whose file they are not.
 
     Parameters at bounds; the equations (m, n) that the loss trusts (None where there were none), the loss's factor on
-    them, and the numbers of those that it left out.
+    them, and the numbers of those that it left out; what statements of a drawing cost.
     """
 
     held: tuple[Held, ...]
     linear: LinearModel | None
     factor: float = 1.0
     left_out: tuple[int, ...] = ()
+    prices: tuple[Price, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -616,3 +623,30 @@ class Outcome:
         if self.kept is not None:
             return self.kept.held
         return diagnosis.held(self.program, self.z, self.weight)
+
+    @cached_property
+    def prices(self) -> tuple[Price, ...]:
+        """What the statements of a drawing (`constraints.parse`) cost, in their order; empty where there are none.
+
+        >>> import cvxpy as cp
+        >>> import rpim_opt as ro
+        >>> length = ro.constraints.parse("a3 + a4 = 824.0 +- 0.5 mm")
+        >>> stated = ro.Formulation("as drawn", penalty=cp.sum_squares, constraints=(length,))
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+        >>> price = result.prices[0]
+        >>> print(f"{price.multiplier:.1f} for every {price.unit}; {price.gain:.2f} of {price.misfit:.2f} for 0.05 mm")
+        10.5 for every mm; 0.53 of 10.25 for 0.05 mm
+        """
+        if self.kept is not None:
+            return self.kept.prices
+        return prices(self.program, self.z, self.weight)
+
+    @cached_property
+    def held_back(self) -> tuple[str, ...]:
+        """Names of the parameters of which a bound, or a statement of a drawing, holds back; intervals ignore that."""
+        names = [held.name for held in self.held]
+        holding = {price.text for price in self.prices if price.holds}
+        for constraint in self.formulation.constraints:
+            if isinstance(constraint, Drawn) and constraint.text in holding:
+                names += constraint.names(self.program.model.parameters)
+        return tuple(dict.fromkeys(names))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from rpim_opt.basics.tables import frame_of
 from rpim_opt.calibration import words
 from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
 
@@ -100,6 +101,36 @@ class Calibration(Outcome):
         ``std`` is None where the formulation has no covariance, or an infinite one.
         """
         return words.parameter_rows(self)
+
+    def to_frame(self, what: str = "parameters") -> Any:
+        """Return one of its tables as a data frame (pandas, or polars where that is missing).
+
+        Parameters
+        ----------
+        what
+            ``"parameters"``, ``"errors"`` (every row's, before and after), ``"history"`` (the passes), ``"flags"``
+            (rows that the fit distrusts), ``"bounds"`` (parameters that their tolerance holds back) or ``"prices"``
+            (of statements of a drawing).
+
+        Raises
+        ------
+        InputError
+            For another name, or where no data frames are installed.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
+        >>> list(result.to_frame().columns)
+        ['parameter', 'unit', 'nominal', 'identified', 'deviation', 'std']
+        >>> result.to_frame("errors").head(2).round(3)
+          label  nominal_mm  identified_mm
+        0    c0       1.090          0.049
+        1    c1       1.886          0.025
+        >>> len(result.to_frame("history")) == len(result.history)
+        True
+        """
+        return frame_of(words.frame_rows(self, what))
 
     def parameter_table(self) -> str:
         """Return the identified parameters as a table of text."""

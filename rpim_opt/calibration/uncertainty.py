@@ -6,19 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor
 from rpim_opt.calibration.result import Calibration, Prediction
 
 
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertainty(Tabled):
     """The uncertainty of a calibration, by the law of propagation (JCGM 100) on its last linearization.
 
     With A = U diag(s) V' whitened and scaled, weight w, filter f = s^2 / (s^2 + w) and the noise level sigma::
@@ -60,6 +62,37 @@ class Uncertainty:
     result: Calibration
     confidence: float = 0.95
 
+    def _short(self) -> str:
+        return f"at confidence {self.confidence:g} of {self.result!r}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""
+        free = self.result.problem.parameters.free
+        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
+        values = free.values(self.result.x)
+        rows: list[dict[str, Any]] = []
+        for i, name in enumerate(free.names):
+            unit, si = display(free.dimensions[i])
+            rows.append(
+                {
+                    "parameter": name,
+                    "unit": unit,
+                    "value": float(values[i] / si),
+                    "u_noise": float(noise[i] / si),
+                    "u_prior": float(prior[i] / si),
+                    "u": float(both[i] / si),
+                    "U": float(self.coverage_factor * both[i] / si),
+                    "held_back": name in self.at_bound,
+                }
+            )
+        return rows
+
+    def _notes(self) -> list[str]:
+        lines = [self.noise_test().verdict, f"k = {self.coverage_factor:.2f}; {self.freedom:.1f} degrees of freedom."]
+        if self.at_bound:
+            lines.append("What is held back by a bound or a statement has an interval that does not know of it.")
+        return lines
+
     def __post_init__(self) -> None:
         if not 0 < self.confidence < 1:
             raise InputError("confidence", f"{self.confidence}", "a probability between 0 and 1")
@@ -99,8 +132,8 @@ class Uncertainty:
 
     @cached_property
     def at_bound(self) -> tuple[str, ...]:
-        """Parameters that a bound holds back: their intervals do not know of the bound."""
-        return tuple(h.name for h in self.result.held)
+        """Parameters that a bound or a statement holds back: their intervals do not know of it."""
+        return self.result.held_back
 
     def intervals(self) -> Array:
         """Return lower and upper ends (n, 2) [SI] of the deviations' intervals."""
@@ -161,14 +194,12 @@ class Uncertainty:
         >>> print(lines[7])
          a2            mm     -0.2622     0.0069     0.0005        0.0069        0.0138
         """
-        free, rows = self.result.problem.parameters.free, []
-        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
-        values = free.values(self.result.x)
-        for i, name in enumerate(free.names):
-            unit, si = display(free.dimensions[i])
-            figures = [values[i], noise[i], prior[i], both[i], self.coverage_factor * both[i]]
-            mark = " *" if name in self.at_bound else ""
-            rows.append([name + mark, unit, *(f"{v / si:.4f}" for v in figures)])
+        rows: list[list[str]] = []
+        for row in self._frame_rows():
+            name = row["parameter"]
+            if row["held_back"]:
+                name += " *"
+            rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
         head = [
             "parameter",
             "unit",

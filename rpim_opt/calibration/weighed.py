@@ -8,9 +8,9 @@ from typing import Any
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.loop import run
 from rpim_opt.calibration.outcome import Iteration
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.rounds import run_about
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.select import Selector
 from rpim_opt.problem.source import Source
@@ -38,7 +38,7 @@ def calibrated(
     """Return the calibration; arguments as for `calibrate`, start (n,) [SI]."""
     require_passes(max_iterations)
     how = {"solver": solver, "settings": settings, "verbose": verbose}
-    ended = run(problem, formulation, weight, start, max_iterations, tolerance, progress, how)
+    ended = run_about(problem, formulation, weight, start, max_iterations, tolerance, progress, how)
     again = {"max_iterations": max_iterations, "tolerance": tolerance, **how}
     choice = ended.state.choice
     return Calibration(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.markup import html_table
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import display
@@ -141,6 +142,7 @@ def remarks(result: Outcome) -> list[str]:
     """Say what a reader must know besides the figures: blunders, bounds that hold, what did not converge."""
     lines = _distrust(result)
     lines += [_bound(result, held) for held in result.held[:MOST_BOUNDS]]
+    lines += [price.sentence() for price in result.prices]
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")
     return [*lines, result.message]
@@ -167,3 +169,31 @@ def _bound(result: Outcome, held: Held) -> str:
         f"{held.name} is held at {held.bound / si:+.3g} {unit}: loosening its tolerance by {tenth} would lower the "
         f"whitened RMS by {held.gain:.2g}."
     )
+
+
+def frame_rows(result: Outcome, what: str) -> list[dict[str, Any]]:
+    """Return the rows of one of the `FRAMES`."""
+    if what not in FRAMES:
+        raise InputError("to_frame", f"'{what}'", choices(what, FRAMES))
+    return FRAMES[what](result)
+
+
+def _parameter_frame(result: Outcome) -> list[dict[str, Any]]:
+    rows = parameter_rows(result)
+    return [{"parameter": row["name"], **{key: row[key] for key in row if key != "name"}} for row in rows]
+
+
+def _error_frame(result: Outcome) -> list[dict[str, Any]]:
+    both = zip(result.problem.labels, 1e3 * result.nominal_errors(), 1e3 * result.errors(), strict=True)
+    return [{"label": label, "nominal_mm": float(b), "identified_mm": float(a)} for label, b, a in both]
+
+
+FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
+    "parameters": _parameter_frame,
+    "errors": _error_frame,
+    "history": lambda result: [dict(vars(each)) for each in result.history],
+    "flags": lambda result: [flag._asdict() for flag in result.flagged],
+    "bounds": lambda result: [held._asdict() for held in result.held],
+    "prices": lambda result: [price._asdict() for price in result.prices],
+}
+"""Tables of a result by name."""

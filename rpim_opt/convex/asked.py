@@ -12,7 +12,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.late import sparse
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.terms import Frozen, Term, listed, scalar
+from rpim_opt.convex.given import Given
+from rpim_opt.convex.given import given as told
+from rpim_opt.convex.terms import Frozen, Term, listed, reason, scalar
 from rpim_opt.robot.parameters import Parameters
 
 
@@ -36,6 +38,8 @@ class Asked:
         Variables that the functions brought along.
     live
         Loss, penalty and constraints with the user's own parameters, and no copies of them.
+    predicts
+        Whether constraints asked for positions, which are linear about some point.
     """
 
     z: cp.Variable
@@ -48,12 +52,15 @@ class Asked:
     constraints: list[list[Any]]
     own: list[cp.Variable]
     live: tuple[Any, Any, list[list[Any]]]
+    predicts: bool
 
 
-def ask(formulation: Formulation, parameters: Parameters, n: int, equations: int, groups: np.ndarray) -> Asked:
-    """Ask the functions of a formulation for n unknowns and so many equations, and keep copies of what they answer."""
+def ask(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Asked:
+    """Ask the functions of a formulation for the parameters and so many equations; keep copies of what they answer."""
     where = f"formulation '{formulation.name}'"
-    z = cp.Variable(n, name="z")
+    from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY, imported where one is made
+
+    z = Unknown(parameters.names)
     r = cp.Variable(equations, name="r")
     seen = r
     if formulation.loss_over == "configuration":
@@ -73,18 +80,27 @@ def ask(formulation: Formulation, parameters: Parameters, n: int, equations: int
         live_penalty = scalar(formulation.penalty(given), f"{where}, penalty")
         penalty_term = Term(copy(live_penalty), given)
         penalty = _over_z(penalty_term.expression, z, given, differences)
-    live = [_listed(constraint, z, parameters, where) for constraint in formulation.constraints]
+    known = told(z, parameters)
+    live = [_listed(c, z, known, f"{where}, {called(c, k)}") for k, c in enumerate(formulation.constraints)]
     loss = _over_r(loss_term.expression, r, seen, groups)
     _require_convex(f"{where}, loss", loss)
     _require_convex(f"{where}, penalty", penalty)
-    own_live = (_over_r(live_loss, r, seen, groups), _over_z(live_penalty, z, given, differences), live)
+    predicts = bool(known.asked)
+    stated = (_over_r(live_loss, r, seen, groups), _over_z(live_penalty, z, given, differences), live)
     constraints = [[copy(each) for each in group] for group in live]
-    return Asked(z, r, loss, penalty, loss_term, penalty_term, differences, constraints, copy.own, own_live)
+    return Asked(z, r, loss, penalty, loss_term, penalty_term, differences, constraints, copy.own, stated, predicts)
 
 
-def _listed(constraint: Any, z: cp.Variable, parameters: Parameters, where: str) -> list[Any]:
-    name = getattr(constraint, "name", getattr(constraint, "__name__", "constraint"))
-    return listed(constraint(z, parameters), f"{where}, {name}")
+def _listed(constraint: Any, z: cp.Variable, known: Given, where: str) -> list[Any]:
+    return listed(constraint(z, known), where)
+
+
+def called(constraint: Any, k: int) -> str:
+    """Return what a person calls the constraint function number k."""
+    name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
+    if name == "<lambda>":
+        return f"constraint {k + 1}"
+    return str(name)
 
 
 def _over_r(expression: Any, r: cp.Variable, seen: cp.Variable, groups: np.ndarray) -> Any:
@@ -104,7 +120,8 @@ def _over_z(expression: Any, z: cp.Variable, given: cp.Variable, differences: li
 def _require_convex(where: str, expression: Any) -> None:
     if expression is not None and not expression.is_convex():
         found = "a program that is not convex"
-        raise InputError(where, found, "CVXPY's DCP rules: nondecreasing over norms")
+        accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+        raise InputError(where, found, accepted)
 
 
 def configuration_norms(r: Array, groups: np.ndarray) -> Array:

@@ -9,9 +9,9 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS
 
 ACCEPTED = "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'"
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_TERM = re.compile(rf"\s*([+-]?)\s*(?:({_NUMBER})\s*\*?\s*)?([A-Za-z_][\w.]*)\s*")
-_QUANTITY = re.compile(rf"\s*([+-]?\s*{_NUMBER})\s*([A-Za-z]\w*)?\s*")
+NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_TERM = re.compile(rf"\s*([+-]?)\s*(?:({NUMBER})\s*\*?\s*)?([A-Za-z_][\w.]*)\s*")
+_QUANTITY = re.compile(rf"\s*([+-]?\s*{NUMBER})\s*([A-Za-z]\w*)?\s*")
 _NOMINAL = re.compile(r"\s*nominal\b(.*)")
 LINEAR = ("length", "angle", "ratio", "compliance")
 """Dimensions that parameters have."""
@@ -98,7 +98,7 @@ def _figures(right: str, equals: bool, spread: str, text: str) -> tuple[float | 
     """Return value (or None), deviation and standard deviation [SI], and their dimension."""
     sd, unit = _quantity(spread, text)
     if not unit:
-        raise _wrong(text, "no unit", f"one of {', '.join(_units())} at the end")
+        raise _wrong(text, "no unit", f"one of {', '.join(units())} at the end")
     if not sd > 0:
         raise _wrong(text, f"a standard deviation of {sd:g} {unit}", "one above zero; [constraints] fixes parameters")
     dimension = UNITS[unit].dimension
@@ -127,10 +127,11 @@ def _quantity(figure: str, text: str) -> tuple[float, str]:
     if found is None:
         raise _wrong(text, f"'{figure.strip()}'", f"a number with a unit; as in {ACCEPTED}")
     unit = found[2] or ""
-    if unit and unit not in _units():
-        raise _wrong(text, f"unit '{unit}'", choices(unit, _units()))
+    if unit and unit not in units():
+        raise _wrong(text, f"unit '{unit}'", choices(unit, units()))
     return float(found[1].replace(" ", "")), unit
 
 
-def _units() -> list[str]:
+def units() -> list[str]:
+    """Return the units that parameters have."""
     return [name for name, unit in UNITS.items() if unit.dimension in LINEAR]

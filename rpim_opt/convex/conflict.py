@@ -14,6 +14,7 @@ from rpim_opt.basics.exceptions import Conflict
 from rpim_opt.convex.asked import norms
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.constraints import Box, spoken
+from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.posed import Posed
 from rpim_opt.problem.linear import LinearModel
 
@@ -43,7 +44,7 @@ def conflict(posed: Posed, model: LinearModel) -> Conflict | None:
     kept = _irreducible(units)
     single = _irreducible([[stated] for unit in kept for stated in unit])
     names = tuple(stated.name for unit in single for stated in unit)
-    return Conflict(*_loosening(posed, model), names)
+    return Conflict(*_loosening(posed, model), names, _of_drawings(posed))
 
 
 def _possible(demands: Sequence[Stated]) -> bool:
@@ -77,6 +78,9 @@ def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated
             units.append(_bounds(function, posed, z))
             continue
         demands = [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+        if isinstance(function, Drawn):
+            units.append([Stated(function.name, tuple(demands))])
+            continue
         name = name_of(function, k)
         several = len(demands) > 1
         units.append([Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)])
@@ -140,7 +144,31 @@ def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
     if posed.limited:
         extra = 0.0 if loosen_boxes else slack
         hard.append(norms(model.A @ z - model.b, model.group) <= posed.formulation.largest + extra)
-    problem = cp.Problem(cp.Minimize(cp.sum(slack)), hard)
+    return _least_sum(slack, hard)
+
+
+def _of_drawings(posed: Posed) -> dict[str, float]:
+    """Return by how much [SI] statements would have to give way, in sum of scales the least; empty where that fails."""
+    z = cp.Variable(posed.n)
+    drawn = [function for function in posed.formulation.constraints if isinstance(function, Drawn)]
+    if not drawn:
+        return {}
+    slack = cp.Variable(len(drawn), nonneg=True)
+    units = [function.scale(posed.parameters) for function in drawn]
+    demands: list[Any] = []
+    for k, function in enumerate(posed.formulation.constraints):
+        if isinstance(function, Drawn):
+            place = drawn.index(function)
+            demands += function.loosened(z, posed.parameters, units[place] * slack[place])
+        else:
+            demands += [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+    least = _least_sum(slack, demands)
+    return {function.name: float(unit * s) for function, unit, s in zip(drawn, units, least, strict=True) if s > 1e-6}
+
+
+def _least_sum(slack: cp.Variable, demands: list[Any]) -> Array:
+    """Return the slacks of least sum that make demands possible; zeros where none do."""
+    problem = cp.Problem(cp.Minimize(cp.sum(slack)), demands)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
         try:

@@ -14,6 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display
 from rpim_opt.convex.atoms import cp
+from rpim_opt.convex.drawn import parse
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.robot.parameters import Parameters
 
@@ -25,6 +26,7 @@ __all__ = [
     "differences",
     "equal",
     "in_ball",
+    "parse",
     "signed",
     "within_tolerance",
 ]

@@ -10,6 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.late import Late
 from rpim_opt.convex.atoms import OPTIMAL, cp
+from rpim_opt.convex.conic import ATTEMPTS
 from rpim_opt.convex.posed import Posed
 
 nonpos: Any = Late("cvxpy.constraints.nonpos")
@@ -69,7 +70,8 @@ def nearest(posed: Posed, z: Array) -> Array:
     n = len(z)
     program = posed.projection
     lift = np.vstack([np.eye(n), np.zeros((posed.equations, n))])
-    found = program.solve(lift, np.zeros(n + posed.equations), 0.0, 2 * np.eye(n), -2 * z)
-    if found.status != OPTIMAL:
-        return z
-    return found.u
+    for attempt in range(len(ATTEMPTS)):
+        found = program.solve(lift, np.zeros(n + posed.equations), 0.0, 2 * np.eye(n), -2 * z, attempt=attempt)
+        if found.status == OPTIMAL:
+            return found.u
+    return z

@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.convex.atoms import ATOMS, LARGEST, NORM1, SQUARES, SUM, cp, named
 from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
 from rpim_opt.robot.parameters import Parameters
@@ -21,8 +22,8 @@ NAMED = (*ATOMS, by_link, by_kind)
 """Functions that mean the same whenever they are asked, besides those that are `Ready`."""
 
 
-@dataclass(frozen=True)
-class Formulation:
+@dataclass(frozen=True, repr=False)
+class Formulation(Brief):
     """A convex way to identify the scaled total deviation z from whitened equations A z ~ b.
 
     ::
@@ -81,6 +82,14 @@ class Formulation:
     largest: float = float("inf")
     solvable: bool = True
 
+    def _short(self) -> str:
+        text = f"'{self.name}': {_called(self.loss)}"
+        if self.penalty is not None:
+            text += f" + weight {_called(self.penalty)}"
+        if self.constraints:
+            text += f", {counted(len(self.constraints), 'constraint')}"
+        return text
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "loss", named(self.loss))
         object.__setattr__(self, "penalty", named(self.penalty))
@@ -95,6 +104,11 @@ class Formulation:
     def ready(self) -> bool:
         """Whether all its functions are the package's own, which mean the same whenever they are asked."""
         return all(_is_ready(f) for f in (self.loss, self.penalty, self.penalty_over, *self.constraints))
+
+
+def _called(function: Any) -> str:
+    """Return what a person calls a function."""
+    return str(getattr(function, "maker", "") or getattr(function, "__name__", type(function).__name__))
 
 
 def _functions(constraints: Any) -> tuple[Constraint, ...]:

@@ -11,12 +11,12 @@ P = TypeVar("P")
 
 ENOUGH = 0.3
 """A search ends where the slope is this part of the first."""
-TRIES, MARGIN = 30, 0.05
+TRIES, MARGIN = 8, 0.05
 """Points of a search at most, and how near to an end of the bracket, relative to it, the next one may lie."""
 
 
 def searched(at: Callable[[float], P], rise: Callable[[P], float], begin: P, longer: bool) -> P:
-    """Return a point on a line where a convex function has a small slope, by the secant in a bracket.
+    """Return a point on a line where a convex function has a small slope, by secants and halves of a bracket.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def searched(at: Callable[[float], P], rise: Callable[[P], float], begin: P, lon
     low, slope_low, below = 0.0, first, begin
     high, slope_high = np.inf, np.inf
     t = 1.0
-    for _ in range(TRIES):
+    for k in range(TRIES):
         there = at(t)
         slope = rise(there)
         if abs(slope) <= ENOUGH * abs(first):
@@ -44,15 +44,15 @@ def searched(at: Callable[[float], P], rise: Callable[[P], float], begin: P, lon
                 return there
         else:
             high, slope_high = t, slope
-        t = _between(low, slope_low, high, slope_high)
+        t = _between(low, slope_low, high, slope_high, k % 2 == 1)
     return below
 
 
-def _between(low: float, slope_low: float, high: float, slope_high: float) -> float:
+def _between(low: float, slope_low: float, high: float, slope_high: float, halved: bool) -> float:
     """Return where to look next between a falling and a rising slope."""
     if not np.isfinite(high):
         return 2 * low
     share = 0.5
-    if np.isfinite(slope_high):
+    if np.isfinite(slope_high) and not halved:
         share = min(max(slope_low / (slope_low - slope_high), MARGIN), 1 - MARGIN)
     return low + share * (high - low)

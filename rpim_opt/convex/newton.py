@@ -16,13 +16,13 @@ from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
-SOUGHT, ACCEPTED = 1e-13, 1e-10
+SOUGHT, ACCEPTED = 1e-12, 1e-10
 """Duality gap, relative to the objective, that the method goes on to while that falls, and that it must reach."""
 MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
 """How sharp they then are, relative to those that a loss without multipliers begins with."""
-SHARPER, SHARPEST = 10.0, 1e9
+SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
@@ -171,13 +171,17 @@ class Newton:
             if best is None or ended.gap < best.gap:
                 best = ended
                 vain = 0
-            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or most == SOON)):
                 break
             if self.loss.kinks and ended.gap - point.smooth.missing <= SETTLED * point.smooth.missing:
                 kinked = Kinked(point.smooth.multipliers, min(SHARPER * kinked.sharpness, SHARPEST))
                 point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
-            else:
-                point = self._stepped(point, slope, kinked)
+                continue
+            ahead = self._stepped(point, slope, kinked)
+            if ahead is point and self.loss.kinks:  # no step is short enough for kinks so sharp
+                kinked = kinked._replace(sharpness=kinked.sharpness / SHARPER)
+                ahead = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
+            point = ahead
         return best
 
     def _begun(self, r: Array) -> Kinked:
@@ -197,11 +201,22 @@ class Newton:
         if self.box is not None:
             by_z = self.back.T @ slope
             slope = (self.at.B * self.unit).T @ np.where(self.held(point.z, by_z), 0.0, by_z)
-        held = self.pull > 0
-        g = np.divide(slope, self.unit, out=np.zeros_like(slope), where=self.unit > 0)
-        gap = float(np.sum(g[held] ** 2 / (4 * self.pull[held])))
-        free = ~held & (self.unit > 0)
-        return gap + FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free]))), by_z
+        gap = float(slope**2 @ self._price)
+        free = self._free
+        if len(free):
+            gap += FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free])))
+        return gap, by_z
+
+    @cached_property
+    def _price(self) -> Array:
+        """(p,) by what squared slopes of penalized coordinates are multiplied in the gap."""
+        held = (self.pull > 0) & (self.unit > 0)
+        return np.divide(0.25, self.pull * self.unit**2, out=np.zeros_like(self.unit), where=held)
+
+    @cached_property
+    def _free(self) -> np.ndarray:
+        """Which coordinates data alone decide."""
+        return np.flatnonzero((self.pull == 0) & (self.unit > 0))
 
     def held(self, z: Array, slope: Array) -> np.ndarray:
         """Return which components of z (n,) a bound holds, for a slope (n,)."""
@@ -251,7 +266,7 @@ class Newton:
             if len(curvature.along):
                 H += self._along(curvature)
         H = self.unit[:, None] * H * self.unit
-        H[np.diag_indices_from(H)] += 2 * self.pull * self.unit**2 + FLAT
+        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
         return H
 
     def _along(self, curvature: Curvature) -> Array:

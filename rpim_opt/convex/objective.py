@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Brief
 from rpim_opt.convex import feasible
 from rpim_opt.convex.asked import configuration_norms
 from rpim_opt.convex.coordinates import Coordinates, coordinates
@@ -29,8 +30,8 @@ class Damping(NamedTuple):
     size: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Objective:
+@dataclass(frozen=True, eq=False, repr=False)
+class Objective(Brief):
     """What a formulation makes of a linear model.
 
     Parameters
@@ -44,6 +45,9 @@ class Objective:
     _posed: Posed
 
     # --- structure ---------------------------------------------------------------------------------------------
+
+    def _short(self) -> str:
+        return f"'{self.formulation.name}' on {self.model._short()}"
 
     @property
     def loss_form(self) -> Quadratic | None:
@@ -69,6 +73,11 @@ class Objective:
     def constrained(self) -> bool:
         """Whether there are constraints, or ``largest`` is one."""
         return self._posed.constrained
+
+    @property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return self._posed.predicts
 
     @property
     def closed_form(self) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.convex.asked import Asked, ask, configuration_norms, norms
+from rpim_opt.convex.asked import Asked, ask, norms
 from rpim_opt.convex.atoms import NORM2, SQUARES, cp
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
@@ -91,7 +91,7 @@ class Posed:
         """The answers of the functions; asked once, whichever thread needs them first."""
         with self._lock:
             if self._answers is None:
-                self._answers = ask(self.formulation, self.parameters, self.n, self.equations, self.groups)
+                self._answers = ask(self.formulation, self.parameters, self.equations, self.groups)
         return self._answers
 
     @cached_property
@@ -123,6 +123,11 @@ class Posed:
     def own(self) -> list[cp.Variable]:
         """Variables that the functions brought along."""
         return self.asked.own
+
+    @cached_property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return not self._known and self.asked.predicts
 
     @cached_property
     def live(self) -> tuple[Any, Any, list[list[Any]]]:
@@ -256,7 +261,7 @@ class Posed:
         """Return what the loss gets of a residual: itself, or the norms of the configurations."""
         if self.formulation.loss_over == "equation":
             return r
-        return configuration_norms(r, self.groups)
+        return np.sqrt(np.bincount(self.groups, r**2))
 
     def loss_slope(self, r: Array) -> Array | None:
         """Return the gradient (m,) of the loss by the residual; None where CVXPY knows none."""
@@ -466,7 +471,7 @@ class Unposed(Posed):
         self.n = model.A.shape[1]
         self.groups = np.unique(model.group, return_inverse=True)[1]
         self.equations = len(model.b)
-        self.limited, self.constrained = False, True
+        self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []
         self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
         self._known = False

@@ -11,6 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.by_rows import Met, by_rows
@@ -28,8 +29,8 @@ PROVEN = 1e-9
 """Duality gap, relative to the objective, that proves a minimum."""
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(Brief):
     """One solution: z (n,) at a weight, with the two values that the L-curve plots.
 
     Parameters
@@ -68,6 +69,9 @@ class Estimate:
     iterations: int = 0
     seconds: float = 0.0
 
+    def _short(self) -> str:
+        return f"{self.status} at weight {self.weight:.4g}: loss {self.loss:.4g}, penalty {self.penalty:.4g}"
+
     @property
     def objective(self) -> float:
         """Loss and weighted penalty together."""
@@ -76,7 +80,7 @@ class Estimate:
         return self.loss + self.weight * self.penalty
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Program(Objective):
     """A formulation applied to a linear model, ready to be solved at any weight.
 
@@ -142,7 +146,9 @@ class Program(Objective):
 
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
-        have a formula, in a box an active set; everything else is Clarabel's, on data that are dimensionless.
+        have a formula, in a box an active set; a loss that is a sum over rows or configurations (robust, sum of norms,
+        quantiles) with a squared penalty, in a box or without, has Newton's method, begun where the last minimum was
+        and ended by a duality gap; everything else is Clarabel's, on data that are dimensionless.
 
         Parameters
         ----------

@@ -73,7 +73,7 @@ class Rows:
         slope = np.zeros_like(v)
         for curve, factor, (a, c) in self.pieces:
             value, rise = curve.both(a * v + c)
-            total += float(np.sum(factor * value))
+            total += float((factor * value).sum())
             slope += factor * a * rise
         return total, slope
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.scalar import least
+from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel
@@ -19,8 +21,8 @@ LARGEST = 1e100
 """Weights that are not zero: far beyond those of any problem, and far within the range of doubles."""
 
 
-@dataclass(frozen=True, eq=False)
-class Selection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Selection(Tabled):
     """A chosen weight with its evidence.
 
     Parameters
@@ -61,6 +63,17 @@ class Selection:
     interior: bool
     note: str = ""
     groups: Mapping[str, float] = field(default_factory=dict)
+
+    def _short(self) -> str:
+        where = "inside" if self.interior else "at an edge of"
+        return f"{self.name}: weight {self.weight:.4g}, {where} {counted(len(self.weights), 'weight')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        pairs = zip(self.weights, self.score, strict=True)
+        return [{"weight": float(weight), "score": float(score)} for weight, score in pairs]
+
+    def _notes(self) -> list[str]:
+        return [self.note]
 
 
 Selector = Callable[[Program], Selection]

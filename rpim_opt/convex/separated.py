@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.rows import Affine, Kink, Rows
+from rpim_opt.convex.rows import LINE, Affine, Kink, Rows
 
 NEAR_ZERO = 1e-150
 """Norms below have no direction."""
@@ -130,28 +130,38 @@ class Separated:
             return v
         return v[self.which]
 
-    def _smooth(self, r: Array) -> tuple[float, Array]:
-        """Return value and slope (m,) of what is no kink."""
+    @cached_property
+    def _curved(self) -> Rows:
+        """What is no kink and, of norms, no line: a line in a norm is a kink at zero."""
         if self.starts is None:
-            return self.rows.both(r)
-        v = self._norms(r)
-        value, slope = self.rows.both(v)
-        if self._tilted:
-            slope = slope + self._tilt
-            value += float(np.sum(self._tilt * v))
-        return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
+            return self.rows
+        bent = tuple(piece for piece in self.rows.pieces if piece.curve is not LINE)
+        nothing = np.zeros(len(self.starts))
+        left = self.rows.both(nothing)[0] - Rows(bent).both(nothing)[0]
+        return Rows(bent, constant=left)
 
     @cached_property
     def _tilt(self) -> Any:
-        """What kinks at zero add to the slope of the pieces, without the kink that is apart."""
-        tilt: Any = -self.at_zero
-        for factor, of in self.rows.kinks:
-            tilt = tilt + factor * np.abs(of.a)
-        return tilt
+        """Slopes (N,) that curved pieces have at norms of zero, which belong to the kink there; or one number."""
+        if self.starts is None:
+            return 0.0
+        slope = self._curved.both(np.zeros(len(self.starts)))[1]
+        if np.any(slope):
+            return slope
+        return 0.0
 
-    @cached_property
-    def _tilted(self) -> bool:
-        return bool(np.any(self._tilt))
+    def _smooth(self, r: Array) -> tuple[float, Array]:
+        """Return value and slope (m,) of what is no kink."""
+        if not self._curved.pieces:
+            return self._curved.constant, np.zeros_like(r)
+        if self.starts is None:
+            return self._curved.both(r)
+        v = self._norms(r)
+        value, slope = self._curved.both(v)
+        if np.ndim(self._tilt):
+            slope = slope - self._tilt
+            value -= float(self._tilt @ v)
+        return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
 
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
@@ -167,7 +177,7 @@ class Separated:
             anew.append(new)
             slope = slope + a * new
             value += float(new @ s - (new - old) @ (new - old) / (2 * sharpness))
-            bent = float(np.sum(factor * self._norms(s)))
+            bent = float((factor * self._norms(s)).sum())
             loss += bent
             missing += bent - float(new @ s)
         return Smoothed(value, loss, slope, anew, missing)
@@ -187,11 +197,13 @@ class Separated:
         return found
 
     def _smooth_curvature(self, r: Array) -> Curvature:
+        if not self._curved.pieces:
+            return Curvature(np.zeros_like(r))
         if self.starts is None:
             return Curvature(self.rows.bend(r))
         v = self._norms(r)
-        slope = self.rows.both(v)[1] + self._tilt
-        bend = self.rows.bend(v)
+        slope = self._curved.both(v)[1] - self._tilt
+        bend = self._curved.bend(v)
         small = v <= NEAR_ZERO
         across = np.where(small, bend, slope / np.where(small, 1.0, v))
         return Curvature(self._spread(across), bend - across, r / self._spread(np.where(small, 1.0, v)))

@@ -28,7 +28,7 @@ def scalar(value: Any, where: str) -> Any:
     if expression.is_complex():
         raise InputError(where, "a complex value", accepted)
     if not expression.is_convex():
-        raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; found {_short(expression)}")
+        raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; {reason(expression)}")
     if expression.shape == ():
         return expression
     return cp.reshape(expression, (), order="C")
@@ -45,8 +45,25 @@ def listed(value: Any, where: str) -> list[Any]:
         if not isinstance(constraint, cp.Constraint):
             raise InputError(where, f"a {type(constraint).__name__}", "a CVXPY constraint, or several in a list")
         if not constraint.is_dcp():
-            raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; found {_short(constraint)}")
+            raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; {reason(constraint)}")
     return made
+
+
+def reason(stated: Any) -> str:
+    """Say which part of an expression or constraint breaks CVXPY's rules: the innermost one."""
+    if isinstance(stated, cp.Constraint):
+        broken = [argument for argument in stated.args if not argument.is_dcp()]
+        if not broken:
+            shapes = ", ".join(argument.curvature.lower() for argument in stated.args)
+            return f"found {_short(stated)}, whose sides are {shapes}: convex <= concave, or affine == affine"
+        return reason(broken[0])
+    if stated.is_dcp():
+        return f"found {_short(stated)}, which is {stated.curvature.lower()}"
+    inner = [argument for argument in stated.args if not argument.is_dcp()]
+    if inner:
+        return reason(inner[0])
+    within = ", ".join(f"{_short(argument)} {argument.curvature.lower()}" for argument in stated.args)
+    return f"found {_short(stated)}, of which CVXPY cannot tell that it is convex (of {within})"
 
 
 def _short(expression: Any) -> str:

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import LARGEST
+from rpim_opt.basics.shown import Brief, Tabled, counted
+from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.models import Measurement, position
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
+@dataclass(frozen=True, eq=False, repr=False)
+class Block(Brief):
     """Rows of a dataset that one function evaluates: one measurement model, the same reflectors and fixture.
 
     Parameters
@@ -60,6 +62,9 @@ class Block:
     columns: Mapping[str, Array] = field(default_factory=dict)
     robot: str = ""
 
+    def _short(self) -> str:
+        return f"{counted(len(self.row), 'row')} of {self.measurement.name}"
+
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
         covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
@@ -80,8 +85,8 @@ class Block:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Dataset:
+@dataclass(frozen=True, eq=False, repr=False)
+class Dataset(Tabled):
     """Rows of measurements, of one kind or several.
 
     Parameters
@@ -107,6 +112,24 @@ class Dataset:
     blocks: tuple[Block, ...]
     label: tuple[str, ...]
     configuration: np.ndarray
+
+    def _short(self) -> str:
+        kinds = ", ".join(dict.fromkeys(block.measurement.name for block in self.blocks))
+        configurations = counted(len(np.unique(self.configuration)), "configuration")
+        return f"{counted(len(self), 'row')} of {kinds} in {configurations}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return label, configuration, kind of measurement, reflectors, and what was measured."""
+        rows: list[dict[str, Any]] = [{} for _ in self.label]
+        for block in self.blocks:
+            units = {column: display(dimension) for column, dimension in block.measurement.columns.items()}
+            for row, y in zip(block.row, block.y, strict=True):
+                found = {"label": self.label[row], "configuration": int(self.configuration[row])}
+                found |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
+                for (column, (unit, si)), value in zip(units.items(), y, strict=True):
+                    found[f"{column}_{unit}"] = float(value / si)
+                rows[row] = found
+        return rows
 
     def __len__(self) -> int:
         return len(self.label)

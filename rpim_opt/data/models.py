@@ -10,6 +10,7 @@ import casadi as ca
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Brief
 from rpim_opt.data.rotations import (
     from_angles,
     from_matrices,
@@ -31,8 +32,8 @@ def _sum(modelled: Array, error: Array) -> Array:
     return modelled + error
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurement(Brief):
     """A measurement model: the residual of a row is ``minus(y, model(T, **own))``.
 
     Parameters
@@ -119,6 +120,9 @@ class Measurement:
     prepare: Callable[[Array], Array] = lambda y: y
     sees: tuple[str, ...] = ()
     extra: Mapping[str, str] = field(default_factory=dict)
+
+    def _short(self) -> str:
+        return f"'{self.name}': {', '.join(self.components)}"
 
     def __post_init__(self) -> None:
         require_columns(self.extra, f"measurement {self.name}")

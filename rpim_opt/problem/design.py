@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
@@ -27,8 +28,8 @@ ENOUGH = 2e-3
 """Relative gap at which the relaxation is solved well enough."""
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Brief):
     """A chosen set of configurations.
 
     Parameters
@@ -61,6 +62,9 @@ class Design:
     value: float
     bound: float
     gap: float
+
+    def _short(self) -> str:
+        return f"{counted(len(self.chosen), 'configuration')} chosen"
 
     def __str__(self) -> str:
         """Return the choice in a sentence."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.units import display
@@ -28,8 +29,8 @@ STANDS_OUT = 5.0
 """Rows further than this many robust standard deviations above the median residual are listed."""
 
 
-@dataclass(frozen=True, eq=False)
-class Inspection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Inspection(Tabled):
     """What `inspect` found.
 
     Parameters
@@ -74,6 +75,18 @@ class Inspection:
     warnings: tuple[str, ...]
     proposals: tuple[str, ...]
     observability: Observability
+
+    def _short(self) -> str:
+        o = self.observability
+        seen = f"{o.rank} of {len(o.names)} directions seen"
+        return f"{self.problem.data._short()}, {seen}, {counted(len(self.warnings), 'warning')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the joints and how far they move."""
+        return self._joint_rows()
+
+    def _notes(self) -> list[str]:
+        return [*(f"Warning: {text}" for text in self.warnings), *(f"Proposal: {text}" for text in self.proposals)]
 
     def __str__(self) -> str:
         """Return everything as a person reads it."""

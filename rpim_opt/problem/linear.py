@@ -12,6 +12,7 @@ from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
 
@@ -19,8 +20,8 @@ RANK_TOLERANCE = 1e-10
 """Singular values below this part of the largest count as zero: the data do not see those directions."""
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(Brief):
     """A calibration linearized around some deviation: A z ~ b, everything dimensionless.
 
     Parameters
@@ -64,6 +65,9 @@ class LinearModel:
     constrained: bool = False
     stands_for: int | None = None
     offset: float = 0.0
+
+    def _short(self) -> str:
+        return f"{counted(self.equations, 'equation')}, {counted(self.A.shape[1], 'parameter')}"
 
     @property
     def equations(self) -> int:

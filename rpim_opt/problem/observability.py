@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.shown import Brief
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import Robot
@@ -17,8 +18,8 @@ TIE = 1e-6
 """Sizes that differ by less than this part are the same but for rounding: the order of the parameters decides."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observability:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observability(Brief):
     """How well a set of configurations shows the identified parameters.
 
     Parameters
@@ -66,6 +67,9 @@ class Observability:
     base: tuple[dict[str, float], ...]
     condition: float
     raw_condition: float
+
+    def _short(self) -> str:
+        return f"{self.rank} of {len(self.names)} directions seen, condition {self.condition:.3g}"
 
     @property
     def indices(self) -> dict[str, float]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.functions import Functions, Kept, Structure, asked
+from rpim_opt.problem.identified import Identified, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.loads import (
     Loads,
@@ -37,8 +40,8 @@ SOME, LARGE = 1000, 20_000
 """Rows from which on a compiled function is worth loading, and worth compiling."""
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationProblem(Tabled):
     """What was measured on which robot, and which parameters are to explain it.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
@@ -82,6 +85,13 @@ class CalibrationProblem:
     data: Dataset
     asked: Kept | None = field(default=None, repr=False)
     scatter: Scatter | None = None
+
+    def _short(self) -> str:
+        return f"of '{self.robot.name}': {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the identified parameters."""
+        return self.parameters.free._frame_rows()
 
     def __post_init__(self) -> None:
         p = self.parameters
@@ -473,7 +483,12 @@ class CalibrationProblem:
                 part = slice(start, start + most)
                 A, b = self._equations(i, x, part)
                 group = np.repeat(self.data.configuration[block.row[part]], each)
-                yield LinearModel(A, b, group, self.parameters.free, constrained)
+                yield LinearModel(A, b, group, self._identified, constrained)
+
+    @cached_property
+    def _identified(self) -> Identified:
+        """The identified parameters, with what their positions are predicted from."""
+        return identified_of(self.robot, self.parameters, self.data)
 
     def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
         """Return whitened, scaled A and b of some rows of a block."""
@@ -506,7 +521,7 @@ class CalibrationProblem:
             residual, jacobian = problem._slopes(x)
             A = problem._whitened(jacobian) * scale
             r = problem._whitened(residual[:, None])[:, 0]
-            yield LinearModel(A, r + A @ (x / scale), problem.groups, self.parameters.free, constrained)
+            yield LinearModel(A, r + A @ (x / scale), problem.groups, self._identified, constrained)
 
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) [SI], evaluated together."""

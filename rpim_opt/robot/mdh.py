@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import Angle, Length, Misfit, Table, read_toml, validate
+from rpim_opt.basics.shown import Brief, shortened
 from rpim_opt.basics.units import LARGEST, UNITS, accepted_units
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mounting import Mounting, PayloadTable, of_links, stated_gravity
@@ -25,8 +26,8 @@ FARTHEST = 1e15
 """Size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away."""
 
 
-@dataclass(frozen=True, eq=False)
-class Robot:
+@dataclass(frozen=True, eq=False, repr=False)
+class Robot(Brief):
     """A serial arm.
 
     Link i moves frame i-1 to frame i by (Craig's convention; paper, Eq. 1)::
@@ -80,6 +81,9 @@ class Robot:
     source: str = ""
     gravity: Gravity = field(default_factory=Gravity)
     model: Model = field(default_factory=Model)
+
+    def _short(self) -> str:
+        return f"'{shortened(self.name)}', {self.dof} joints"
 
     def __post_init__(self) -> None:
         mdh = _frozen(self.mdh)

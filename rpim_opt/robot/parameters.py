@@ -7,19 +7,25 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Tabled
+from rpim_opt.basics.units import display
 from rpim_opt.robot.kinematics import roll_pitch_yaw, rotation_rpy
 from rpim_opt.robot.overlay import Overlay
 from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, own_name
 
+SHOWN = 4
+"""Names in one line."""
 
-@dataclass(frozen=True, eq=False)
-class Parameters:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Parameters(Tabled):
     """A table of model parameters, one entry each in every field.
 
     Parameters
@@ -63,6 +69,27 @@ class Parameters:
     identified: np.ndarray
     own_frames: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
+
+    def _short(self) -> str:
+        shown = ", ".join([*self.names[:SHOWN], "..."] if len(self) > SHOWN else self.names)
+        return f"{shown}: {np.count_nonzero(self.identified)} of {len(self)} identified"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
+            unit, si = display(dimension)
+            row = {
+                "parameter": name,
+                "unit": unit,
+                "nominal": float(self.nominal[i] / si),
+                "scale": float(self.scale[i] / si),
+                "tolerance": None,
+                "identified": bool(self.identified[i]),
+            }
+            if np.isfinite(self.tolerance[i]):
+                row["tolerance"] = float(self.tolerance[i] / si)
+            rows.append(row)
+        return rows
 
     def __len__(self) -> int:
         return len(self.names)

@@ -6,21 +6,22 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.show.figure import AFTER, MARK, Axes, axes_of, legend_above
 
 
-def l_curve(program: Program, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
+def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
     """Draw the L-curve: the root of the penalty against that of the loss, over the weights, with selectors' choices.
 
     The program is solved at 200 weights where it has a closed form, else at 40.
 
     Parameters
     ----------
-    program
-        Its penalty has to be something: InputError otherwise.
+    of
+        A program, or a result, whose own weight is marked; its penalty has to be something: InputError otherwise.
     selections
         Choices to mark, by name.
     ax
@@ -30,24 +31,39 @@ def l_curve(program: Program, selections: Mapping[str, Selection] | None = None,
     --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.l_curve(result.program, {"REML": result.selection})
+    >>> ax = ro.plot.l_curve(result)
+    >>> print(ax.get_legend().get_texts()[0].get_text())
+    reml, weight 1.5
     >>> ax.get_xlabel()
     'whitened residual norm'
     >>> ax.figure.savefig("l_curve.pdf")
     """
     ax = axes_of(ax)
+    program, marked = _program_and_marks(of, selections)
     weights = weight_grid(program, 200 if program.closed_form else 40)
     points = np.array([[e.loss, e.penalty] for e in program.path(weights)])
     ax.loglog(np.sqrt(points[:, 0]), np.sqrt(points[:, 1]), color="0.3", lw=1.5)
-    for k, (name, selection) in enumerate((selections or {}).items()):
-        e = program.path([selection.weight])[0]
-        label = f"{name}, weight {selection.weight:.2g}"
+    for k, (name, weight) in enumerate(marked.items()):
+        e = program.path([weight])[0]
+        label = f"{name}, weight {weight:.2g}"
         ax.plot(np.sqrt(e.loss), np.sqrt(e.penalty), "osD^v<>"[k % 7], color=f"C{k}", ms=8, mec="white", label=label)
     ax.set_xlabel("whitened residual norm")
     ax.set_ylabel("norm of the deviations [scales]")
-    if selections:
+    if marked:
         ax.legend(frameon=False)
     return ax
+
+
+def _program_and_marks(
+    of: Program | Calibration, selections: Mapping[str, Selection] | None
+) -> tuple[Program, dict[str, float]]:
+    """Return the program, and the weights to mark by name: of a result its own first."""
+    marked = {name: choice.weight for name, choice in (selections or {}).items()}
+    if not isinstance(of, Calibration):
+        return of, marked
+    if of.selector not in marked:
+        marked = {of.selector: of.weight, **marked}
+    return of.program, marked
 
 
 def selection(selection: Selection, ax: Axes = None) -> Axes:
@@ -77,13 +93,13 @@ def selection(selection: Selection, ax: Axes = None) -> Axes:
     return ax
 
 
-def selectors(program: Program, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
+def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
     """Draw the weights that selectors choose; hollow: at an edge.
 
     Parameters
     ----------
-    program
-        The formulation on a linear model.
+    of
+        The formulation on a linear model, or a result.
     selections
         Choices by name; by default those of all selectors that serve the program (`compare`).
     ax
@@ -93,11 +109,12 @@ def selectors(program: Program, selections: Mapping[str, Selection] | None = Non
     --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.selectors(result.program)
+    >>> ax = ro.plot.selectors(result)
     >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
     ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
     """
     ax = axes_of(ax)
+    program, _ = _program_and_marks(of, None)
     chosen = compare(program) if selections is None else selections
     ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
     for place, (_, selection) in enumerate(ordered):
@@ -109,7 +126,7 @@ def selectors(program: Program, selections: Mapping[str, Selection] | None = Non
     return ax
 
 
-def picard(program: Program, weight: float = 0.0, ax: Axes = None) -> Axes:
+def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:
     """Draw Picard's condition: singular values, what the data say along them, and the solution's coefficients.
 
     Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
@@ -117,10 +134,10 @@ def picard(program: Program, weight: float = 0.0, ax: Axes = None) -> Axes:
 
     Parameters
     ----------
-    program
-        The formulation on a linear model.
+    of
+        The formulation on a linear model, or a result.
     weight
-        Whose root is drawn, if it is not zero.
+        Whose root is drawn, if it is not zero; of a result its own by default.
     ax
         Matplotlib's axes; new ones by default.
 
@@ -128,11 +145,13 @@ def picard(program: Program, weight: float = 0.0, ax: Axes = None) -> Axes:
     --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.picard(result.program, result.weight)
+    >>> ax = ro.plot.picard(result)
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
     ['singular value s', "data |u'b|", "coefficient |u'b| / s", 'root of the weight']
     """
     ax = axes_of(ax)
+    program, marked = _program_and_marks(of, None)
+    weight = weight or next(iter(marked.values()), 0.0)
     beta, s, _ = program.model.svd
     k = np.arange(1, len(s) + 1)
     seen = s > 0

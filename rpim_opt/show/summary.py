@@ -56,6 +56,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         **{key: whole[key] for key in KEYS},
         "errors": errors,
         "orientation": angles,
+        "prices": [price._asdict() for price in result.prices],
         "remarks": _remarks(result),
         "lack_of_fit": lacking and lacking.content(),
     }

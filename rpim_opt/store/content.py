@@ -37,6 +37,7 @@ def content(result: Calibration) -> dict[str, Any]:
         "certificate": _certificate(result),
         "trust": _trust(result),
         "held": [held._asdict() for held in result.held],
+        "prices": [price._asdict() for price in result.prices],
         "history": [{**vars(each)} for each in result.history],
         "selection": selection_part(result.selection),
         "definition": definition(result.formulation),

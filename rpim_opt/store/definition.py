@@ -18,6 +18,7 @@ from rpim_opt.convex.constraints import (
     differences,
     equal,
     in_ball,
+    parse,
     signed,
     within_tolerance,
 )
@@ -38,7 +39,7 @@ READY: dict[str, Callable[..., Any]] = {
 }
 """Functions of a formulation that a file names; those that the next ones make are named with their arguments."""
 MAKERS: dict[str, Callable[..., Any]] = {
-    f.__name__: f for f in (huber, at_nominal, signed, equal, in_ball, differences)
+    f.__name__: f for f in (huber, at_nominal, signed, equal, in_ball, differences, parse)
 }
 BELIEVED = "believed"
 """The maker of a prior's penalty, whose first argument is the penalty that it was made of."""

@@ -10,17 +10,20 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
+from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.atoms import cp
-from rpim_opt.convex.constraints import Box
+from rpim_opt.convex.constraints import Box, Constraint
+from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.given import given
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import starting_parameters
+from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
@@ -32,8 +35,8 @@ from rpim_opt.store.prior_table import prior_files, stated_prior
 from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
 
 
-@dataclass(frozen=True, eq=False)
-class Instance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Instance(Tabled):
     """A calibration problem as its folder states it.
 
     Parameters
@@ -86,6 +89,16 @@ class Instance:
     excluded: Mapping[str, str] = field(default_factory=dict)
     model: str = "geometry"
     noise: str = "robot"
+
+    def _short(self) -> str:
+        return f"'{shortened(self.title)}': {self.problem!r}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the identified parameters."""
+        return self.problem.parameters.free._frame_rows()
+
+    def _notes(self) -> list[str]:
+        return [self.source]
 
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration as the folder wants it, with its record.
@@ -150,7 +163,7 @@ def load(
     tables = read_tables(stated)
     try:
         problem = _problem(stated, tables)
-        formulation = _formulation(table, problem.parameters, path)
+        formulation = _formulation(stated, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
     except InputError as error:
         raise error.within(path) from None
@@ -183,16 +196,30 @@ def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
     return problem.scattered(stated_scatter(stated.table, stated.path))
 
 
-def _formulation(table: ProblemTable, parameters: Parameters, path: Path) -> Formulation:
+def _formulation(stated: Stated, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
+    table, path = stated.table, stated.path
     formulation = named_formulation(table.formulation, path)
-    formulation = replace(formulation, constraints=(*formulation.constraints, *table.constraints.all()))
+    demands = table.constraints.all(problem.robot, problem.data)
+    formulation = replace(formulation, constraints=(*formulation.constraints, *demands))
+    parameters = identified_of(problem.robot, problem.parameters, problem.data)
     for constraint in formulation.constraints:
         if isinstance(constraint, Box):
-            constraint.bounds(parameters.free)
+            constraint.bounds(parameters)
         else:
-            constraint(cp.Variable(len(parameters.free)), parameters.free)
+            _require_fit(constraint, parameters)
+    for demand in demands:
+        if isinstance(demand, Drawn):
+            demand.require_near(parameters)
     return formulation
+
+
+def _require_fit(constraint: Constraint, parameters: Parameters) -> None:
+    """Ask a constraint of the file for what it demands of the parameters, or raise its InputError."""
+    from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
+
+    z = Unknown(parameters.names)
+    constraint(z, given(z, parameters))
 
 
 def _published(table: ProblemTable, tables: Tables, path: Path) -> dict[str, Mapping[str, float]]:

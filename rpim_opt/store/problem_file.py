@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,6 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.units import split_unit
-from rpim_opt.convex.constraints import Constraint, at_nominal, equal, signed
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.problem.scatter import Scatter
@@ -28,6 +26,7 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.named import find, named_formulation, named_weight
 from rpim_opt.store.prior_table import PriorTable
 from rpim_opt.store.proposal import proposed
+from rpim_opt.store.stated_table import Constraints
 
 Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
@@ -61,25 +60,6 @@ class Observation(Table):
     identification: str
     validation: str | None = None
     noise: dict[str, Any] = Field(default_factory=dict)
-
-
-class Constraints(Table):
-    """What is known of parameters besides their scales: ``[constraints]``."""
-
-    at_nominal: list[Name] = Field(default_factory=list)
-    positive: list[Name] = Field(default_factory=list)
-    negative: list[Name] = Field(default_factory=list)
-    equal: list[list[Name]] = Field(default_factory=list)
-
-    def all(self) -> tuple[Constraint, ...]:
-        """Return them as functions of a formulation."""
-        boxes = (
-            (self.at_nominal, at_nominal),
-            (self.positive, partial(signed, 1)),
-            (self.negative, partial(signed, -1)),
-        )
-        made = [make(*patterns) for patterns, make in boxes if patterns]
-        return (*made, *(equal(*names) for names in self.equal))
 
 
 class ProblemTable(Table):

@@ -16,6 +16,7 @@ from rpim_opt.basics.files import read_json, validate, write_json
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held
+from rpim_opt.calibration.prices import Price
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import Unposed
@@ -26,6 +27,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import own_frames
+from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.open_model import Model
@@ -161,7 +163,7 @@ def _calibration(file: File, known: Mapping[str, Measurement], model: Models) ->
     if len(x) != unknowns:
         raise InputError("key x", f"{len(x)} numbers", f"{unknowns}, one an identified parameter")
     formulation = formulation_of(file.formulation, file.definition)
-    program = _program(file, formulation, problem.linearize(x))
+    program = _program(file, formulation, around(problem.linearize(x), x))
     return Calibration(
         problem,
         formulation,
@@ -242,12 +244,13 @@ def _validation(file: File, problem: CalibrationProblem, known: Mapping[str, Mea
 def _kept(file: File, program: Program) -> Kept:
     """Return what the functions of a script said when they were there; nobody can ask them again."""
     held = tuple(Held(**held.model_dump()) for held in file.held)
+    prices = tuple(Price(**price.model_dump()) for price in file.prices)
     if file.trust is None:
-        return Kept(held, None)
+        return Kept(held, None, prices=prices)
     keep = np.ones(len(program.model.b), dtype=bool)
     keep[file.trust.left_out] = False
     factor = file.trust.factor**2
-    return Kept(held, kept_equations(program.model, keep, factor), factor, tuple(file.trust.left_out))
+    return Kept(held, kept_equations(program.model, keep, factor), factor, tuple(file.trust.left_out), prices)
 
 
 def _compare(file: File, result: Calibration) -> None:

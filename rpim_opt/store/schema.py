@@ -168,6 +168,18 @@ class HeldPart(Part):
     gain: float
 
 
+class PricePart(Part):
+    """What a statement of a drawing costs, in its unit."""
+
+    text: str
+    unit: str
+    slack: float
+    multiplier: float
+    step: float
+    gain: float
+    misfit: float
+
+
 class RecordPart(Part):
     """Where the measurements come from."""
 
@@ -255,6 +267,7 @@ class File(Part):
     held: list[HeldPart]
     robot: RobotPart | None = None
     robots: dict[str, RobotPart] = Field(default_factory=dict)
+    prices: list[PricePart] = Field(default_factory=list)
     model: list[ParameterPart]
     data: SetsPart
     record: RecordPart

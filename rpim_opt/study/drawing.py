@@ -128,7 +128,7 @@ def _round_ticks(ax: Any) -> None:
         ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     else:
         ax.xaxis.set_major_locator(LogLocator(subs=[k / 10 for k in range(10, 100)]))
-    if 1.2 < high / low <= 3:
+    if 1.6 < high / low <= 3:
         ax.xaxis.set_major_locator(LogLocator(subs=(1, 1.2, 1.5, 2, 2.5, 3, 5, 6, 7, 8, 9)))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

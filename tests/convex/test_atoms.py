@@ -67,7 +67,7 @@ def test_what_is_declared_is_what_the_canonicalization_shows(stated: Formulation
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
     program = ro.convex.pose(stated, model)
     equations, n = model.A.shape
-    asked = ask(stated, model.parameters, n, equations, model.group)
+    asked = ask(stated, model.parameters, equations, model.group)
     rng = np.random.default_rng(0)
     r, z = rng.normal(size=equations), rng.normal(size=n)
     loss = quadratic(asked.loss_term.expression, asked.loss_term.variable)

@@ -21,6 +21,7 @@ VARIANTS = (
     "parallel_axes",
     "offsets",
     "certified_tool",
+    "drawing",
     "everything",
     "wrong_tolerance",
 )

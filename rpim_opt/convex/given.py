@@ -1,0 +1,215 @@
+"""What a formulation's functions are given: z and the parameters by name, and predicted positions that follow z."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.convex.atoms import cp
+from rpim_opt.problem.identified import Identified, Machine
+from rpim_opt.problem.predicting import Predicted, markers, moved, predicted
+from rpim_opt.robot.parameters import Parameters
+
+
+def places(names: Sequence[str], pattern: str, where: str) -> list[int]:
+    """Return which names match a pattern (``*``, ``?``, ``[...]``), one at least."""
+    found = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+    if not found:
+        raise InputError(where, f"'{pattern}'", "parameters: " + choices(pattern, names))
+    return found
+
+
+def index_of(names: Sequence[str], key: Any, where: str) -> Any:
+    """Return the place of a name, the places that a pattern matches, or any other index as it is."""
+    if not isinstance(key, str):
+        return key
+    if key in names:
+        return list(names).index(key)
+    return places(names, key, where)
+
+
+class Deviations:
+    """x = S z, deviations [SI] by name: ``x["a2"]`` in metres, ``x["alpha?"]`` in radians, ``x["*"]`` all of them.
+
+    Parameters
+    ----------
+    z
+        (n,) in units of the scales.
+    parameters
+        The n identified parameters.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> def shorter(z, p):
+    ...     return p.x["a2"] <= -0.1e-3  # [m]
+    >>> stated = ro.Formulation("a shorter link", penalty=ro.tikhonov.penalty, constraints=(shorter,))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+    >>> print(f"{1e3 * dict(zip(result.problem.parameters.free.names, result.x))['a2']:.3f} mm")
+    -0.100 mm
+    """
+
+    def __init__(self, z: cp.Expression, parameters: Parameters):
+        self._z = z
+        self._parameters = parameters
+
+    def __getitem__(self, key: Any) -> Any:
+        index = index_of(self._parameters.names, key, "x")
+        return cp.multiply(self._parameters.scale[index], self._z[index])
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._parameters.names)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Given(Identified):
+    """The identified parameters as a constraint function gets them: with z, and what follows it.
+
+    Other arguments as for `Parameters`.
+
+    Parameters
+    ----------
+    z
+        (n,) the unknowns, a CVXPY variable.
+    asked
+        Notes that positions were asked for, which are linear about some point.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> home = np.zeros((1, 6))  # joint values [rad]
+    >>> def level(z, p):
+    ...     return p.positions(home)[0, 2] == 0.1975  # [m], of the reflector in the instrument's frame
+    >>> stated = ro.Formulation("level", penalty=ro.tikhonov.penalty, constraints=(level,))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+    >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
+    0.1975 m
+    """
+
+    z: Any = None
+    asked: list[str] = field(default_factory=list)
+
+    @property
+    def x(self) -> Deviations:
+        """Deviations [SI] by name, as expressions of z.
+
+        >>> import rpim_opt as ro
+        >>> equal = lambda z, p: p.x["a3"] == p.x["a4"]
+        >>> stated = ro.Formulation("as long", penalty=ro.tikhonov.penalty, constraints=(equal,))
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+        >>> (1e3 * result.x[[9, 14]]).round(2)  # [mm]
+        array([-1.38, -1.38])
+        """
+        return Deviations(self.z, self)
+
+    def positions(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
+        """Return predicted positions (N, 3) [m] in the instrument's frame, affine in z.
+
+        To first order about the solution: a calibration is repeated about what it found until that is so.
+
+        Parameters
+        ----------
+        q
+            (N, dof) joint values of the controller [rad or m].
+        marker
+            The reflector; the only one, or the first, by default.
+        torque
+            (N, dof) joint torques [Nm], where the compliance of joints is identified from measured ones.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> parameters = problem.linearize(np.zeros(len(problem.parameters.free))).parameters
+        >>> z = ro.convex.Unknown(parameters.names)
+        >>> there = ro.convex.given(z, parameters).positions(np.zeros((2, 6)))
+        >>> there.shape, there.is_affine()
+        ((2, 3), True)
+        """
+        return _expression(predicted(machine_of(self), q, marker, torque), self)
+
+    def movements(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
+        """Return by how much the robot's own parameters move the reflector (N, 3) [m]; arguments as for `positions`.
+
+        Linear in z. Deviations of frames (base, reflector) do not count: they say where things stand, not how the
+        robot is.
+
+        >>> import cvxpy as cp
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> still = lambda z, p: cp.norm(p.movements(np.zeros((1, 6)))[0]) <= 1e-3  # [m]
+        >>> stated = ro.Formulation("at home", penalty=ro.tikhonov.penalty, constraints=(still,))
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
+        >>> there = ro.robot.forward_kinematics(result.robot, np.zeros(6))[0, :3, 3]
+        >>> before = ro.robot.forward_kinematics(result.problem.robot, np.zeros(6))[0, :3, 3]
+        >>> print(f"{1e3 * np.linalg.norm(there - before):.3f} mm")
+        1.000 mm
+        """
+        return _expression(moved(machine_of(self), q, marker, torque), self)
+
+
+def whole(p: Given) -> Parameters:
+    """Return all parameters of the machine; of a table alone those that it has."""
+    if p.machine is None:
+        return p
+    return p.machine.parameters
+
+
+def machine_of(p: Given) -> Machine:
+    """Return the machine of some parameters; InputError where there is none."""
+    if p.machine is None:
+        found = "parameters of no problem"
+        raise InputError("positions", found, "those that a problem's linear model has (`CalibrationProblem`)")
+    p.asked.append("positions")
+    return p.machine
+
+
+def every_movement(p: Given, q: Array) -> Predicted:
+    """Return `Given.movements` of every reflector, one after the other: (M, 3) [m] and their slopes (M, 3, n) by z."""
+    machine = machine_of(p)
+    found = [moved(machine, q, marker) for marker in markers(machine)]
+    slope = np.concatenate([each.slope for each in found])
+    return Predicted(np.concatenate([each.position for each in found]), slope * p.scale)
+
+
+def _expression(found: Predicted, p: Given) -> cp.Expression:
+    count = len(found.position)
+    flat = (found.slope * p.scale).reshape(3 * count, -1)
+    return cp.reshape(flat @ p.z, (count, 3), order="C") + found.position
+
+
+def given(z: Any, parameters: Parameters) -> Given:
+    """Return what constraint functions get: parameters that know z.
+
+    Parameters
+    ----------
+    z
+        (n,) a CVXPY expression.
+    parameters
+        Of z; those of a linear model know the machine.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> parameters = ro.load("paper_arm").problem.parameters.free
+    >>> len(ro.convex.given(ro.convex.Unknown(parameters.names), parameters).x)
+    26
+    """
+    if isinstance(parameters, Given):
+        return replace(parameters, z=z)
+    table = {each.name: getattr(parameters, each.name) for each in fields(Parameters)}
+    machine = None
+    if isinstance(parameters, Identified):
+        machine = parameters.machine
+    return Given(**table, machine=machine, z=z)

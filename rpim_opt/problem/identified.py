@@ -1,0 +1,74 @@
+"""The identified parameters of a problem, which know the machine that they belong to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import Parameters
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Machine:
+    """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
+
+    They are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
+    """
+
+    robot: Robot
+    parameters: Parameters
+    data: Dataset
+    at: Array | None = None
+    farthest: Array | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Parameters):
+    """The n identified parameters of a problem.
+
+    Parameters
+    ----------
+    machine
+        That they belong to; None for a table alone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("paper_arm").problem
+    >>> parameters = problem.linearize(np.zeros(len(problem.parameters.free))).parameters
+    >>> parameters.machine.robot.dof, len(parameters), len(parameters.machine.parameters)
+    (6, 26, 114)
+    """
+
+    machine: Machine | None = None
+
+
+def identified_of(robot: Robot, parameters: Parameters, data: Dataset) -> Identified:
+    """Return the identified parameters of a table, with the machine; of the data one row of each kind."""
+    blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(data.blocks))
+    first = [int(block.row[0]) for block in data.blocks]
+    labels = tuple(f"{data.label[row]}" for row in first)
+    few = Dataset(blocks, labels, data.configuration[first])
+    table = {each.name: getattr(parameters.free, each.name) for each in fields(Parameters)}
+    return Identified(**table, machine=Machine(robot, parameters, few))
+
+
+def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
+    """Return a linear model whose parameters predict positions linearly about deviations x (n,) [SI], or nominal.
+
+    Positions of a region are also those that move farthest at ``farthest`` (n,) [SI], by default at x.
+    """
+    known = model.parameters
+    if x is None or not isinstance(known, Identified) or known.machine is None:
+        return model
+    if farthest is None:
+        farthest = x
+    machine = replace(known.machine, at=x, farthest=farthest)
+    return replace(model, parameters=replace(known, machine=machine))
