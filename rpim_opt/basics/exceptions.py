@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
-
 Named = TypeVar("Named")
 LONGEST = 1000
 """Characters of a part of a sentence."""
