@@ -18,7 +18,9 @@ from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.given import Given, Unknown
 from rpim_opt.convex.given import given as told
+from rpim_opt.convex.kinks import kinks
 from rpim_opt.convex.separated import Separated
+from rpim_opt.convex.split import Split, split
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, listed, reason, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
@@ -183,6 +185,17 @@ class Posed:
         L = np.vstack([root * D for root, D in zip(form.L, self._differences, strict=True)])
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
+    @cached_property
+    def split(self) -> Split | None:
+        """The unknowns in which the penalty is a sum of absolute values and norms; None where there are none such."""
+        if self.penalty is None or self.penalty_form is not None or self.box is None or self.inner:
+            return None
+        z = cp.Variable(self.n)
+        found = kinks(self.penalty.tree_copy({id(self.z): z}), z)
+        if found is None:
+            return None
+        return split(found)
+
     def _form(self, function: Any, term: Term) -> Quadratic | None:
         if function is cp.sum_squares:  # declared; a test holds it against the canonicalization
             return identity(term.variable.size)
@@ -264,6 +277,16 @@ class Posed:
     def slope_seen(self, seen: Array) -> Array | None:
         """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
         return self._loss_term.slope(seen)
+
+    def loss_of_norms(self, v: Array) -> float:
+        """Return a loss of the configurations' norms (N,)."""
+        return self._loss_term(v)
+
+    def row_slopes(self, v: Array) -> Array | None:
+        """Return the gradient of the loss by what it gets: residuals (m,) or configurations' norms (N,)."""
+        if self.inner or self._loss_term.variable.size != len(v):
+            return None
+        return self._loss_term.slope(v)
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
@@ -485,6 +508,6 @@ class Unposed(Posed):
         self.z, self.r = cp.Variable(self.n), cp.Variable(len(model.b))
         self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []
-        self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
+        self.loss_form, self.penalty_form, self.box, self.split = loss_form, penalty_form, None, None
         self._penalty_term = None
         self.live = self.loss = self.penalty = self.values = self.trusted = self.conic = lost(formulation.name)
