@@ -14,10 +14,12 @@ from rpim_opt.basics.shown import Brief
 from rpim_opt.convex import feasible
 from rpim_opt.convex.asked import configuration_norms
 from rpim_opt.convex.coordinates import Coordinates, coordinates
+from rpim_opt.convex.faces import Faces
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import Posed
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.separated import Separated
+from rpim_opt.convex.split import Split
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.trust import Trusted, outlying
 from rpim_opt.problem.linear import LinearModel
@@ -78,6 +80,11 @@ class Objective(Brief):
     def predicts(self) -> bool:
         """Whether constraints asked for positions, which are linear about some point."""
         return self._posed.predicts
+
+    @property
+    def inner(self) -> bool:
+        """Whether loss or penalty have variables of their own."""
+        return bool(self._posed.inner)
 
     @property
     def closed_form(self) -> bool:
@@ -144,6 +151,57 @@ class Objective(Brief):
         26.1
         """
         return ridge(self.squared, self.penalty_form)
+
+    @cached_property
+    def faces(self) -> Faces | None:
+        """The program in unknowns in which its penalty has its kinks at zero; None where it is no such program.
+
+        >>> import cvxpy as cp
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+        >>> mine = ro.Formulation("mine", penalty=lambda z: cp.norm1(z[:20]) + cp.norm(z[20:]))
+        >>> ro.convex.pose(mine, model).faces.groups, ro.convex.pose(ro.minimax, model).faces
+        (array([1.]), None)
+        """
+        return self.damped_faces(None)
+
+    def damped_faces(self, damping: Damping | None) -> Faces | None:
+        """Return `faces` with a damping term."""
+        box, split = self.box, self._posed.split
+        if self.loss_form is None or split is None or box is None:
+            return None
+        return split.faces(*self.stacked(0.0, damping), box)
+
+    @property
+    def split(self) -> Split | None:
+        """The unknowns of `faces`; None where the penalty is no sum of norms of different unknowns."""
+        return self._posed.split
+
+    @property
+    def on_triangles(self) -> bool:
+        """Whether triangles of some of the equations, instead of these, give this program of them."""
+        posed_on_triangle = self._posed.equations == self.model.A.shape[1] + 1
+        return posed_on_triangle and self.linear_or_split and self.squared_rows
+
+    @property
+    def squared_rows(self) -> bool:
+        """Whether the loss is the sum of the equations' squares."""
+        return self.loss_form is not None and self.squared is self.model
+
+    def loss_of_norms(self, v: Array) -> float:
+        """Return a loss of the configurations' norms (N,)."""
+        return self._posed.loss_of_norms(v)
+
+    def row_slopes(self, v: Array) -> Array | None:
+        """Return the loss's slopes by what it gets, residuals (m,) or norms (N,); None where CVXPY knows none."""
+        return self._posed.row_slopes(v)
+
+    @property
+    def linear_or_split(self) -> bool:
+        """Whether the minimum is a formula, or an active set's, or found from face to face."""
+        return (self.quadratic and self.box is not None) or self.faces is not None
 
     @property
     def rows(self) -> tuple[Array, Array]:

@@ -16,7 +16,9 @@ from rpim_opt.convex.atoms import NORM2, SQUARES, cp
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
+from rpim_opt.convex.kinks import kinks
 from rpim_opt.convex.separated import Separated
+from rpim_opt.convex.split import Split, split
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
@@ -186,6 +188,17 @@ class Posed:
         L = np.vstack([root * D for root, D in zip(form.L, differences, strict=True)])
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
+    @cached_property
+    def split(self) -> Split | None:
+        """The unknowns in which the penalty is a sum of absolute values and norms; None where there are none such."""
+        if self.formulation.penalty is None or self.penalty_form is not None or self.box is None or self.inner:
+            return None
+        z = cp.Variable(self.n)
+        found = kinks(self.penalty.tree_copy({id(self.z): z}), z)
+        if found is None:
+            return None
+        return split(found)
+
     @property
     def _sees(self) -> int:
         """Of how many numbers the loss is a function."""
@@ -278,6 +291,16 @@ class Posed:
     def slope_seen(self, seen: Array) -> Array | None:
         """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
         return self.asked.loss_term.slope(seen)
+
+    def loss_of_norms(self, v: Array) -> float:
+        """Return a loss of the configurations' norms (N,)."""
+        return self.asked.loss_term(v)
+
+    def row_slopes(self, v: Array) -> Array | None:
+        """Return the gradient of the loss by what it gets: residuals (m,) or configurations' norms (N,)."""
+        if self.inner or self.asked.loss_term.variable.size != len(v):
+            return None
+        return self.asked.loss_term.slope(v)
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
@@ -473,7 +496,7 @@ class Unposed(Posed):
         self.equations = len(model.b)
         self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []
-        self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
+        self.loss_form, self.penalty_form, self.box, self.split = loss_form, penalty_form, None, None
         self._known = False
         self.live: Any = lost(formulation.name)
         self.loss = self.penalty = self.values = self.trusted = self.conic = lost(formulation.name)

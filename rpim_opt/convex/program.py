@@ -20,6 +20,7 @@ from rpim_opt.convex.conflict import advice, conflict
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.gap import duality_gap
 from rpim_opt.convex.interior import Found, interior
+from rpim_opt.convex.kinked import minimum_on_faces
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.posed import Unposed, posed
 from rpim_opt.convex.written import by_solver, parametrized
@@ -178,6 +179,8 @@ class Program(Objective):
         elif self.quadratic and box is not None:
             z, multipliers = minimum_between(self, box, weight, damping, minimum(self, weight, None), None)
             estimate = self._at(z, weight, shares(self, box, z, multipliers))
+        elif weight > 0 and self.faces is not None:
+            estimate = self._on_faces(weight, damping)
         else:
             estimate = self._by_rows(weight, damping) or self._by_interior_point(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
@@ -186,7 +189,8 @@ class Program(Objective):
         """Return the solution at a weight, on evidence that is independent of how it was found.
 
         Of a loss over rows a duality gap that is computed anew from the functions' own values and slopes
-        (`gap.duality_gap`); where it leaves doubt, an interior point finds the solution.
+        (`gap.duality_gap`); where it leaves doubt, an interior point finds the solution, and of a penalty with kinks
+        it is asked anyway.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -196,6 +200,8 @@ class Program(Objective):
         True
         """
         estimate = self.solve(weight)
+        if estimate.weight > 0 and self.faces is not None:
+            return self._lower_by_interior_point(estimate)
         if self.separated is None:
             return estimate
         near = self._met.nearest(weight)
@@ -208,15 +214,35 @@ class Program(Objective):
             return estimate
         return self._by_interior_point(weight, None)
 
+    def _lower_by_interior_point(self, estimate: Estimate) -> Estimate:
+        """Return what cones find where that is lower, beyond an interior point's accuracy."""
+        try:
+            other = self._by_interior_point(estimate.weight, None)
+        except NoSolutionFound:
+            return estimate
+        if other.objective < estimate.objective - PROVEN * max(1.0, abs(estimate.objective)):
+            return other
+        return estimate
+
     @one_blas_thread
-    def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
-        """Return the solutions at many weights (K,): all at once by formula, in a box each from its neighbour."""
+    def path(self, weights: Sequence[float] | Array, near: Array | None = None) -> list[Estimate]:
+        """Return the solutions at many weights (K,): all at once by formula, or each from its neighbour.
+
+        Parameters
+        ----------
+        weights
+            Zero or more.
+        near
+            A point (n,) near the solution at the largest weight, if one is known.
+        """
         checked = np.array([self._weight(weight) for weight in weights])
         box = self.box
         if self.closed_form:
             Z = self.ridge.minima(checked)
             rows = zip(Z, checked, *values(self, Z), strict=True)
             return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
+        if self.faces is not None:
+            return self._path_on_faces(checked, near)
         if not self.quadratic or box is None:
             return [self.solve(weight) for weight in checked]
         Z, multipliers = path_between(self, box, checked)
@@ -248,6 +274,38 @@ class Program(Objective):
         found, near = ended
         self._met.keep(weight, near)
         return Estimate(near.z, weight, *self.value(near.z, weight), found.duals, iterations=found.iterations)
+
+    def _on_faces(self, weight: float, damping: Damping | None, start: Array | None = None) -> Estimate:
+        """Return the minimum of a penalty with kinks, or where it is not certain the interior point's, if lower."""
+        found = minimum_on_faces(self, weight, damping, start)
+        estimate = Estimate(found.z, weight, found.loss, found.penalty, found.duals)
+        if found.certain:
+            return estimate
+        try:
+            other = self._by_interior_point(weight, damping)
+        except NoSolutionFound:
+            if found.good:
+                return estimate
+            raise
+        damped = [self._damped_objective(each.z, weight, damping) for each in (other, estimate)]
+        return (other, estimate)[int(np.argmin(damped))]
+
+    def _damped_objective(self, z: Array, weight: float, damping: Damping | None) -> float:
+        value = self.objective(z, weight)
+        if damping is None:
+            return value
+        return value + float(np.sum((damping.size * (z - damping.centre)) ** 2))
+
+    def _path_on_faces(self, weights: Array, start: Array | None) -> list[Estimate]:
+        """Return the solutions at many weights, each from that of the next larger one."""
+        found: dict[float, Estimate] = {}
+        for weight in sorted({float(weight) for weight in weights}, reverse=True):
+            if weight > 0:
+                found[weight] = self._on_faces(weight, None, start)
+            else:
+                found[weight] = self._by_interior_point(weight, None)
+            start = found[weight].z
+        return [found[float(weight)] for weight in weights]
 
     def _by_interior_point(self, weight: float, damping: Damping | None) -> Estimate:
         """Return what Clarabel finds in our terms, and where it finds nothing, in CVXPY's."""

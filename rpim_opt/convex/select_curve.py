@@ -10,6 +10,8 @@ from rpim_opt.convex.selection import Selection, least_between, weight_grid
 
 TINY = np.finfo(float).tiny
 """Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
+SHARP = 0.5
+"""Part of the largest curvature from which a path with kinks has another corner."""
 GOLDEN = (1 + 5**0.5) / 2
 
 
@@ -34,6 +36,8 @@ def l_curve(program: Program) -> Selection:
         weights = weight_grid(program, 60)
         score = menger(_points(program.path(weights)))
     best = int(np.argmax(score))
+    if program.faces is not None:
+        best = _first_corner(score)
     if not score[best] > 0:
         best = 0
     if not 0 < best < len(weights) - 1:
@@ -42,6 +46,18 @@ def l_curve(program: Program) -> Selection:
     if program.closed_form:
         weight = _refined(program, weights, score, best)
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
+
+
+def _first_corner(score: Array) -> int:
+    """Return the corner at the smallest weight of those that are about as sharp as the sharpest.
+
+    Where the last parameters or groups vanish, a path with kinks bends like at a corner, far above the noise.
+    """
+    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
+    sharp = peaks[score[peaks] >= SHARP * np.max(score)]
+    if len(sharp):
+        return int(sharp[0])
+    return int(np.argmax(score))
 
 
 def _no_corner(weights: Array, score: Array, best: int) -> Selection:
@@ -131,7 +147,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
     >>> f"{result.weight:.1g}", result.selection.note
-    ('0.7', 'corner of the L-curve by golden sections')
+    ('2', 'corner of the L-curve by golden sections')
     """
     low, high = np.log(weight_grid(program, 2))
     curve = _Curve(program)

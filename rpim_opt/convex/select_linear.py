@@ -32,11 +32,16 @@ class Squared:
 
 def _squared(program: Program, weight: float) -> Squared:
     """Return the squares that a program amounts to: its own, or those that a robust loss trusts at a weight."""
-    penalty = program.penalty_form or identity(program.model.A.shape[1])
+    penalty = penalty_of(program)
     if program.quadratic:
         return Squared(program.squared, penalty, program.ridge)
     model = program.trusted(program.solve(weight).z)
     return Squared(model, penalty, ridge(model, penalty))
+
+
+def penalty_of(program: Program) -> Quadratic:
+    """Return the squared penalty of a program, |z|^2 where it has none."""
+    return program.penalty_form or identity(program.model.A.shape[1])
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from rpim_opt.problem.linear import LinearModel
 SMALLEST = 1e-100
 LARGEST = 1e100
 """Weights that are not zero: far beyond those of any problem, and far within the range of doubles."""
+LEAST, MOST = 1e-9, 1e-6
+"""Between which parts of its largest weight a grid of a penalty with kinks begins: below the first, what it adds to the
+objective is less than the accuracy to which that is known."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,6 +85,11 @@ Score = Callable[[Array], Array]
 """From weights (K,) to what a rule compares, (K,)."""
 
 
+SAME_SCORE = 1e-4
+"""Scores that differ by no more, relative, tell no weights apart."""
+SAME_WEIGHT = 1.1
+"""Ratio of weights up to which a search does not tell them apart."""
+
 EDGES = {
     "lower": "the smallest weight of the grid is best: the data want no penalty",
     "upper": "the largest weight of the grid is best: the data want no deviation",
@@ -113,15 +121,24 @@ def require_weight(weight: float, where: str, file: object = None) -> float:
 
 
 def weight_grid(program: Program, count: int = 200) -> Array:
-    """Return weights from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside).
+    """Return the weights between which the estimate changes, at equal ratios.
 
-    Below, the penalty changes nothing that the data see; above, it leaves nothing to identify.
+    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside): below,
+    the penalty changes nothing that the data see; above, it leaves nothing to identify. A penalty with kinks (lasso)
+    leaves nothing to identify from its own largest weight on, which ends the grid.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
     if program.quadratic:
         return grid_of(program.ridge, count)
-    return grid_of(ridge(program.model, program.penalty_form), count)
+    weights = grid_of(ridge(program.model, program.penalty_form), count)
+    if program.faces is None:
+        return weights
+    largest = program.faces.largest()
+    if largest is None:
+        return weights
+    least = float(np.clip(weights[0], LEAST * largest, MOST * largest))
+    return np.geomspace(least, largest, count)
 
 
 def grid_of(form: Ridge, count: int = 200) -> Array:
@@ -137,3 +154,27 @@ def least_between(score: Score, weights: Array, best: int) -> tuple[float, float
     low, high = np.log(weights[[best - 1, best + 1]])
     at, value = least(lambda t: score(np.exp([t]))[0], float(low), float(high), 1e-6)
     return float(np.exp(at)), value
+
+
+def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
+    """Return weights (K,), their scores and the place of the least, from a coarse grid refined about its best.
+
+    Between the best and its neighbours the score is asked for halfway, again and again, until the neighbours' scores
+    do not differ from the best's, or their weights hardly from its own.
+
+    >>> import numpy as np
+    >>> from rpim_opt.convex.selection import searched
+    >>> weights, score, best = searched(lambda w: 1 + np.log(w / 3) ** 2, np.geomspace(1e-3, 1e3, 7))
+    >>> bool(abs(np.log(weights[best] / 3)) < 0.05), len(weights)
+    (True, 19)
+    """
+    weights, found = np.array(grid), score(grid)
+    while True:
+        best = int(np.argmin(found))
+        around = found[max(best - 1, 0) : best + 2]
+        flat = np.ptp(around) <= SAME_SCORE * np.max(np.abs(around))
+        if not 0 < best < len(weights) - 1 or flat or weights[best + 1] <= SAME_WEIGHT * weights[best - 1]:
+            return weights, found, best
+        between = np.sqrt(weights[best - 1 : best + 1] * weights[best : best + 2])
+        weights = np.insert(weights, [best, best + 1], between)
+        found = np.insert(found, [best, best + 1], score(between))

@@ -271,7 +271,7 @@ def test_two_steps_say_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) -> No
     def error(program: Any, weights: np.ndarray, parts: Any = None) -> np.ndarray:
         return np.abs(np.arange(len(weights)) - best) + 1.0
 
-    monkeypatch.setattr("rpim_opt.convex.select_held_out.held_out_error", error)
+    monkeypatch.setattr("rpim_opt.convex.select_held_out._left_out_error", error)
     chosen = ro.two_step(PROGRAM)
     assert chosen.interior == (0 < best < 9)
     assert ("a wider search would go on" in chosen.note) != chosen.interior

@@ -1,0 +1,579 @@
+"""Squares with a penalty that has kinks, in a box: the minimum, from face to face, certified by its duality gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import get_lapack_funcs
+
+from rpim_opt.basics.arrays import Array
+
+EPS = float(np.finfo(float).eps)
+SLOPE = 16 * EPS
+"""Rounding of a slope, relative to the sizes of its column and of the residual's terms."""
+VANISHED = 1e-15
+"""Fall that a Newton step promises, relative to the objective, from which the minimum of a face is reached."""
+CERTAIN = 1e-9
+"""Gap, relative to the objective, up to which a minimum is taken to be one."""
+GOOD = 1e-6
+"""The same for a minimum that no other solver finds more exactly."""
+NOTHING = 1e-12
+"""Gap, in squared sigmas of one equation, that is as good as none."""
+FAR = 1e100
+"""Stands for a bound where there is none."""
+SHORT = 0.05
+"""Part of the promised fall with which a step has to come, or groups are moved one by one."""
+FIRM, STIFFER = 1e-3, 1e3
+"""Up to what ridge, and by what factor, steps are tried that rounding spoiled with less."""
+NEAR = 1e-13
+"""How near to a kink a start is taken to be at it, relative to its largest component."""
+UNSEEN = 1e-8
+"""Curvature of a direction that nothing sees, relative to the largest: what a ridge is measured by there."""
+RIDGE = 100 * EPS
+"""Curvature, relative to a column's own, that directions get which nothing else holds: a step there is then long, and
+ends at the next kink."""
+
+_posv: Any
+(_posv,) = get_lapack_funcs(("posv",), (np.empty(1),))
+
+
+class Face(NamedTuple):
+    """A point y (n,), which components of it may move, and what the gap says of it.
+
+    Parameters
+    ----------
+    y, free
+        (n,) each.
+    gap
+        By how much the objective at y may lie above the minimum, infinite where nothing is known.
+    value
+        The objective at y.
+    """
+
+    y: Array
+    free: np.ndarray
+    gap: float
+    value: float
+
+    @property
+    def good(self) -> bool:
+        """Whether y is as good as what an interior point finds."""
+        return self.gap <= GOOD * self.value + NOTHING
+
+    @property
+    def certain(self) -> bool:
+        """Whether the gap says that y is the minimum."""
+        return self.gap <= CERTAIN * self.value + NOTHING
+
+
+@dataclass(frozen=True, eq=False)
+class Faces:
+    """|M y - d|^2 + weight (1/2 y'H y + g'y + sum price_j |y_j| + sum price_k |y_k|), lower <= y <= upper.
+
+    A component has a price of its own, or is a member of one group y_k, or has neither. Kinks are at zero.
+
+    On a face (the components at zero or on a bound stay, the others keep their signs) the objective is smooth. Newton's
+    steps lead to its minimum, or to the next kink or bound, which then holds; groups are put to zero where that is best
+    with the others as they are. At the minimum of a face, components and groups that are held in vain are moved to
+    where each is best, and the next face begins. The objective falls at every step. That the last point is the minimum
+    is known from the duality gap, which asks nothing of the way there.
+
+    Parameters
+    ----------
+    M, d
+        (k, n) and (k,).
+    H, g
+        (n, n), or None for zero, and (n,).
+    price
+        (n,), zero or more.
+    member
+        (n,) number of the group that a component belongs to, or -1.
+    groups
+        (K,) prices of the groups, above zero.
+    lower, upper
+        (n,), infinite for members of groups.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rpim_opt.convex.faces import Faces
+    >>> one = np.ones(2)
+    >>> single = np.full(2, -1)
+    >>> lasso = Faces(np.eye(2), np.array([3.0, 0.2]), None, 0 * one, one, single, np.empty(0), -9 * one, 9 * one)
+    >>> face = lasso.minimum(1.0)
+    >>> [round(float(y), 9) for y in face.y], face.certain  # shrunk by half the weight
+    ([2.5, 0.0], True)
+    """
+
+    M: Array
+    d: Array
+    H: Array | None
+    g: Array
+    price: Array
+    member: np.ndarray
+    groups: Array
+    lower: Array
+    upper: Array
+
+    # --- what stays the same ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def gram(self) -> Array:
+        """2 M'M, the curvature of the squares."""
+        return 2 * self.M.T @ self.M
+
+    @cached_property
+    def size(self) -> Array:
+        """Norms of the columns of M (n,)."""
+        return np.sqrt(np.einsum("ij,ij->j", self.M, self.M))
+
+    @cached_property
+    def grouped(self) -> np.ndarray:
+        """Which components (n,) belong to groups."""
+        return self.member >= 0
+
+    @cached_property
+    def together(self) -> Array:
+        """1 where two components belong to the same group (n, n)."""
+        return ((self.member[:, None] == self.member) & self.grouped[:, None]).astype(float)
+
+    @cached_property
+    def blocks(self) -> Array:
+        """The curvature of the squares within groups (n, n), zero elsewhere."""
+        return self.gram * self.together
+
+    @cached_property
+    def picks(self) -> Array:
+        """1 where a component (n) belongs to a group (K): (K, n)."""
+        return (self.member == np.arange(len(self.groups))[:, None]).astype(float)
+
+    @cached_property
+    def spectrum(self) -> tuple[Array, Array]:
+        """Singular values of M that are not rounding, and their directions as rows."""
+        _, s, Vt = np.linalg.svd(self.M, full_matrices=False)
+        seen = s > len(s) * EPS * np.max(s, initial=0.0)
+        return s[seen], Vt[seen]
+
+    @cached_property
+    def members(self) -> list[np.ndarray]:
+        """The components of every group."""
+        return [np.flatnonzero(self.member == k) for k in range(len(self.groups))]
+
+    @cached_property
+    def kinked(self) -> np.ndarray:
+        """Which components (n,) have a kink of their own at zero."""
+        return self.price > 0
+
+    def lengths(self, v: Array) -> Array:
+        """Return the norms of the groups (K,) of a vector (n,)."""
+        return np.sqrt(self.picks @ (v * v))
+
+    def curvature(self, weight: float) -> Array:
+        """Return the second derivatives (n, n) of the smooth part."""
+        if self.H is None:
+            return self.gram
+        return self.gram + weight * self.H
+
+    # --- values ----------------------------------------------------------------------------------------------------
+
+    def penalty(self, y: Array) -> float:
+        """Return what the weight multiplies."""
+        value = float(self.g @ y + self.price @ np.abs(y))
+        if len(self.groups):
+            value += float(self.groups @ self.lengths(y))
+        if self.H is not None:
+            value += float(0.5 * y @ self.H @ y)
+        return value
+
+    def value(self, y: Array, weight: float) -> float:
+        """Return the objective."""
+        r = self.M @ y - self.d
+        return float(r @ r) + weight * self.penalty(y)
+
+    def slope(self, y: Array, weight: float) -> Array:
+        """Return the gradient (n,) of the smooth part."""
+        slope = 2 * (self.M.T @ (self.M @ y - self.d)) + weight * self.g
+        if self.H is not None:
+            slope += weight * (self.H @ y)
+        return slope
+
+    def rounding(self, y: Array, weight: float) -> Array:
+        """Return what rounding may make of the slopes (n,)."""
+        terms = float(self.size @ np.abs(y)) + self.target
+        return SLOPE * (2 * terms * self.size + weight * (self.prices + np.abs(self.g)))
+
+    @cached_property
+    def target(self) -> float:
+        """Norm of d."""
+        return float(np.linalg.norm(self.d))
+
+    @cached_property
+    def prices(self) -> Array:
+        """Prices (n,) of the components, or of the groups that they belong to."""
+        if not len(self.groups):
+            return self.price
+        return self.price + self.groups @ self.picks
+
+    def gap(self, y: Array, slope: Array, weight: float) -> float:
+        """Return by how much the objective at y may lie above its minimum: the least of some bounds of it."""
+        gap = np.inf
+        ridge = RIDGE
+        value = self.value(y, weight)
+        while ridge < FIRM and not gap <= CERTAIN * value:
+            gap = min(gap, self._gap(y, slope, weight, ridge))
+            ridge = STIFFER * ridge
+        return gap
+
+    def _gap(self, y: Array, slope: Array, weight: float, ridge: float) -> float:
+        """Return by how much the objective at y may lie above its minimum: Fenchel's and Young's inequality.
+
+        The tangent of the smooth part at any point is a lower bound of it, and with the kinks, whose minimum is known,
+        one of the objective. It is taken where Newton's step leads, whose curvature counts: on the face the slope there
+        is what the kinks need, whatever rounding made of it at y.
+        """
+        C = self.curvature(weight)
+        step = self._newton(y, slope, C, weight, ridge)[0]
+        left = slope + C @ step
+        price = weight * self.price
+        below, above = np.isfinite(self.lower), np.isfinite(self.upper)
+        excess = np.where(above, 0.0, np.minimum(left + price, 0.0))
+        excess = excess + np.where(below, 0.0, np.maximum(left - price, 0.0))
+        if len(self.groups):
+            excess = np.where(self.grouped, self._over(left, weight), excess)
+        left = left - excess
+        young = self._young(y, left, price, weight * self.groups)
+        curved = float(np.sum((self.M @ step) ** 2))
+        if self.H is not None:
+            curved += 0.5 * weight * max(float(step @ self.H @ step), 0.0)
+        return max(young, 0.0) + curved + self._cost(excess, y, weight)
+
+    def _over(self, slope: Array, weight: float) -> Array:
+        """Return what a slope (n,) has beyond the prices of the groups."""
+        steep = self.lengths(slope)
+        over = np.maximum(steep - weight * self.groups, 0.0)
+        share = np.divide(over, steep, out=np.zeros_like(steep), where=steep > 0)
+        return slope * (share @ self.picks)
+
+    def _young(self, y: Array, left: Array, price: Array, groups: Array) -> float:
+        """Return left'y and the kinks at y, less the least that both together are anywhere in the box."""
+        here = left * y + price * np.abs(y)
+        nearest = np.minimum(np.maximum(0.0, self.lower), self.upper)
+        least = left * nearest + price * np.abs(nearest)
+        for bound in (self.lower, self.upper):
+            at = np.where(np.isfinite(bound), bound, nearest)
+            least = np.minimum(least, left * at + price * np.abs(at))
+        if not len(self.groups):
+            return float(np.sum(here - least))
+        single = float(np.sum((here - least)[~self.grouped]))
+        return single + float(np.sum(self.picks @ here + groups * self.lengths(y)))
+
+    def _cost(self, excess: Array, y: Array, weight: float) -> float:
+        """Return what it costs a lower bound to take an excess (n,) off the slope."""
+        if not excess.any():
+            return 0.0
+        s, Vt = self.spectrum
+        seen = Vt @ excess
+        unseen = excess - seen @ Vt
+        unseen[np.abs(unseen) <= self.rounding(y, weight)] = 0.0
+        cost = float(np.sum((seen / (2 * s)) ** 2))
+        if not unseen.any():
+            return cost
+        priced = weight * self.prices
+        if (priced[unseen != 0] == 0).any():
+            return float("inf")
+        value = self.value(y, weight)
+        away = np.abs(y) + np.divide(value, priced, out=np.zeros_like(y), where=priced > 0)
+        return cost + float(np.abs(unseen) @ away)
+
+    # --- the way there ---------------------------------------------------------------------------------------------
+
+    def near(self, weight: float) -> Array:
+        """Return a point (n,) from which the minimum is few steps away: that with squares instead of norms."""
+        s, Vt = self.spectrum
+        target = Vt @ (self.M.T @ self.d)  # s times the coordinates of d
+        return (target / (s**2 + weight)) @ Vt
+
+    def minimum(self, weight: float, start: Array | None = None) -> Face:
+        """Return the minimum at a weight above zero, from a point (n,) near it."""
+        if start is not None:
+            face = self._minimum(weight, start)
+            if face.certain:
+                return face
+        return self._minimum(weight, self.near(weight))
+
+    def _minimum(self, weight: float, start: Array) -> Face:
+        y = np.minimum(np.maximum(self.snapped(start, NEAR), self.lower), self.upper)
+        C = self.curvature(weight)
+        ridge = RIDGE
+        for _ in range(50 + len(y)):
+            slope = self.slope(y, weight)
+            if len(self.groups):
+                slope = self._emptied(y, slope, C, weight)
+            value = self.value(y, weight)
+            step, fall = self._newton(y, slope, C, weight, ridge)
+            if fall > VANISHED * abs(value):
+                ahead = self._ahead(y, step, fall, value, C, weight)
+                lower = self.value(ahead, weight) - value
+                if lower < 0 or (lower == 0 and self.free(ahead).sum() < self.free(y).sum()):
+                    y = ahead
+                    ridge = RIDGE
+                    continue
+                if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
+                    ridge = STIFFER * ridge
+                    continue
+            ridge = RIDGE
+            wrong = self._wrong(y, slope, weight)
+            if not wrong.any():
+                break
+            before = y
+            y = self._moved(y, slope, wrong, C, weight)
+            if not self.value(y, weight) < value:
+                y = before
+                break
+        slope = self.slope(y, weight)
+        return Face(y, self.free(y), self.gap(y, slope, weight), self.value(y, weight))
+
+    def free(self, y: Array) -> np.ndarray:
+        """Return which components (n,) are on no kink and no bound."""
+        free = (y > self.lower) & (y < self.upper) & ((y != 0) | ~self.kinked)
+        if len(self.groups):
+            free &= ~self.grouped | ((self.lengths(y) > 0) @ self.picks > 0)
+        return free
+
+    def largest(self) -> float | None:
+        """Return the smallest weight from which all that has a price is zero; None where there is none.
+
+        With what has no price at its best, zero is the minimum where no slope of the squares exceeds weight x price:
+        the dual norm of the slope, the largest of |slope_j| / price_j and |slope_k| / price_k.
+        """
+        if (self.lower > 0).any() or (self.upper < 0).any():
+            return None
+        y = np.zeros(len(self.g))
+        bare = self.prices == 0
+        if bare.any():
+            y[bare] = np.linalg.lstsq(self.M[:, bare], self.d, rcond=None)[0]
+        slope = 2 * (self.M.T @ (self.M @ y - self.d))
+        # with a line in the penalty, one side of zero costs more than the other
+        room = self.price - np.sign(slope) * self.g
+        single = ~self.grouped & (room > 0) & ~bare
+        found = [0.0, *(np.abs(slope[single]) / room[single])]
+        if len(self.groups):
+            found += [*(self.lengths(slope) / self.groups)]
+        largest = float(np.max(found))
+        if largest > 0:
+            return largest
+        return None
+
+    def bent(self, y: Array, weight: float) -> tuple[Array, Array]:
+        """Return slope (n,) and curvature (n, n) of the penalty's kinked part where it is smooth, without its zeros."""
+        slope = weight * self.price * np.sign(y)
+        if not len(self.groups):
+            return slope, np.zeros((0, 0))
+        nu = self.lengths(y)
+        inverse = np.divide(1.0, nu, out=np.zeros_like(nu), where=nu > 0)
+        per = (weight * self.groups * inverse) @ self.picks
+        u = y * (inverse @ self.picks)
+        bend = self.together * (per * u)[:, None] * -u
+        bend.flat[:: len(y) + 1] += per
+        return slope + per * y, bend
+
+    def bend(self, y: Array, weight: float) -> Array:
+        """Return the penalty's Hessian (n, n) where it is smooth."""
+        bend = self.bent(y, weight)[1]
+        if not len(self.groups):
+            bend = np.zeros((len(y), len(y)))
+        if self.H is not None:
+            bend = bend + weight * self.H
+        return bend
+
+    def snapped(self, y: Array, close: float) -> Array:
+        """Return a point (n,) with what is close to a kink or bound, relative to the largest component, put on it."""
+        room = close * float(np.max(np.abs(y), initial=0.0))
+        y = y.copy()
+        for place in self.places:
+            y = np.where(np.abs(y - place) <= room, place, y)
+        if len(self.groups):
+            y = np.where(self.grouped & ((self.lengths(y) <= room) @ self.picks > 0), 0.0, y)
+        return y
+
+    def _ahead(self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float) -> Array:
+        """Return the point after a step, and where that comes short, after groups were moved one by one."""
+        ahead = self._stepped(y, step, value, weight)
+        if len(self.groups) and self.value(ahead, weight) > value - SHORT * fall:
+            # where a group is nearly zero, the norm bends more than Newton's step sees
+            return self._moved(ahead, self.slope(ahead, weight), self.grouped, C, weight)
+        return ahead
+
+    def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
+        """Return Newton's step (n,) on the face, and twice the fall that it promises."""
+        step = np.zeros_like(y)
+        free = self.free(y)
+        if not free.any():
+            return step, 0.0
+        kink, bend = self.bent(y, weight)
+        F = np.flatnonzero(free)
+        K = C[F[:, None], F]
+        if len(self.groups):
+            K = K + bend[F[:, None], F]
+        g = (slope + kink)[F]
+        diagonal = K.flat[:: len(F) + 1]
+        own = np.maximum(diagonal, UNSEEN * np.max(diagonal))
+        for _ in range(20):
+            K.flat[:: len(F) + 1] = diagonal + ridge * own
+            _, found, info = _posv(K, -g, lower=1)
+            if info == 0:
+                break
+            ridge = 10 * ridge
+        else:
+            return step, 0.0
+        step[F] = found
+        return step, float(-g @ found)
+
+    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> Array:
+        """Return the point after a step: over all kinks where that lowers the objective, else to the first."""
+        full = self._stopped(y, y + step)
+        if self.value(full, weight) < value:
+            return full
+        share = self._first(y, step)
+        for _ in range(40):
+            ahead = self._stopped(y, y + share * step)
+            if share < 1:
+                ahead = self._snapped(y, step, ahead, share)
+            if self.value(ahead, weight) <= value:
+                return ahead
+            share = share / 2
+        return y
+
+    def _stopped(self, y: Array, ahead: Array) -> Array:
+        """Return a point with components that passed a kink or a bound put on it."""
+        ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
+        ahead[self.kinked & (ahead * y < 0)] = 0.0
+        return ahead
+
+    def _first(self, y: Array, step: Array) -> float:
+        """Return how far along a step (at most 1) the first kink or bound is."""
+        share = 1.0
+        for place in self.places:
+            gap = place - y
+            passed = (gap * step > 0) & (np.abs(gap) < np.abs(share * step))
+            if passed.any():
+                share = min(share, float(np.min(gap[passed] / step[passed])))
+        return share
+
+    @cached_property
+    def places(self) -> tuple[Array, Array, Array]:
+        """Lower and upper bounds and kinks (n,), far away where there is none."""
+        far = FAR
+        kink = np.where(self.kinked, 0.0, far)
+        return np.maximum(self.lower, -far), np.minimum(self.upper, far), kink
+
+    def _snapped(self, y: Array, step: Array, ahead: Array, share: float) -> Array:
+        """Put what reached its kink or bound but for rounding exactly there."""
+        close = 8 * EPS * (np.abs(y) + np.abs(share * step))
+        for place in self.places:
+            reached = (step != 0) & (np.abs(ahead - place) <= close)
+            ahead = np.where(reached, place, ahead)
+        return ahead
+
+    def _emptied(self, y: Array, slope: Array, C: Array, weight: float) -> Array:
+        """Put groups to zero (in place) where that is best with the others as they are; return the slope then."""
+        blocks = self.blocks
+        if self.H is not None:
+            blocks = C * self.together
+        small = (self.lengths(slope - blocks @ y) <= weight * self.groups) & (self.lengths(y) > 0)
+        for k in np.flatnonzero(small):
+            inside = self.members[k]
+            block = C[inside[:, None], inside]
+            without = slope[inside] - block @ y[inside]
+            if np.linalg.norm(without) <= weight * self.groups[k]:
+                slope = slope - C[:, inside] @ y[inside]
+                y[inside] = 0.0
+        return slope
+
+    def _wrong(self, y: Array, slope: Array, weight: float) -> np.ndarray:
+        """Return which held components (n,) the objective falls along."""
+        room = self.rounding(y, weight)
+        price = weight * self.price
+        right = slope + np.where(y >= 0, price, -price)
+        left = slope + np.where(y > 0, price, -price)
+        wrong = ((y < self.upper) & (right < -room)) | ((y > self.lower) & (left > room))
+        wrong &= ~self.free(y)
+        if len(self.groups):
+            steep = self.lengths(slope) - weight * self.groups
+            vain = ((self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)) @ self.picks > 0
+            wrong = np.where(self.grouped, vain, wrong)
+        return wrong
+
+    def _moved(self, y: Array, slope: Array, wrong: np.ndarray, C: Array, weight: float) -> Array:
+        """Return the point after each component or group that is held in vain was moved to where it is best."""
+        y = y.copy()
+        slope = slope.copy()
+        for j in np.flatnonzero(wrong & ~self.grouped):
+            moved = self._best_component(int(j), float(y[j]), float(slope[j]), float(C[j, j]), weight)
+            slope += C[:, j] * (moved - y[j])
+            y[j] = moved
+        for k in np.unique(self.member[wrong & self.grouped]):
+            inside = self.members[k]
+            block = C[inside[:, None], inside]
+            moved = shrunk(block, slope[inside] - block @ y[inside], weight * float(self.groups[k]))
+            slope += C[:, inside] @ (moved - y[inside])
+            y[inside] = moved
+        return y
+
+    def _best_component(self, j: int, at: float, slope: float, curvature: float, weight: float) -> float:
+        """Return where the objective is least along a component, on this side of the next kink or bound."""
+        price = weight * float(self.price[j])
+        lower, upper = float(self.lower[j]), float(self.upper[j])
+        right = slope + (price if at >= 0 else -price)
+        left = slope + (price if at > 0 else -price)
+        if right < 0 and at < upper:
+            end = min(0.0, upper) if at < 0 < price else upper
+            return _towards(at, -right, curvature, end)
+        if left > 0 and at > lower:
+            end = max(0.0, lower) if at > 0 < price else lower
+            return _towards(at, -left, curvature, end)
+        return at
+
+
+def _towards(at: float, force: float, curvature: float, end: float) -> float:
+    """Return at + force / curvature, or the end where that lies beyond."""
+    if curvature <= 0 and not np.isfinite(end):
+        return at
+    ahead = end
+    if curvature > 0:
+        ahead = at + force / curvature
+    if (ahead - end) * np.sign(force) > 0:
+        return end
+    return ahead
+
+
+def shrunk(K: Array, c: Array, price: float) -> Array:
+    """Return where 1/2 v'K v + c'v + price |v| is least, v (k,): zero where |c| <= price.
+
+    With K = Q diag(l) Q', v = -Q (Q'c) / (l + price / |v|), where |v| solves sum (Q'c)_i^2 / (l_i |v| + price)^2 = 1.
+
+    >>> import numpy as np
+    >>> from rpim_opt.convex.faces import shrunk
+    >>> [float(v) for v in shrunk(2 * np.eye(2), np.array([-6.0, -8.0]), 4.0).round(6)]
+    [1.8, 2.4]
+    """
+    if np.linalg.norm(c) <= price:
+        return np.zeros_like(c)
+    curvatures, Q = np.linalg.eigh(K)
+    # rounding leaves small negative ones; along them, nothing but the norm would hold
+    curvatures = np.maximum(curvatures, 4 * EPS * max(float(curvatures[-1]), np.finfo(float).tiny))
+    squares = (Q.T @ c) ** 2
+    length = 0.0
+    for _ in range(100):
+        below = curvatures * length + price
+        total = float(np.sum(squares / below**2))
+        falling = float(np.sum(squares * curvatures / below**3))
+        # Newton's for 1 / sqrt(total) = 1, which is nearly a line and concave: from the left, it never overshoots
+        step = (np.sqrt(total) - 1) * total / falling
+        length += step
+        if abs(step) <= 8 * EPS * length:
+            break
+    return -Q @ ((Q.T @ c) * length / (curvatures * length + price))

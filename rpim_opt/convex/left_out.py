@@ -1,0 +1,234 @@
+"""Residuals of configurations that had no say in an estimate: by formula for squares, or solved again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.selection import Score
+from rpim_opt.problem.linear import from_triangle, reduced_rows
+
+DROPPED = 1e-13
+"""Pivots below this belong to what nothing else decides."""
+RAISED, SAME = 1e-4, 1e-12
+"""By how much norms are raised to see whether they matter to a loss; relative change of it that is rounding."""
+MANY = 1_000_000
+"""Residuals that are in memory together, of many weights."""
+
+
+class Rows(NamedTuple):
+    """Rows of configurations with the same number of equations, (G, k): places in the residual."""
+
+    places: np.ndarray
+    configurations: np.ndarray
+
+
+def by_size(group: np.ndarray) -> list[Rows]:
+    """Return the rows of configurations, those of a size together.
+
+    Parameters
+    ----------
+    group
+        (m,) number of the configuration that an equation belongs to.
+    """
+    which, count = np.unique(group, return_inverse=True, return_counts=True)[1:]
+    order = np.argsort(which, kind="stable")
+    first = np.cumsum(count) - count
+    found = []
+    for size in np.unique(count):
+        configurations = np.flatnonzero(count == size)
+        places = order[first[configurations][:, None] + np.arange(size)]
+        found.append(Rows(places, configurations))
+    return found
+
+
+def solved(M: Array, v: Array) -> Array:
+    """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...), without pivoting.
+
+    What a vanishing pivot would decide is zero, as in a pseudo-inverse.
+    """
+    k = len(M)
+    M, v = M.copy(), v.copy()
+    for i in range(k):
+        pivot = M[i, i]
+        with np.errstate(divide="ignore"):
+            inverse = np.where(np.abs(pivot) > DROPPED, 1 / pivot, 0.0)
+        M[i, i] = inverse
+        for j in range(i + 1, k):
+            share = M[j, i] * inverse
+            M[j, i:] = M[j, i:] - share * M[i, i:]
+            v[j] = v[j] - share * v[i]
+    for i in reversed(range(k)):
+        for j in range(i + 1, k):
+            v[i] = v[i] - M[i, j] * v[j]
+        v[i] = v[i] * M[i, i]
+    return v
+
+
+def of_squares(Q: Array, s2: Array, target: Array, group: np.ndarray) -> Score:
+    """Return the sums of squares (K,) of all left-out residuals of an estimator with influence Q diag(f) Q', by weight.
+
+    With f = s^2 / (s^2 + weight) and residuals r of all, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
+
+    Parameters
+    ----------
+    Q, s2, target
+        (m, p), (p,) and the values (m,).
+    group
+        (m,) number of the configuration.
+    """
+    projected = Q.T @ target
+    parts = [(rows.places, _products(Q, rows.places)) for rows in by_size(group)]
+
+    def some(weights: Array) -> Array:
+        filters = (s2 / (s2 + weights[:, None])).T
+        residual = target[:, None] - Q @ (filters * projected[:, None])
+        total = np.zeros(len(weights))
+        for places, products in parts:
+            k = places.shape[1]
+            M = np.empty((k, k, len(places), len(weights)))
+            for (i, j), product in products.items():
+                M[i, j] = (i == j) - product @ filters
+                M[j, i] = M[i, j]
+            left = solved(M, residual[places.T])
+            total += np.einsum("igw,igw->w", left, left)
+        return total
+
+    few = max(1, MANY // len(target))
+
+    def score(weights: Array) -> Array:
+        return np.concatenate([some(weights[start : start + few]) for start in range(0, len(weights), few)])
+
+    return score
+
+
+def _products(Q: Array, places: np.ndarray) -> dict[tuple[int, int], Array]:
+    """Return the products (G, p) of the rows i <= j of every configuration, whose sums are its influence."""
+    k = places.shape[1]
+    return {(i, j): Q[places[:, i]] * Q[places[:, j]] for i in range(k) for j in range(i, k)}
+
+
+class Folds:
+    """A program without each of some parts of its configurations, solved again at weights that are asked for.
+
+    Parameters
+    ----------
+    program
+        The whole.
+    parts
+        Numbers of the configurations that are left out together.
+    """
+
+    def __init__(self, program: Program, parts: Sequence[np.ndarray]):
+        self._model = program.model
+        self._out = [np.isin(program.model.group, part) for part in parts]
+        self._programs = list(_folds(program, parts))
+        self._met: list[dict[float, Array]] = [{} for _ in parts]
+
+    def norms(self, weights: Array) -> Array:
+        """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
+        return np.hstack([self._norms(k, weights) for k in range(len(self._out))])
+
+    def _norms(self, k: int, weights: Array) -> Array:
+        model, out, met = self._model, self._out[k], self._met[k]
+        near = None
+        if met:
+            near = met[min(met, key=lambda weight: abs(np.log(weight / np.max(weights))))]
+        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near)])
+        if (weights > 0).all():
+            met |= dict(zip(weights, Z, strict=True))
+        squares = (Z @ model.A[out].T - model.b[out]) ** 2
+        _, which = np.unique(model.group[out], return_inverse=True)
+        sums = np.zeros((len(weights), which.max() + 1))
+        np.add.at(sums.T, which, squares.T)
+        return np.sqrt(sums)
+
+
+def solved_again(program: Program, weights: Array, parts: Sequence[np.ndarray]) -> Array:
+    """Return the norms (K, N) of the residuals of configurations left out in parts, in the order of the parts.
+
+    Parameters
+    ----------
+    program
+        Whose estimates they are.
+    weights
+        (K,).
+    parts
+        Numbers of the configurations that are left out together.
+    """
+    return Folds(program, parts).norms(weights)
+
+
+def without_say(program: Program, z: Array) -> np.ndarray:
+    """Return which configurations (N,) have no say in an estimate z (n,): of a nondecreasing loss of their norms.
+
+    Those whose norms could all be a little larger at once, and the loss were the same (of a largest norm, all but the
+    few that are about as large). Left out, they leave the estimate as it is.
+    """
+    v = program.norms(z)
+    order = np.argsort(v)
+    loss = program.loss_of_norms(v)
+    none, all_of_them = 0, len(v)
+    while all_of_them - none > 1:
+        middle = (none + all_of_them) // 2
+        raised = v.copy()
+        raised[order[:middle]] *= 1 + RAISED
+        if abs(program.loss_of_norms(raised) - loss) <= SAME * abs(loss):
+            none = middle
+        else:
+            all_of_them = middle
+    silent = np.zeros(len(v), dtype=bool)
+    silent[order[:none]] = True
+    return silent
+
+
+def by_their_say(program: Program, weights: Array) -> Array:
+    """Return norms (K, N) of left-out residuals, of which at least the medians over the configurations are exact.
+
+    A configuration without say keeps its residual. One that has a say, left out, has a larger residual than all those
+    of its kind: where they are fewer than half, their own norms, which are less, are on the right side of the median.
+    Where they are more, they are solved for.
+    """
+    groups = np.unique(program.model.group)
+    found = []
+    for estimate in program.path(weights):
+        norms = program.norms(estimate.z)
+        heard = np.flatnonzero(~without_say(program, estimate.z))
+        if 2 * len(heard) >= len(norms) - 1:
+            norms[heard] = solved_again(program, np.array([estimate.weight]), list(groups[heard][:, None]))[0]
+        found.append(norms)
+    return np.array(found)
+
+
+def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
+    """Return the program without each of the parts, one after the other.
+
+    The rows of a squared loss are reduced part by part, once: what is left without a part is the triangles of the parts
+    before it over those after it. Rows are added to triangles only, never taken from them, so that nothing is lost to
+    cancellation where what is left sees less than the whole.
+    """
+    model = program.model
+    n = model.A.shape[1]
+    if not program.on_triangles or len(parts) < 2:
+        for part in parts:
+            yield program.on(model.scaled(np.where(np.isin(model.group, part), 0.0, 1.0)))
+        return
+    rows = np.column_stack([model.A, model.b])
+    place = np.full(int(model.group.max()) + 1, -1)
+    for k, part in enumerate(parts):
+        place[part] = k
+    of_part = place[model.group]
+    each = [reduced_rows(rows[of_part == k]) for k in range(len(parts))]
+    rest = reduced_rows(rows[of_part < 0])
+    after = [np.zeros((n + 1, n + 1))]
+    for triangle in reversed(each[1:]):
+        after.append(reduced_rows(triangle, after[-1]))
+    before = rest
+    for k, triangle in enumerate(each):
+        left = reduced_rows(before, after[-1 - k])
+        yield program.on(from_triangle(model, left, model.equations - int(np.sum(of_part == k))))
+        before = reduced_rows(triangle, before)
