@@ -19,7 +19,7 @@ class Machine:
     """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
 
     They are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
-    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at. ``robot`` is None where there are several.
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at. ``robot`` is None for several robots.
     """
 
     robot: Robot | None
