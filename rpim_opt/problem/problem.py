@@ -87,7 +87,8 @@ class CalibrationProblem(Tabled):
     scatter: Scatter | None = None
 
     def _short(self) -> str:
-        return f"of '{self.robot.name}': {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
+        names = ", ".join(f"'{robot.name}'" for robot in self.arms.values())
+        return f"of {names}: {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the identified parameters."""
@@ -488,7 +489,8 @@ class CalibrationProblem(Tabled):
     @cached_property
     def _identified(self) -> Identified:
         """The identified parameters, with what their positions are predicted from."""
-        return identified_of(self.robot, self.parameters, self.data)
+        only = self.robots if isinstance(self.robots, Robot) else None
+        return identified_of(only, self.parameters, self.data)
 
     def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
         """Return whitened, scaled A and b of some rows of a block."""
