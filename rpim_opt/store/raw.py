@@ -11,7 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
-from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position
+from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position, revisit
+from rpim_opt.data.naming import TOUCHED
 from rpim_opt.data.orientations import ORDERS
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.several import together
@@ -204,14 +205,22 @@ def _whole(
 
 
 def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
-    """Return poses where the tables have orientations, else positions."""
+    """Return poses where the tables have orientations, else positions, else touches of points or planes."""
     stems = {stem for each in tables for stem in each.stems}
+    if not stems & {"x", "y", "z"} and any(_touched(each.raw) for each in tables):
+        return revisit
     if not stems & {"x", "y", "z"}:
         names = ", ".join(name for each in tables for name in each.raw)
         accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
         raise InputError("the header", f"no positions among {names}", accepted, paths[0])
     forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
     return pose if any(form <= stems for form in forms) else position
+
+
+def _touched(raw: Columns) -> bool:
+    """Return whether a column ``point`` or ``plane`` names something twice: labels, which it may hold, are unique."""
+    cells = [column for name, column in raw.items() if name.strip().lower() in TOUCHED]
+    return any(len({str(cell) for cell in column}) < len(column) for column in cells)
 
 
 def _ordered(
