@@ -1,4 +1,4 @@
-"""How near does a robot come to one that a tracker calibrated, when it has only touched things that nobody measured?
+"""Robots that have only touched things that nobody measured, beside robots that a tracker calibrated.
 
 Simulated: a seven-axis arm, deviations drawn with the scales, 0.03 mm of noise a touch. What it touches: ten sockets,
 six times each, without and with two known distances; six ball bars; the faces of three datum cubes. Beside each 60

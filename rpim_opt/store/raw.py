@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position, revisit
 from rpim_opt.data.naming import TOUCHED
+
+COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
+"""In the name of a column that holds a measured coordinate."""
 from rpim_opt.data.orientations import ORDERS
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.several import together
@@ -180,8 +184,10 @@ def understand_of(
     kind = pose
     if measurement is not None:
         kind = pick(MEASUREMENTS, measurement, "measurement")
+    if measurement is None and _touching(paths, arm, asked):
+        kind = revisit
     tables = _understood(paths, arm, kind, asked)
-    if measurement is None:
+    if measurement is None and kind is pose:
         kind = _kind(tables, paths)
         if kind is not pose:
             tables = _understood(paths, arm, kind, asked)
@@ -205,16 +211,24 @@ def _whole(
 
 
 def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
-    """Return poses where the tables have orientations, else positions, else touches of points or planes."""
+    """Return poses where the tables have orientations, else positions."""
     stems = {stem for each in tables for stem in each.stems}
-    if not stems & {"x", "y", "z"} and any(_touched(each.raw) for each in tables):
-        return revisit
     if not stems & {"x", "y", "z"}:
         names = ", ".join(name for each in tables for name in each.raw)
         accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
         raise InputError("the header", f"no positions among {names}", accepted, paths[0])
     forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
     return pose if any(form <= stems for form in forms) else position
+
+
+def _touching(paths: Sequence[Path], arm: Described, asked: Asked) -> bool:
+    """Return whether the tables have joints, what they touched, and no measured position."""
+    try:
+        tables = _understood(paths, arm, revisit, asked)
+    except InputError:
+        return False
+    measured = any(COORDINATE.search(name.lower()) for each in tables for name in each.raw)
+    return not measured and any(_touched(each.raw) for each in tables)
 
 
 def _touched(raw: Columns) -> bool:
