@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.layouts import read_raw
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position, revisit
 from rpim_opt.data.naming import TOUCHED
-
-COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
-"""In the name of a column that holds a measured coordinate."""
 from rpim_opt.data.orientations import ORDERS
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.several import together
@@ -27,6 +25,8 @@ from rpim_opt.robot.library import read_arm
 from rpim_opt.store.drawing import find_source
 from rpim_opt.store.named import pick
 
+COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
+"""In the name of a column that holds a measured coordinate."""
 CLEARLY = 3.0
 """The right order of a quaternion leaves so many times less than the other one."""
 
@@ -184,7 +184,7 @@ def understand_of(
     kind = pose
     if measurement is not None:
         kind = pick(MEASUREMENTS, measurement, "measurement")
-    if measurement is None and _touching(paths, arm, asked):
+    if measurement is None and _touching(paths, asked):
         kind = revisit
     tables = _understood(paths, arm, kind, asked)
     if measurement is None and kind is pose:
@@ -221,14 +221,18 @@ def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
     return pose if any(form <= stems for form in forms) else position
 
 
-def _touching(paths: Sequence[Path], arm: Described, asked: Asked) -> bool:
-    """Return whether the tables have joints, what they touched, and no measured position."""
-    try:
-        tables = _understood(paths, arm, revisit, asked)
-    except InputError:
-        return False
-    measured = any(COORDINATE.search(name.lower()) for each in tables for name in each.raw)
-    return not measured and any(_touched(each.raw) for each in tables)
+def _touching(paths: Sequence[Path], asked: Asked) -> bool:
+    """Return whether a table says what was touched, and none has a measured coordinate."""
+    touched = False
+    for path in paths:
+        try:
+            raw = read_raw(path, asked.layout).columns
+        except InputError:  # whatever it is, the one who understands it says so
+            return False
+        if any(COORDINATE.search(name.lower()) for name in raw):
+            return False
+        touched = touched or _touched(raw)
+    return touched
 
 
 def _touched(raw: Columns) -> bool:
