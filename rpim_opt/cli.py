@@ -413,6 +413,12 @@ def design(
         int, typer.Option(min=1, max=1_000_000, help="How many random candidates within the joint limits.")
     ] = 1000,
     table: Annotated[Path | None, typer.Option(help="A table of candidates instead: q1_deg, ...")] = None,
+    point: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a robot that touches points: x,y,z [mm] of one in its base frame; else among the data's."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random candidates.")] = 0,
     out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
     as_json: Json = False,
@@ -421,15 +427,18 @@ def design(
     with progress() as say:
         from rpim_opt.basics.tables import csv_text
         from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
+        from rpim_opt.problem.postures import postures_at, touched_place
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem)
         robot = instance.problem.robot
-        if table is None:
-            q = random_candidates(robot, candidates, seed)
-        else:
+        if table is not None:
             q = read_candidates(table, robot)
+        elif instance.problem.data.blocks[0].measurement.touching:
+            q = postures_at(instance.problem, touched_place(instance.problem, point)[None].repeat(candidates, 0), seed)
+        else:
+            q = random_candidates(robot, candidates, seed)
         found = choose(instance.problem, q, count, criterion, progress=say)
     columns = joint_cells(robot, q[found.chosen], found.chosen)
     text = csv_text(columns, zip(*columns.values(), strict=True))

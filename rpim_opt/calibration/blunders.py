@@ -9,7 +9,7 @@ from scipy.special import chdtrc, chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.diagnosis import error_vectors
-from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
 from rpim_opt.problem.source import Source
 
 BEYOND, LOOK = 6.0, 3.0
@@ -35,11 +35,11 @@ def ratios(problem: CalibrationProblem, x: Array) -> Array:
     """
     components = np.zeros((len(problem.data), 2), dtype=int)
     for block in problem.data.blocks:
-        dimensions = list(block.measurement.components.values())
+        dimensions = error_dimensions(block)
         components[block.row] = [dimensions.count("length"), dimensions.count("angle")]
     found = np.zeros(len(problem.data))
     for dimension, counts in zip(("length", "angle"), components.T, strict=True):
-        errors = problem.errors(x, dimension)
+        errors = np.nan_to_num(problem.errors(x, dimension))
         for k in np.unique(counts[counts > 0]):
             rows = np.flatnonzero(counts == k)
             median = max(float(np.median(errors[rows])), 1e-12)
@@ -142,9 +142,12 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
     among[rows] = True
     found = np.zeros(len(rows), dtype=bool)
     whose = np.array(problem.data.robot)
+    together = problem.data.configuration
+    if problem.touches is not None:  # touches of a point have one number, and differ in their joint values
+        together = np.unique(q, axis=0, return_inverse=True)[1].ravel()
     for k, i in enumerate(rows):
         apart = np.sum((unit - unit[i]) ** 2, axis=1)
-        apart[problem.data.configuration == problem.data.configuration[i]] = np.inf
+        apart[together == together[i]] = np.inf
         apart[whose != whose[i]] = np.inf
         j = int(np.argmin(apart))
         found[k] = among[j] and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
@@ -185,19 +188,18 @@ def unbelievable(
         The rows.
     """
     kept = dict(labels)
-    rows = problem.on(problem.data.take([problem.labels.index(label) for label in labels]))
-    residual = rows.residual(x)
-    J = rows.jacobian(x)
+    residual, J = problem.slopes(x)
     start = 0
-    for block, V in zip(rows.data.blocks, rows.covariances(), strict=True):
+    for block, V in zip(problem.data.blocks, problem.covariances(), strict=True):
         k = len(block.measurement.components)
         end = start + k * len(block.row)
-        r = residual[start:end].reshape(-1, k, 1)
-        slopes = J[start:end].reshape(-1, k, len(x))
+        asked = np.array([problem.labels[row] in labels for row in block.row])
+        r = residual[start:end].reshape(-1, k, 1)[asked]
+        slopes = J[start:end].reshape(-1, k, len(x))[asked]
         start = end
-        S = slopes @ covariance @ slopes.transpose(0, 2, 1) + V
+        S = slopes @ covariance @ slopes.transpose(0, 2, 1) + np.broadcast_to(V, (len(block.row), k, k))[asked]
         squares = np.sum(r * np.linalg.solve(S, r), axis=(1, 2))
-        for row, square in zip(block.row, squares, strict=True):
+        for row, square in zip(block.row[asked], squares, strict=True):
             if chdtrc(k, square) > _rare():
-                kept.pop(rows.labels[row])
+                kept.pop(problem.labels[row])
     return kept

@@ -85,8 +85,7 @@ class Comparison:
     @cached_property
     def row(self) -> np.ndarray:
         """The row (m,) of every equation."""
-        blocks = self.problem.data.blocks
-        return np.concatenate([np.repeat(block.row, len(block.measurement.components)) for block in blocks])
+        return self.problem.owners
 
     @cached_property
     def rows(self) -> int:

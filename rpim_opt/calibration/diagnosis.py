@@ -69,7 +69,8 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     """Return the rows beyond `outlying` at x (n,) [SI], the worst first."""
     norms, count = problem.whitened_errors(x)
     limit = outlying(norms, count)
-    error = 1e3 * problem.errors(x)
+    error = problem.errors(x)
+    error = 1e3 * np.where(np.isfinite(error), error, problem.errors(x, "stated length"))
     noise = limit / np.sqrt(chdtri(count, RARE / len(norms)))
     labels = problem.labels
     worst = [i for i in np.argsort(-norms) if norms[i] > limit[i]]

@@ -127,7 +127,9 @@ def narrow(problem: CalibrationProblem) -> tuple[int, ...]:
 
 
 def errors_alike(compared: Comparison, model: Judged) -> Alike | None:
-    """Return whether similar configurations err alike, errors in units of their noise."""
+    """Return whether similar configurations err alike, errors in units of their noise; None where they touch points."""
+    if compared.problem.touches is not None:
+        return None
     row = compared.row
     scatter = model.evidence.scatter(model.point.logs)
     stacks = model.evidence.data.stacks

@@ -343,7 +343,7 @@ def _floor(merit: float) -> float:
 
 
 def _equations(source: Source) -> int:
-    return sum(len(b.row) * len(b.measurement.components) for part in source.rows() for b in part.data.blocks)
+    return sum(len(part.owners) for part in source.rows())
 
 
 def require_start(start: Array, count: int) -> Array:

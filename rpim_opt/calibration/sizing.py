@@ -102,8 +102,9 @@ class Learning:
         """Return the evidence of a linearization at x (n,) [SI]."""
         free = problem.parameters.free
         stated = self.stated(problem)
-        J = problem.jacobian(x)
-        y = problem.residual(x) + J @ x
+        residual, jacobian = problem.slopes(x)
+        J = problem.contrasts(jacobian)
+        y = problem.contrasts(residual[:, None])[:, 0] + J @ x
         require_finite(J, y)
         unit = free.scale * stated.scale
         stacks = problem.stacks(joints="joint" in self.noise, at=_values(problem, x))

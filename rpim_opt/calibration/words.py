@@ -87,8 +87,8 @@ def in_short(result: Outcome) -> str:
 
 
 def _sentences(result: Outcome) -> list[str]:
-    before = 1e3 * result.nominal_errors().mean()
-    after = 1e3 * result.errors().mean()
+    before = 1e3 * np.nanmean(result.nominal_errors())
+    after = 1e3 * np.nanmean(result.errors())
     errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
     return [errors, *weight_lines(result), *noise_sentence(result), *remarks(result)]
 

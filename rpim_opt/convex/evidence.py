@@ -376,8 +376,12 @@ def _trace(stack: Stack, kind: str, Q: Array, u: Array) -> float:
     if kind == "joint":
         T = stack.joint
         return float(np.sum(T * (Q @ T)) - np.sum((T.transpose(0, 2, 1) @ u[:, :, None]) ** 2))
+    V = None
     if kind == "instrument":
         V = stack.instrument
+    if kind == "position":
+        V = stack.unit
+    if V is not None:
         return float(np.sum(Q * V) - np.einsum("nk,nkl,nl->", u, V, u))
     mask = stack.length
     if kind == "orientation":

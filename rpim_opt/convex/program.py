@@ -231,9 +231,18 @@ class Program(Objective):
         Parameters
         ----------
         weights
-            Zero or more.
+            (K,), zero or more.
         near
             A point (n,) near the solution at the largest weight, if one is known.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> [int(np.count_nonzero(estimate.z)) for estimate in program.path([1e2, 1e4, 1e6])]
+        [22, 14, 4]
         """
         checked = np.array([self._weight(weight) for weight in weights])
         box = self.box

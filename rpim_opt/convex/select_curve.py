@@ -147,7 +147,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
     >>> f"{result.weight:.1g}", result.selection.note
-    ('2', 'corner of the L-curve by golden sections')
+    ('0.7', 'corner of the L-curve by golden sections')
     """
     low, high = np.log(weight_grid(program, 2))
     curve = _Curve(program)

@@ -1,3 +1,7 @@
+from .contact import KnownAngle as KnownAngle
+from .contact import KnownDistance as KnownDistance
+from .contact import touches as touches
+from .contact import with_known as with_known
 from .dataset import Dataset as Dataset
 from .models import Measurement as Measurement
 from .reading import read_data as read_data

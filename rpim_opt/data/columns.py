@@ -25,6 +25,8 @@ def text_columns(kind: Measurement) -> list[str]:
     names = ["label", "configuration", "marker", "fixture"]
     if kind.points == 2:
         names.append("to_marker")
+    if kind.touching:
+        names += ["point", "plane"]
     return names
 
 
@@ -160,7 +162,7 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
     else:
         label = texts(table["label"], "label")
         _require_unique(label)
-    for column in ("marker", "to_marker", "fixture", "configuration"):
+    for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane"):
         for i, name in enumerate(texts(table.get(column, ()), column)):
             if not name:
                 raise InputError(f"row {label[i]}, column {column}", "''", "a name")

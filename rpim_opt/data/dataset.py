@@ -47,6 +47,8 @@ class Block(Brief):
         Further columns by name, (N,) each [SI], which terms and measurements of a user's own see.
     robot
         Whose rows these are; ``""`` for the only robot.
+    point
+        (N, p) names of the points that were touched, or None.
     """
 
     measurement: Measurement
@@ -61,6 +63,7 @@ class Block(Brief):
     approach: Array | None = None
     columns: Mapping[str, Array] = field(default_factory=dict)
     robot: str = ""
+    point: np.ndarray | None = None
 
     def _short(self) -> str:
         return f"{counted(len(self.row), 'row')} of {self.measurement.name}"
@@ -69,7 +72,7 @@ class Block(Brief):
         """Return the entries at ``index``, which become the rows ``row``."""
         covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
 
-        def rows(values: Array | None) -> Array | None:
+        def rows(values: Any | None) -> Any | None:
             return None if values is None else values[index]
 
         return replace(
@@ -82,6 +85,7 @@ class Block(Brief):
             payload=rows(self.payload),
             approach=rows(self.approach),
             columns={name: values[index] for name, values in self.columns.items()},
+            point=rows(self.point),
         )
 
 

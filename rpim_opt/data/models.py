@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi as ca
@@ -74,6 +74,11 @@ class Measurement(Brief):
         (dof, 2); ``"torque"`` for the measured joint torques in the same shape; and columns of the data by name.
     extra
         Those columns, name to dimension.
+    touching
+        Whether a row says no more than which point was touched: its equations are differences to the other rows of
+        the point, in the robot's own base frame.
+    planar
+        Whether what was touched is a plane.
 
     Examples
     --------
@@ -120,6 +125,8 @@ class Measurement(Brief):
     prepare: Callable[[Array], Array] = lambda y: y
     sees: tuple[str, ...] = ()
     extra: Mapping[str, str] = field(default_factory=dict)
+    touching: bool = False
+    planar: bool = False
 
     def _short(self) -> str:
         return f"'{self.name}': {', '.join(self.components)}"
@@ -137,12 +144,12 @@ class Measurement(Brief):
 
     def __reduce__(self) -> Any:
         """Ready measurements travel to other processes by name, so that they stay the same there."""
-        known = MEASUREMENTS.get(self.name) is self
+        known = READY.get(self.name) is self
         return (_ready, (self.name,)) if known else super().__reduce__()
 
 
 def _ready(name: str) -> Measurement:
-    return MEASUREMENTS[name]
+    return READY[name]
 
 
 def of_fixture(parameter: str, fixture: str) -> str:
@@ -214,4 +221,40 @@ sphere = Measurement(
 )
 """A point on a sphere of radius R about c: r = R - |p - c|."""
 
-MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere)}
+revisit = Measurement(
+    "revisit",
+    model=_origin,
+    columns={},
+    components=_XYZ,
+    noise={"position": "length"},
+    touching=True,
+)
+"""A touch of a point that nobody measured: r_i = c - p_i, with c the mean of the positions of all touches of it."""
+
+revisit_plane = replace(revisit, name="revisit_plane", planar=True)
+"""A touch of a plane that nobody measured: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
+
+known_distance = Measurement("known_distance", lambda T1, T2: ca.norm_2(_origin(T2) - _origin(T1)), _DISTANCE, points=2)
+"""The distance that a drawing states between two touched points or parallel planes: r = y - |c2 - c1|."""
+
+known_square = Measurement(
+    "known_square", lambda T1, T2: 0 * T1[0, 0], {"angle": "angle"}, noise={"angle": "angle"}, points=2
+)
+"""Two touched planes are at right angles: r = -asin(n1'n2)."""
+
+known_parallel = Measurement(
+    "known_parallel",
+    model=lambda T1, T2: 0 * T1[:2, 0],
+    columns={"angle": "angle"},
+    components={"tilt_1": "angle", "tilt_2": "angle"},
+    noise={"angle": "angle"},
+    points=2,
+)
+"""Two touched planes are parallel: r = -(t1'n2, t2'n2), with two directions t in the first."""
+
+MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere, revisit)}
+"""What a problem file may name."""
+KNOWN = (known_distance, known_square, known_parallel)
+"""What a drawing knows of things that were touched: no measurements, though they have equations."""
+READY = {**MEASUREMENTS, **{m.name: m for m in (revisit_plane, *KNOWN)}}
+"""All that come with the package."""

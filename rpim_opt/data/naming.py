@@ -20,6 +20,8 @@ __all__ = ["Reading", "Renamed", "parse_units", "rename"]
 AMBIGUOUS = ("rx", "ry", "rz")
 """Without a unit these may also be a rotation vector, as Universal Robots' are."""
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
+TOUCHED = ("point", "plane")
+"""Names of columns that say what a row touched."""
 NOT_MEASURED = "what was wanted is no measurement"
 VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
@@ -100,6 +102,8 @@ def _read(name: str, head: Head | None, known: Sequence[str], joints: Sequence[s
             return Reading(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
     if stem in known:
         return Reading(stem, unit, "named so")
+    if stem.lower() in TOUCHED and stem.lower() in known:  # elsewhere such a column holds labels
+        return Reading(stem.lower(), unit, "what was touched")
     found = _recognised(stem, joints)
     if head is not None and head.group and not found.why and not found.kind:
         bare = split(head.name)[0]

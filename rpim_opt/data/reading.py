@@ -13,8 +13,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.data.columns import Numbers, further_columns, labels, numeric, values_form
+from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.models import Measurement, position, revisit, revisit_plane
 from rpim_opt.data.spread import covariances, declared_noise
 from rpim_opt.robot.mdh import Robot
 
@@ -27,7 +28,8 @@ def read_data(
     Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
 
     - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default);
-    - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere);
+    - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere); ``point``
+      or ``plane`` (which one was touched);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
     - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
@@ -72,6 +74,8 @@ def read_data(
 
 def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Measurement) -> Dataset:
     N = len(next(iter(table.values())))
+    if kind is revisit and "plane" in table:
+        kind = revisit_plane
     label = labels(table, N)
     columns = numeric(table, robot, kind, label)
     y = _measured(columns, kind, label, N)
@@ -85,14 +89,28 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         payload=_payload(columns, label),
         approach=_approach(columns, robot, kind, label),
         columns=_further(columns, robot, kind),
+        point=_touched(table, kind, N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     _require_two_points(whole, markers, label)
     configuration = _configurations(table, whole.q)
-    if not {"marker", "to_marker", "fixture"} & set(table):
-        return Dataset((replace(whole, markers=("",) * kind.points),), label, configuration)
-    blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
-    return Dataset(blocks, label, configuration)
+    blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
+    if {"marker", "to_marker", "fixture"} & set(table):
+        blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
+    data = Dataset(blocks, label, configuration)
+    if kind.touching:
+        return by_points(data)
+    return data
+
+
+def _touched(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
+    """Return the names (N, 1) of the points that were touched."""
+    if not kind.touching:
+        return None
+    if ("point" in table) == ("plane" in table):
+        accepted = "a column point, or a column plane: what a row touched"
+        raise InputError("the header", ", ".join(table), accepted)
+    return np.array(_names(table, ["point", "plane"], N), dtype=object)[:, None]
 
 
 def _further(columns: Numbers, robot: Robot, kind: Measurement) -> dict[str, Array]:

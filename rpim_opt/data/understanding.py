@@ -21,7 +21,8 @@ from rpim_opt.robot.mdh import Robot
 
 _OF = {"x": "x", "y": "y", "z": "z", "rx": "roll", "ry": "pitch", "rz": "yaw", "distance": "distance"}
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
-         "to_marker": "reflector of the second point"}  # fmt: skip
+         "to_marker": "reflector of the second point", "point": "point that was touched",
+         "plane": "plane that was touched"}  # fmt: skip
 
 
 class Meant(NamedTuple):

@@ -16,6 +16,7 @@ from .parts import partitions as partitions
 from .placing import hand_eye as hand_eye
 from .placing import register as register
 from .placing import tool_from_distances as tool_from_distances
+from .postures import postures_at as postures_at
 from .problem import CalibrationProblem as CalibrationProblem
 from .scatter import Scatter as Scatter
 from .several import together as together

@@ -14,6 +14,7 @@ from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import position
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
@@ -24,6 +25,8 @@ SMOOTH = 12
 """Power of the smooth least eigenvalue, (tr M^-p)^(-1/p)."""
 ROUNDINGS = 5
 """How often the relaxation is rounded: once to the largest weights, then at random by them; the best set stays."""
+ANYWHERE = 1.0
+"""Standard deviation of where a touched point is [m]."""
 ENOUGH = 2e-3
 """Relative gap at which the relaxation is solved well enough."""
 
@@ -141,6 +144,9 @@ def choose(
         E   maximize the least eigenvalue of M
         V   minimize the mean variance of predicted positions, the axes' sum [m^2]
 
+    Of a problem whose rows touch points, the candidates are postures at one point (`postures_at`); V counts positions
+    of the tool.
+
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
     any set can reach; E counts directions that some candidate sees. The largest weights are rounded and improved by
     exchanges (Fedorov 1972).
@@ -179,11 +185,14 @@ def choose(
     if not 0 < count < len(candidates):
         raise InputError("count", f"{count}", f"1 to {len(candidates) - 1}, fewer than the candidates")
     A = _rows(problem, candidates)
+    if problem.data.blocks[0].measurement.touching:
+        A = _of_one_point(A, problem)
     n = A.shape[2]
     C = np.eye(n)
     if criterion == "V":
         P = _rows(problem, candidates if predicted is None else np.atleast_2d(predicted), whitened=False)
-        C = np.einsum("kin,kim->nm", P, P) / len(P)
+        C = np.zeros((n, n))
+        C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
     progress(f"relaxing over {len(A)} candidates")
     if criterion == "E":  # directions that no candidate sees would be the least informed whatever is chosen
         _, s, Vt = np.linalg.svd(A.reshape(-1, n), full_matrices=False)
@@ -212,6 +221,8 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     """Jacobians (M, k, n) of the candidates at nominal, in units of the scales; of positions [m] if not whitened."""
     block = problem.data.blocks[0]
     kind = block.measurement
+    if kind.touching:  # where the tool is: the point's own columns stand for what a touch does not show
+        kind = position
     if kind.points != 1:
         raise InputError("design", f"measurement '{kind.name}' between two points", "measurements of one point")
     y = np.zeros((len(q), len(kind.columns)))
@@ -227,6 +238,17 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     rows = there.linearize(x).A if whitened else there.jacobian(x) * scale
     rows = rows.reshape(len(q), -1, len(scale))
     return rows if whitened else rows[:, [i for i, d in enumerate(kind.components.values()) if d == "length"]]
+
+
+def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:
+    """Return rows (M, 3, n + 3) of touches of one point, whose place is unknown to `ANYWHERE`.
+
+    ln det of the information with those columns is that without the point, but for a constant: the point is a fixed
+    effect.
+    """
+    covariance = np.median(problem.data.blocks[0].covariance, axis=0)
+    place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(covariance))
+    return np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)
 
 
 def _value(M: Array, criterion: str, C: Array) -> float:

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.models import MEASUREMENTS, Measurement, of_fixture
+from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads
 from rpim_opt.robot.kinematics import FRAME, chain, frame
 from rpim_opt.robot.parameter_names import tool_prefix
@@ -25,7 +25,7 @@ transform = Measurement(
 )
 """The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
 
-_READY = frozenset({*MEASUREMENTS.values(), transform})
+_READY = frozenset({*READY.values(), transform})
 
 
 class Structure(NamedTuple):
@@ -33,7 +33,7 @@ class Structure(NamedTuple):
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
     ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
-    user's own.
+    user's own; ``several`` whether other robots have rows, too.
     """
 
     joint_types: tuple[str, ...]
@@ -44,6 +44,7 @@ class Structure(NamedTuple):
     fixture: str
     loads: Loads
     terms: tuple[Term, ...] = ()
+    several: bool = False
 
 
 class Row(NamedTuple):
@@ -144,6 +145,8 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
 
     def reflector(point: int, marker: str) -> ca.SX:
         flange = chain(of.joint_types, posture(point), value, of.terms)
+        if measurement.touching and not of.several:  # touches differ by as much wherever the robot stands
+            return flange @ place(tool_prefix(marker))
         return place("base_") @ flange @ place(tool_prefix(marker))
 
     own = {name: place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}

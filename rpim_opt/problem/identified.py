@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.mdh import Robot
@@ -18,10 +19,10 @@ class Machine:
     """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
 
     They are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
-    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at. ``robot`` is None for several robots.
     """
 
-    robot: Robot
+    robot: Robot | None
     parameters: Parameters
     data: Dataset
     at: Array | None = None
@@ -50,7 +51,14 @@ class Identified(Parameters):
     machine: Machine | None = None
 
 
-def identified_of(robot: Robot, parameters: Parameters, data: Dataset) -> Identified:
+def require_robot(machine: Machine) -> Robot:
+    """Return the machine's robot; InputError where there are several."""
+    if machine.robot is None:
+        raise InputError("positions", "several robots in one problem", "one robot: constraints of `problem.alone(...)`")
+    return machine.robot
+
+
+def identified_of(robot: Robot | None, parameters: Parameters, data: Dataset) -> Identified:
     """Return the identified parameters of a table, with the machine; of the data one row of each kind."""
     blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(data.blocks))
     first = [int(block.row[0]) for block in data.blocks]

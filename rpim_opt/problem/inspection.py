@@ -15,6 +15,7 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.contact import contact_sentences
 from rpim_opt.problem.frames import fitted_frames
 from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
 from rpim_opt.problem.problem import CalibrationProblem
@@ -51,6 +52,8 @@ class Inspection(Tabled):
         One sentence each: what the problem file could say.
     observability
         What the configurations can show.
+    contact
+        One sentence each: what touches show, and known distances.
 
     Examples
     --------
@@ -75,6 +78,7 @@ class Inspection(Tabled):
     warnings: tuple[str, ...]
     proposals: tuple[str, ...]
     observability: Observability
+    contact: tuple[str, ...] = ()
 
     def _short(self) -> str:
         o = self.observability
@@ -91,6 +95,7 @@ class Inspection(Tabled):
     def __str__(self) -> str:
         """Return everything as a person reads it."""
         parts = [self._joints(), self._measured(), self._rows(), self._identifiable()]
+        parts += ["\n".join(self.contact)]
         parts += ["\n".join(f"Warning: {text}" for text in self.warnings)]
         parts += ["\n".join(f"Proposal: {text}" for text in self.proposals)]
         return "\n\n".join(part for part in parts if part)
@@ -113,6 +118,7 @@ class Inspection(Tabled):
                 "condition": o.condition, "raw_condition": o.raw_condition, **o.indices, "unseen": o.unseen,
                 "redundant": o.redundant,
             },
+            "contact": self.contact,
             "warnings": self.warnings,
             "proposals": self.proposals,
         }  # fmt: skip
@@ -239,6 +245,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         warnings=(*_ranges(problem), *_copies(data), *shared_rows(data, validation), *_mistakes(problem, fitted, x)),
         proposals=tuple(proposals),
         observability=observe(problem),
+        contact=tuple(contact_sentences(problem)),
     )
 
 

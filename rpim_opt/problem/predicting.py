@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import position
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.identified import Machine
+from rpim_opt.problem.identified import Machine, require_robot
 from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
 
@@ -85,15 +85,15 @@ def _about(here: CalibrationProblem, x: Array) -> Predicted:
 def _there(machine: Machine, q: Array, marker: str | None, torque: Array | None) -> CalibrationProblem:
     """Return the problem whose measurements are the positions of a reflector."""
     q = np.atleast_2d(np.asarray(q, dtype=float))
-    if not np.isfinite(q).all() or q.shape[1] != machine.robot.dof:
+    if not np.isfinite(q).all() or q.shape[1] != require_robot(machine).dof:
         found = f"joint values of shape {q.shape}"
-        raise InputError("positions", found, f"finite numbers (N, {machine.robot.dof}) [rad or m]")
+        raise InputError("positions", found, f"finite numbers (N, {require_robot(machine).dof}) [rad or m]")
     data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
     data = bearing(data, machine.data, torque)
     if marker is None:
         marker = markers(machine)[0]
     block = replace(data.blocks[0], markers=(marker,))
-    problem = CalibrationProblem(machine.robot, machine.parameters, machine.data)
+    problem = CalibrationProblem(require_robot(machine), machine.parameters, machine.data)
     return problem.on(replace(data, blocks=(block,)))
 
 
@@ -104,7 +104,7 @@ def markers(machine: Machine) -> list[str]:
 
 def within_ranges(machine: Machine) -> Array:
     """Return configurations (N, dof) of all joint ranges that stand for them."""
-    return _standing(machine, random_candidates(machine.robot, ALL))
+    return _standing(machine, random_candidates(require_robot(machine), ALL))
 
 
 def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
@@ -117,7 +117,7 @@ def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
     lower, upper
         (3,) corners [m].
     """
-    key = (machine.robot, machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
+    key = (require_robot(machine), machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
     if key not in _FOUND:
         if len(_FOUND) >= SOME:
             _FOUND.clear()
@@ -151,9 +151,9 @@ def _reaching(machine: Machine, lower: Array, upper: Array) -> Array:
     nominal[[name.startswith("base_") for name in whole.names]] = 0.0
     at_base = replace(machine, parameters=replace(whole, nominal=nominal), at=None, farthest=None)
     still = np.zeros(len(whole.free))
-    inside = [np.zeros((0, machine.robot.dof))]
+    inside = [np.zeros((0, require_robot(machine).dof))]
     for seed in range(16):
-        q = random_candidates(machine.robot, DRAWN, seed)
+        q = random_candidates(require_robot(machine), DRAWN, seed)
         at = _there(at_base, q, None, None).modelled(still)[0]
         inside.append(q[((at >= lower) & (at <= upper)).all(axis=1)])
         if sum(map(len, inside)) >= ALL:

@@ -28,6 +28,7 @@ from rpim_opt.problem.loads import (
     require_same_torques,
 )
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
+from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
 from rpim_opt.robot.compiled import compiled
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
@@ -87,7 +88,8 @@ class CalibrationProblem(Tabled):
     scatter: Scatter | None = None
 
     def _short(self) -> str:
-        return f"of '{self.robot.name}': {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
+        names = ", ".join(f"'{robot.name}'" for robot in self.arms.values())
+        return f"of {names}: {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the identified parameters."""
@@ -342,7 +344,33 @@ class CalibrationProblem(Tabled):
 
     def residual(self, x: Array) -> Array:
         """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
-        return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+        residual = np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+        if self.touches is not None:
+            residual, _ = self.touches.centred(residual, size=self._size)
+        return residual
+
+    @cached_property
+    def touches(self) -> Touches | None:
+        """Points and planes that rows touched and nobody measured; None where there are none.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.touches
+        """
+        return Touches.of(self.data)
+
+    def _residuals(self, x: Array) -> Iterator[tuple[Block, Array]]:
+        """Yield every block with its residual (N, c) [SI]."""
+        if self.touches is None:
+            for block in self.data.blocks:
+                yield block, self._evaluate(block, "residual", x)[0][:, 0]
+            return
+        residual = self.residual(x)
+        start = 0
+        for block in self.data.blocks:
+            each = len(block.measurement.components)
+            end = start + each * len(block.row)
+            yield block, residual[start:end].reshape(-1, each)
+            start = end
 
     def modelled(self, x: Array) -> list[Array]:
         """Return what the instrument would read at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
@@ -357,7 +385,9 @@ class CalibrationProblem(Tabled):
             (n,) deviations [SI].
         dimension
             ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error. Rows without
-            such components get NaN.
+            such components get NaN. For touches the length is the distance from the mean of their point's touches, NaN
+            for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of them,
+            which is no measurement.
 
         Examples
         --------
@@ -369,11 +399,12 @@ class CalibrationProblem(Tabled):
         ['15.00', '7.07']
         """
         errors = np.full(len(self.data), np.nan)
-        for block in self.data.blocks:
-            of = [i for i, d in enumerate(block.measurement.components.values()) if d == dimension]
+        for block, residual in self._residuals(x):
+            of = [i for i, d in enumerate(error_dimensions(block)) if d == dimension]
             if of:
-                residual = self._evaluate(block, "residual", x)[0][:, 0, of]
-                errors[block.row] = np.sqrt(np.sum(residual**2, axis=1))
+                errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
+        if self.touches is not None:
+            errors[self._rows_of_equations[self.touches.alone]] = np.nan
         return errors
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
@@ -388,8 +419,8 @@ class CalibrationProblem(Tabled):
         """
         norms = np.zeros(len(self.data))
         count = np.zeros(len(self.data), dtype=int)
-        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
-            r = (whitening @ self._evaluate(block, "residual", x)[0].transpose(0, 2, 1))[:, :, 0]
+        for (block, residual), whitening in zip(self._residuals(x), self._whitening, strict=True):
+            r = (whitening @ residual[:, :, None])[:, :, 0]
             norms[block.row] = np.sqrt(np.sum(r**2, axis=1))
             count[block.row] = r.shape[1]
         return norms, count
@@ -404,9 +435,7 @@ class CalibrationProblem(Tabled):
         >>> norms.shape, count[:2]
         ((25,), array([9, 9]))
         """
-        numbers = [np.repeat(b.row, len(b.measurement.components)) for b in self.data.blocks]
-        configuration = self.data.configuration[np.concatenate(numbers)]
-        which = np.unique(configuration, return_inverse=True)[1]
+        which = np.unique(self.groups, return_inverse=True)[1]
         squares = np.bincount(which, self.whitened_residual(x) ** 2)
         return np.sqrt(squares), np.bincount(which)
 
@@ -420,8 +449,8 @@ class CalibrationProblem(Tabled):
         >>> bool(np.allclose(problem.whitened_residual(nominal), problem.linearize(nominal).b))
         True
         """
-        if self.scatter is not None:
-            return self._whitened(self.residual(x)[:, None])[:, 0]
+        if self.scatter is not None or self.touches is not None:
+            return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
         parts = []
         for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
             residual = self._evaluate(block, "residual", x)[0]
@@ -430,6 +459,8 @@ class CalibrationProblem(Tabled):
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
+        if self.touches is not None:
+            return self.slopes(x)[1]
         parts = [self._evaluate(block, "jacobian", x)[1] for block in self.data.blocks]
         return np.concatenate([part.reshape(-1, len(x)) for part in parts])
 
@@ -473,8 +504,9 @@ class CalibrationProblem(Tabled):
         >>> [len(piece.b) for piece in problem.pieces(np.zeros(len(problem.parameters.free)), 5)]
         [15, 12]
         """
-        constrained = any(not block.measurement.columns for block in self.data.blocks)
-        if self.scatter is not None:
+        kinds = [block.measurement for block in self.data.blocks]
+        constrained = any(not kind.columns and not kind.touching for kind in kinds)
+        if self.scatter is not None or self.touches is not None:
             yield from self._scattered(x, most, constrained)
             return
         for i, block in enumerate(self.data.blocks):
@@ -488,7 +520,8 @@ class CalibrationProblem(Tabled):
     @cached_property
     def _identified(self) -> Identified:
         """The identified parameters, with what their positions are predicted from."""
-        return identified_of(self.robot, self.parameters, self.data)
+        only = self.robots if isinstance(self.robots, Robot) else None
+        return identified_of(only, self.parameters, self.data)
 
     def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
         """Return whitened, scaled A and b of some rows of a block."""
@@ -518,16 +551,41 @@ class CalibrationProblem(Tabled):
             problem = self
             if len(rows) < len(self.data):
                 problem = self.on(self.data.take(rows))
-            residual, jacobian = problem._slopes(x)
-            A = problem._whitened(jacobian) * scale
-            r = problem._whitened(residual[:, None])[:, 0]
+            residual, jacobian = problem.slopes(x)
+            A = problem._whitened(problem.contrasts(jacobian)) * scale
+            r = problem._whitened(problem.contrasts(residual[:, None]))[:, 0]
             yield LinearModel(A, r + A @ (x / scale), problem.groups, self._identified, constrained)
 
-    def _slopes(self, x: Array) -> tuple[Array, Array]:
-        """Return residual (m,) and Jacobian (m, n) [SI], evaluated together."""
+    def slopes(self, x: Array) -> tuple[Array, Array]:
+        """Return residual (m,) and Jacobian (m, n) [SI], evaluated together.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> [part.shape for part in problem.slopes(np.zeros(len(problem.parameters.free)))]
+        [(27,), (27, 26)]
+        """
         both = [self._evaluate(block, "jacobian", x) for block in self.data.blocks]
         residual = np.concatenate([r.ravel() for r, _ in both])
-        return residual, np.concatenate([J.reshape(-1, len(x)) for _, J in both])
+        jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
+        if self.touches is not None:
+            left, slopes = self.touches.centred(residual, jacobian, self._size)
+            return left, np.asarray(slopes)
+        return residual, jacobian
+
+    def contrasts(self, values: Array) -> Array:
+        """Return what values of the rows' equations (m, c) say without the points that were touched, (k, c).
+
+        They are what `linearize` whitens, in its order; the values themselves where no row touches a point.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.contrasts(np.eye(27)).shape
+        (27, 27)
+        """
+        if self.touches is None:
+            return values
+        return self.touches.contrasts(values, self.touched)
 
     def _whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise, configuration by configuration."""
@@ -563,7 +621,36 @@ class CalibrationProblem(Tabled):
         slopes = None
         if joints:
             slopes = self.joint_slopes(at)
-        return stacked(self.data, slopes)
+        found = stacked(self.data, slopes)
+        if self.touches is None:
+            return found
+        stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
+        return contrasted(self.touches, found, self.touched, stop[self._rows_of_equations])
+
+    @cached_property
+    def _size(self) -> float:
+        """How far the nominal robot's touches spread [m]."""
+        if self.touches is None:
+            return 0.0
+        return self.touches.size(self._untouched)
+
+    @cached_property
+    def _untouched(self) -> Array:
+        """The residual (m,) of the nominal robot [SI] with touched points at the origin."""
+        x = np.zeros(len(self.parameters.free))
+        return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+
+    @cached_property
+    def touched(self) -> Things:
+        """Where the nominal robot puts the points and planes that were touched, in its base frame.
+
+        >>> import rpim_opt as ro
+        >>> len(ro.load("contact").problem.touched)
+        10
+        """
+        if self.touches is None:
+            return ()
+        return self.touches.located(self._untouched)
 
     def joint_slopes(self, at: Array | None = None) -> Array:
         """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
@@ -586,10 +673,12 @@ class CalibrationProblem(Tabled):
         if at is not None:
             nominal = at
         alone = replace(self, parameters=replace(p, nominal=nominal, identified=angles), scatter=None)
-        found = np.zeros((len(self.groups), max(robot.dof for robot in self.arms.values())))
+        found = np.zeros((len(self._rows_of_equations), max(robot.dof for robot in self.arms.values())))
         if angles.any():
             columns = [number[name] for name in p.names if name in number]
-            J = alone.jacobian(np.zeros(len(columns)))
+            at_nominal = np.zeros(len(columns))
+            parts = [alone._evaluate(block, "jacobian", at_nominal)[1] for block in self.data.blocks]
+            J = np.concatenate([part.reshape(-1, len(columns)) for part in parts])
             # the same joint of several robots: a row has slopes by those of its own robot alone
             np.add.at(found.T, columns, J.T)
         return found
@@ -614,8 +703,25 @@ class CalibrationProblem(Tabled):
         array([[19, 19, 19],
                [ 0,  0,  0]])
         """
+        return np.asarray(self.data.configuration[self.owners])
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """Number of the row that every equation of `linearize` belongs to, (m,).
+
+        >>> import rpim_opt as ro
+        >>> ro.load("position").problem.owners[:4]
+        array([0, 0, 0, 1])
+        """
+        if self.touches is None:
+            return self._rows_of_equations
+        return self._rows_of_equations[self.touches.kept(self.touched)]
+
+    @cached_property
+    def _rows_of_equations(self) -> np.ndarray:
+        """Number of the row of every equation, with those that the touched points take (m,)."""
         rows = [np.repeat(block.row, len(block.measurement.components)) for block in self.data.blocks]
-        return np.asarray(self.data.configuration[np.concatenate(rows)])
+        return np.concatenate(rows)
 
     @cached_property
     def _whitening(self) -> list[Array]:
@@ -639,6 +745,13 @@ class CalibrationProblem(Tabled):
         >>> [V.shape for V in ro.load("paper_arm").problem.covariances()]
         [(1, 3, 3)]
         """
+        found = self._of_rows(reading)
+        if self.touches is None:
+            return found
+        return of_rows(self.touches, self.data, found, self.touched, reading)
+
+    def _of_rows(self, reading: bool) -> list[Array]:
+        """Return the covariances of the rows, each touch's by itself."""
         scatter = self.scatter
         if scatter is None:
             return [block.covariance * reading for block in self.data.blocks]
@@ -647,7 +760,7 @@ class CalibrationProblem(Tabled):
             slopes = self.joint_slopes(scatter.at)
         # each row as a configuration of its own
         alone = replace(self.data, configuration=np.arange(len(self.data)))
-        count = len(self.groups)
+        count = len(self._rows_of_equations)
         found = {}
         for stack in stacked(alone, slopes):
             place = np.full(count, -1)
@@ -678,7 +791,7 @@ class CalibrationProblem(Tabled):
             names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
         structure = Structure(
             robot.joint_types, names, p.identified.tobytes(), absent.tobytes(),
-            block.markers, block.fixture, self._loads(block), tuple(robot.model.terms),
+            block.markers, block.fixture, self._loads(block), tuple(robot.model.terms), len(self.arms) > 1,
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 
@@ -707,6 +820,20 @@ class CalibrationProblem(Tabled):
         y = block.y[part]
         joints = (block.q[part] @ robot.joint_map.T).reshape(len(y), -1)
         return np.hstack([joints, *columns(robot, block, part), y])
+
+
+def error_dimensions(block: Block) -> list[str]:
+    """Return what the components of a block's residual count as in errors: ``length``, ``angle``, ``stated``.
+
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.problem import error_dimensions
+    >>> error_dimensions(ro.load("paper_arm").problem.data.blocks[0])
+    ['length', 'length', 'length']
+    """
+    dimensions = list(block.measurement.components.values())
+    if block.point is not None and not block.measurement.touching:
+        return ["stated " + dimension for dimension in dimensions]
+    return dimensions
 
 
 def _cholesky(covariance: Array) -> Array:

@@ -66,7 +66,11 @@ class Stack:
     length, angle
         (N, k) which equations are lengths, and which angles.
     joint
-        (N, k, dof) slopes by the revolute joints' angles [SI]; (N, k, 0) where nobody asks.
+        (N, k, dof) slopes by the revolute joints' angles [SI]; (N, k, 0) where nobody asks. Where equations mix several
+        stops of the joints, dof columns a stop.
+    unit
+        (N, k, k) covariance of a unit scatter of every measured position where equations mix several; None where each
+        has its own, 1 on the diagonal for lengths.
     """
 
     index: np.ndarray
@@ -74,12 +78,17 @@ class Stack:
     length: np.ndarray
     angle: np.ndarray
     joint: Array
+    unit: Array | None = None
 
     def covariance(self, scatter: Scatter, reading: bool = True) -> Array:
         """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""
         k = self.index.shape[1]
-        own = scatter.position**2 * self.length + scatter.orientation**2 * self.angle
+        own = scatter.orientation**2 * self.angle
+        if self.unit is None:
+            own = scatter.position**2 * self.length + own
         found = own[:, :, None] * np.eye(k)
+        if self.unit is not None:
+            found += scatter.position**2 * self.unit
         if scatter.joint > 0:
             found += scatter.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
         if reading:

@@ -45,7 +45,9 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     if wrong:
         ax.plot(place[wrong] + 0.2, after[wrong], "v", color=MARK, label="distrusted")
     ax.set_yscale("log")
-    ax.set_ylim(bottom=max(0.5 * min(before.min(), after.min()), 1e-4))  # a row that a norm fits exactly is below
+    ax.set_ylim(
+        bottom=max(0.5 * min(np.nanmin(before), np.nanmin(after)), 1e-4)
+    )  # a row that a norm fits exactly is below
     ax.set_ylabel("error [mm]")
     if len(labels) <= 60:
         ax.set_xticks(place, labels, rotation=90, fontsize=7)

@@ -10,10 +10,12 @@ import numpy as np
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import table
 from rpim_opt.calibration.causes import likely_causes
+from rpim_opt.calibration.contact_words import contact_remarks
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import weight_lines
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import known_distance, known_parallel, known_square
 from rpim_opt.store.content import figures, sets
 
 KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
@@ -48,6 +50,9 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         turn = result.errors(data, "angle")
         if np.isfinite(turn).any():
             angles.append({"what": name, **statistics(turn, "mrad")})
+        stated = result.errors(data, "stated angle")
+        if np.isfinite(stated).any():
+            angles.append({"what": f"{name}, known angle", **statistics(stated, "mrad")})
     whole = figures(result)
     lacking = judged(result)
     return {
@@ -67,9 +72,14 @@ def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any
     errors = []
     several = len(_kinds(result.problem.data)) > 1
     for kind, rows in _kinds(data).items():
-        which = f"{name}, {kind}" if several else name
-        errors.append({"what": f"{which}, nominal", **statistics(result.nominal_errors(data)[rows])})
-        errors.append({"what": f"{which}, identified", **statistics(result.errors(data)[rows])})
+        which = f"{name}, {kind.replace('_', ' ')}" if several else name
+        if kind in (known_square.name, known_parallel.name):
+            continue
+        dimension = "length"
+        if kind == known_distance.name:
+            dimension = "stated length"
+        for when, of in (("nominal", result.nominal_errors), ("identified", result.errors)):
+            errors.append({"what": f"{which}, {when}", **statistics(of(data, dimension)[rows])})
     if name == "identification" and result.flagged:
         distrusted = {flag.label for flag in result.flagged}
         trusted = result.errors(data)[[label not in distrusted for label in data.label]]
@@ -80,7 +90,13 @@ def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any
 def _remarks(result: Calibration) -> list[str]:
     model = result.program.model
     count = f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see."
-    remarks = [*weight_lines(result), count, *result.noise_sentence(), *result.remarks()]
+    remarks = [
+        *weight_lines(result),
+        count,
+        *contact_remarks(result.problem.sample()),
+        *result.noise_sentence(),
+        *result.remarks(),
+    ]
     remarks += likely_causes(result)
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     if fitted.any():

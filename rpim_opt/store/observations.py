@@ -11,6 +11,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import robodk_columns
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.reading import read_data
+from rpim_opt.store.known import with_stated
 from rpim_opt.store.problem_file import Observation, Stated
 
 ROLES = ("identification", "validation")
@@ -36,6 +37,7 @@ def read_tables(stated: Stated) -> Tables:
     sets = {role: _together([part for part in read if part.role == role]) for role in ROLES if files[role]}
     _require_labels(stated, sets)
     kept = {role: _kept(stated, data, files[role][0]) for role, data in sets.items()}
+    kept = {role: with_stated(data, stated.table, role, stated.path) for role, data in kept.items()}
     return Tables(kept["identification"], kept.get("validation"), files, _tools(stated, tcps))
 
 

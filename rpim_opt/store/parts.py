@@ -181,10 +181,11 @@ def _block_part(block: Block) -> dict[str, Any]:
         "approach": _optional(block.approach),
         "columns": {name: values.tolist() for name, values in block.columns.items()},
         "robot": block.robot,
+        "point": _optional(block.point),
     }
 
 
-def _optional(values: Array | None) -> Any:
+def _optional(values: Any) -> Any:
     return None if values is None else values.tolist()
 
 
@@ -215,6 +216,9 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
     approach = None
     if part.approach is not None:
         approach = _array(part.approach, f"{where}.approach", N, kind.points, -1)
+    point = None
+    if part.point is not None:
+        point = _points(part.point, f"{where}.point", N, kind.points)
     return Block(
         kind,
         q=_array(part.q, f"{where}.q", N, kind.points, -1),
@@ -228,7 +232,15 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         approach=approach,
         columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
         robot=part.robot,
+        point=point,
     )
+
+
+def _points(names: list[list[str]], where: str, N: int, points: int) -> np.ndarray:
+    """Return the names (N, points) of touched points."""
+    if len(names) != N or any(len(row) != points for row in names):
+        raise InputError(where, f"{len(names)} rows of names", f"{N} rows of {points}")
+    return np.array(names, dtype=object).reshape(N, points)
 
 
 def selection_part(selection: Selection | None) -> dict[str, Any] | None:

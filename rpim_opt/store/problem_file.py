@@ -88,6 +88,8 @@ class ProblemTable(Table):
     tolerance: dict[Name, Any] = Field(default_factory=dict)
     prior: PriorTable = PriorTable()
     constraints: Constraints = Constraints()
+    known_distance: list[dict[str, Any]] = Field(default_factory=list)
+    known_angle: list[dict[str, Any]] = Field(default_factory=list)
     base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
     tool: dict[str, Any] = Field(default_factory=dict)
     published: dict[str, dict[str, float]] = Field(default_factory=dict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.layouts import read_raw
 from rpim_opt.basics.tables import Columns
-from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position
+from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position, revisit
+from rpim_opt.data.naming import TOUCHED
 from rpim_opt.data.orientations import ORDERS
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.several import together
@@ -22,6 +25,8 @@ from rpim_opt.robot.library import read_arm
 from rpim_opt.store.drawing import find_source
 from rpim_opt.store.named import pick
 
+COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
+"""In the name of a column that holds a measured coordinate."""
 CLEARLY = 3.0
 """The right order of a quaternion leaves so many times less than the other one."""
 
@@ -179,8 +184,10 @@ def understand_of(
     kind = pose
     if measurement is not None:
         kind = pick(MEASUREMENTS, measurement, "measurement")
+    if measurement is None and _touching(paths, asked):
+        kind = revisit
     tables = _understood(paths, arm, kind, asked)
-    if measurement is None:
+    if measurement is None and kind is pose:
         kind = _kind(tables, paths)
         if kind is not pose:
             tables = _understood(paths, arm, kind, asked)
@@ -212,6 +219,26 @@ def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
         raise InputError("the header", f"no positions among {names}", accepted, paths[0])
     forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
     return pose if any(form <= stems for form in forms) else position
+
+
+def _touching(paths: Sequence[Path], asked: Asked) -> bool:
+    """Return whether a table says what was touched, and none has a measured coordinate."""
+    touched = False
+    for path in paths:
+        try:
+            raw = read_raw(path, asked.layout).columns
+        except InputError:  # whatever it is, the one who understands it says so
+            return False
+        if any(COORDINATE.search(name.lower()) for name in raw):
+            return False
+        touched = touched or _touched(raw)
+    return touched
+
+
+def _touched(raw: Columns) -> bool:
+    """Return whether a column ``point`` or ``plane`` names something twice: labels, which it may hold, are unique."""
+    cells = [column for name, column in raw.items() if name.strip().lower() in TOUCHED]
+    return any(len({str(cell) for cell in column}) < len(column) for column in cells)
 
 
 def _ordered(

@@ -24,7 +24,7 @@ from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.data.models import READY, Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.problem.frames import own_frames
 from rpim_opt.problem.identified import around
@@ -114,7 +114,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     stored = read_json(path)
     _require_format(stored, path)
     file = validate(File, stored, path)
-    known = {**MEASUREMENTS, **{m.name: m for m in measurements}}
+    known = {**READY, **{m.name: m for m in measurements}}
     try:
         result = _calibration(file, known, model or Model())
         _compare(file, result)

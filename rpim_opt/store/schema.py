@@ -78,6 +78,7 @@ class BlockPart(Part):
     approach: Cube | None = None
     columns: dict[str, Vector] = Field(default_factory=dict)
     robot: str = ""
+    point: list[list[str]] | None = None
 
 
 class DataPart(Part):

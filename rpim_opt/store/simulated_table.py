@@ -20,6 +20,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.problem_file import Stated
+from rpim_opt.store.touched_table import touched_table
 from rpim_opt.store.touching import touching_poses
 
 TORQUE = 20.0
@@ -50,6 +51,14 @@ class Shape:
         return cls(kind, markers, tuple(dict.fromkeys(nested)) or ("",))
 
 
+class PlaneTable(Table):
+    """A square of a plane that is touched, in the robot's base frame."""
+
+    at_mm: list[float]
+    normal: list[float]
+    size: Length
+
+
 class Simulation(Table):
     """The keys of ``[simulation]``."""
 
@@ -62,6 +71,10 @@ class Simulation(Table):
     blunder: Length = 0.0
     markers: dict[str, list[str]] = Field(default_factory=dict)
     torques: Literal["measured", "gravity"] = "measured"
+    points_mm: dict[str, list[float]] = Field(default_factory=dict)
+    validation_points_mm: dict[str, list[float]] = Field(default_factory=dict)
+    planes: dict[str, PlaneTable] = Field(default_factory=dict)
+    validation_planes: dict[str, PlaneTable] = Field(default_factory=dict)
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -167,6 +180,8 @@ def simulated_table(
         Whether measurements have noise and blunders.
     """
     kind = shape.kind
+    if kind.touching:
+        return touched_table(stated.robot, shape.markers, truth.parameters, truth.x, truth.plan, noise, rng, noisy), []
     count = len(random) // 2
     draft = Draft(stated.robot, shape, _rows(shape, count, rng))
     draft.name(count)

@@ -14,6 +14,7 @@ from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.writing import scratch_folder, write_text
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
+from rpim_opt.data.naming import TOUCHED
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.spelling import parse_units
 from rpim_opt.data.understanding import Asked
@@ -129,7 +130,7 @@ def new_problem(
     said = {
         "robot": toml(source.stated),
         "drawing": source.drawing,
-        "columns": "as you said" if measurement else f"guessed from the columns {', '.join(kind.columns)}",
+        "columns": "as you said" if measurement else _guessed(kind, columns),
         "data": Path(found.file).name,
         "count": str(len(rows)),
         "validation": apart,
@@ -141,6 +142,14 @@ def new_problem(
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     return Started(folder, counts, (*notes, *guessed), found)
+
+
+def _guessed(kind: Measurement, columns: Columns) -> str:
+    """Say what the kind of measurement was guessed from."""
+    if not kind.touching:
+        return f"guessed from the columns {', '.join(kind.columns)}"
+    column = next(name for name in TOUCHED if name in columns)
+    return f"guessed: rows with the same {column} touched it, and nothing else is measured"
 
 
 def _require_new(folder: Path, validation: str | Path | None, hold_out: float | None) -> None:

@@ -64,11 +64,21 @@ angle_mrad = 10.0
 {base}
 # The reflector in the flange frame: {known}.
 {tools}
-
+{known_of}
 # Rows to leave out, label = reason:
 # [exclude]
 # {label} = "the reflector was bumped"
 """
+
+KNOWN_OF = """
+# What a drawing or a certificate knows of the points that were touched: without a distance, contact does not tell how
+# large the robot is. Of planes also [[known_angle]] with deg = 0 (parallel) or 90 (square) and sigma_mrad.
+# [[known_distance]]
+# between = ["A", "B"]
+# distance_mm = 300.0
+# sigma_mm = 0.01
+"""
+"""What the text says where points were touched."""
 
 
 def problem_text(
@@ -91,6 +101,7 @@ def problem_text(
         known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
         tools="\n".join(_tool_tables(markers, arm.tool)),
         label=_key(rows.label[0]),
+        known_of=KNOWN_OF * kind.touching,
     )
     return text, [how]
 

@@ -1,0 +1,290 @@
+"""What is known of points and planes that were touched: which rows touched one, and what a drawing says of two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import Measurement, known_distance, known_parallel, known_square, revisit, revisit_plane
+
+
+class Known(Protocol):
+    """What a drawing or a certificate states of two touched things: a value [m or rad] and its standard deviation."""
+
+    @property
+    def between(self) -> tuple[str, str]:
+        """The names of the two."""
+        ...
+
+    @property
+    def measurement(self) -> Measurement:
+        """The model of its row."""
+        ...
+
+    @property
+    def value(self) -> float:
+        """What it is."""
+        ...
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation."""
+        ...
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """A distance between two touched points, or two touched planes that are parallel.
+
+    Parameters
+    ----------
+    between
+        The names of the two.
+    value
+        What it is [m].
+    sigma
+        Its standard deviation [m].
+
+    Raises
+    ------
+    InputError
+        For lengths that are not greater than zero, and twice the same name.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.data.KnownDistance(("left", "right"), 0.3, 5e-6).measurement.name
+    'known_distance'
+    """
+
+    between: tuple[str, str]
+    value: float
+    sigma: float
+
+    def __post_init__(self) -> None:
+        if not self.value > 0:
+            raise InputError("known distance", f"{self.value:g} m", "a length greater than zero")
+        _require_sound(self)
+
+    @property
+    def measurement(self) -> Measurement:
+        """The model of its row."""
+        return known_distance
+
+
+@dataclass(frozen=True)
+class KnownAngle:
+    """Two touched planes that are parallel, or at right angles.
+
+    Parameters
+    ----------
+    between
+        The names of the two.
+    parallel
+        Whether they are parallel; at right angles otherwise.
+    sigma
+        Standard deviation of the angle [rad].
+
+    Raises
+    ------
+    InputError
+        For a deviation that is not greater than zero, and twice the same name.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5).measurement.name
+    'known_square'
+    """
+
+    between: tuple[str, str]
+    parallel: bool
+    sigma: float
+
+    def __post_init__(self) -> None:
+        _require_sound(self)
+
+    @property
+    def value(self) -> float:
+        """By how much the angle differs from that: not at all."""
+        return 0.0
+
+    @property
+    def measurement(self) -> Measurement:
+        """The model of its row."""
+        if self.parallel:
+            return known_parallel
+        return known_square
+
+
+def _require_sound(known: Known) -> None:
+    where = known.measurement.name.replace("_", " ")
+    if not known.sigma > 0:
+        raise InputError(where, f"sigma {known.sigma:g}", "a standard deviation greater than zero")
+    if known.between[0] == known.between[1]:
+        raise InputError(where, f"'{known.between[0]}' twice", "two names")
+
+
+def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
+    """Return measurements with rows that state what is known of touched points and planes.
+
+    Points that a distance joins belong together from then on: cross-validation leaves out all of them or none.
+
+    Parameters
+    ----------
+    data
+        With rows that touch them.
+    known
+        Distances and angles.
+
+    Raises
+    ------
+    InputError
+        For a name that no row touches, and for points where planes are wanted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> q = np.linspace(0, 1, 24).reshape(4, 6)
+    >>> data = ro.data.touches(q, ["A", "A", "B", "B"], sigma=1e-4)
+    >>> whole = ro.data.with_known(data, [ro.data.KnownDistance(("A", "B"), 0.3, 5e-6)])
+    >>> whole.label, whole.configuration.tolist()
+    (('1', '2', '3', '4', 'A to B'), [0, 0, 0, 0, 0])
+    """
+    if not known:
+        return data
+    touched = _first_touches(data)
+    for each in known:
+        _require_touched(each, touched)
+    blocks = [_stating(each, touched, len(data) + i) for i, each in enumerate(known)]
+    label = (*data.label, *_labels(known))
+    alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
+    configuration = np.concatenate([data.configuration, alone])
+    return by_points(Dataset((*data.blocks, *blocks), label, configuration))
+
+
+def _labels(known: Sequence[Known]) -> list[str]:
+    """Return what the rows are called, ``A to B``; planes may have both an angle and a distance."""
+    labels: list[str] = []
+    for each in known:
+        label = " to ".join(each.between)
+        if label in labels:
+            label = f"{label}, {each.measurement.name.removeprefix('known_')}"
+        labels.append(label)
+    return labels
+
+
+def _require_touched(known: Known, touched: Mapping[str, Block]) -> None:
+    where = known.measurement.name.replace("_", " ")
+    for name in known.between:
+        if name not in touched:
+            raise InputError(where, f"'{name}'", choices(name, touched))
+    planar = {touched[name].measurement.planar for name in known.between}
+    if len(planar) > 1 or (known.measurement is not known_distance and planar == {False}):
+        accepted = "two planes, or for a distance two points"
+        raise InputError(where, f"between '{known.between[0]}' and '{known.between[1]}'", accepted)
+
+
+def _first_touches(data: Dataset) -> dict[str, Block]:
+    """Return the first touch of every point, a block of one row."""
+    found: dict[str, Block] = {}
+    for block in data.blocks:
+        if block.point is not None and block.measurement.touching:
+            _, first = np.unique(block.point[:, 0].astype(str), return_index=True)
+            for i in first:
+                found.setdefault(str(block.point[i, 0]), block.take(np.array([i]), np.array([0])))
+    return found
+
+
+def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
+    """Return the row that states a distance; its joint values are those of a touch of either point."""
+    first, second = (touched[name] for name in known.between)
+
+    def both(one: Array | None, other: Array | None) -> Array | None:
+        if one is None or other is None:
+            return None
+        return np.concatenate([one, other], axis=1)
+
+    return Block(
+        known.measurement,
+        q=np.concatenate([first.q, second.q], axis=1),
+        y=np.array([[known.value]]),
+        covariance=known.sigma**2 * np.eye(len(known.measurement.components))[None],
+        row=np.array([row]),
+        markers=(*first.markers, *second.markers),
+        torque=both(first.torque, second.torque),
+        payload=first.payload,
+        approach=both(first.approach, second.approach),
+        point=np.array([known.between], dtype=object),
+    )
+
+
+def touches(
+    q: Array, point: Sequence[str], sigma: float | Array, label: tuple[str, ...] = (), planes: bool = False
+) -> Dataset:
+    """Return touches of points, or of planes, that nobody measured.
+
+    Parameters
+    ----------
+    q
+        (N, dof) joint values of the controller at every touch [rad or m].
+    point
+        N names: rows with the same one touched the same point.
+    sigma
+        Standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
+    label
+        N row labels; numbers from 1 by default.
+    planes
+        Whether planes were touched.
+
+    Raises
+    ------
+    InputError
+        As for `Dataset.of`, and for another number of names than of rows.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> data = ro.data.touches(np.linspace(0, 1, 24).reshape(4, 6), ["A", "B", "A", "B"], sigma=1e-4)
+    >>> data.configuration.tolist()
+    [0, 1, 0, 1]
+    """
+    kind = revisit
+    if planes:
+        kind = revisit_plane
+    data = Dataset.of(q, np.empty((len(q), 0)), sigma, label, kind)
+    if len(point) != len(data):
+        raise InputError("point", f"{len(point)} names", f"{len(data)}, one a touch")
+    names = np.array([str(name) for name in point], dtype=object)[:, None]
+    return by_points(replace(data, blocks=(replace(data.blocks[0], point=names),)))
+
+
+def by_points(data: Dataset) -> Dataset:
+    """Return measurements in which rows that one unknown point ties together have one number of configuration.
+
+    Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
+    configuration: a fold of a cross-validation has all of them or none.
+    """
+    group: dict[Any, Any] = {}
+
+    def root(of: Any) -> Any:
+        while group.setdefault(of, of) != of:
+            of = group[of]
+        return of
+
+    for block in data.blocks:
+        if block.point is not None:
+            for row, names in zip(block.row, block.point, strict=True):
+                for name in names:
+                    group[root(("point", name))] = root(("rows", data.configuration[row]))
+    joined = [root(("rows", number)) for number in data.configuration]
+    number = {each: i for i, each in enumerate(dict.fromkeys(joined))}
+    return replace(data, configuration=np.array([number[each] for each in joined], dtype=int))

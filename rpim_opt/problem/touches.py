@@ -1,0 +1,416 @@
+"""All that was touched and nobody measured: what is left of a problem's equations without it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.problem.scatter import Stack
+from rpim_opt.problem.touched import Moved, Plane, Point
+
+AXES = np.arange(3)
+CLOSE = 0.05
+"""Touches that spread by less [m] do not show how large a robot is, whatever else is known."""
+ROUNDING = 1e-12
+"""Relative size of a covariance that is none."""
+Things = Sequence[Point | Plane]
+
+
+class Tie(NamedTuple):
+    """What a drawing knows of two touched things: its equations (e,), of which kind, its value, and which two."""
+
+    equations: np.ndarray
+    kind: str
+    value: float
+    ends: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Touches:
+    """Which equations touch which point or plane, and how these are eliminated.
+
+    Touches at p_i have the equations c - p_i ~ 0 with a point c that nobody wants, or n'(p_i - c) ~ 0 with a plane.
+    Their best values follow from the touches (`touched.Point`, `touched.Plane`), and what the equations say of the
+    robot alone are contrasts, which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two
+    of them is an equation of these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin
+    n_1'n_2 for square ones, n_2 along two directions in the first for parallel ones.
+
+    Parameters
+    ----------
+    rows
+        (K, 3) numbers of the equations of the touches of every thing.
+    planar
+        Which of them are planes.
+    ties
+        What is known of two of them.
+    equations
+        How many equations there are before points and planes are eliminated.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.touches import Touches
+    >>> data = ro.data.touches(np.zeros((5, 6)), ["A", "A", "A", "B", "B"], sigma=1e-4)
+    >>> found = Touches.of(data)
+    >>> where = found.located(np.zeros(15))
+    >>> found.equations, found.contrasts(np.eye(15), where).shape  # without two points
+    (15, (9, 15))
+    """
+
+    rows: tuple[np.ndarray, ...]
+    planar: tuple[bool, ...]
+    ties: tuple[Tie, ...]
+    equations: int
+
+    @classmethod
+    def of(cls, data: Dataset) -> Touches | None:
+        """Return the touches of a dataset; None where there are none."""
+        at: dict[str, list[int]] = {}
+        planar: dict[str, bool] = {}
+        stated: list[tuple[np.ndarray, Block, int, tuple[str, str]]] = []
+        start = 0
+        for block in data.blocks:
+            each = len(block.measurement.components)
+            first = start + each * np.arange(len(block.row))
+            start += each * len(block.row)
+            if block.point is None:
+                continue
+            if not block.measurement.touching:
+                for i, (one, other) in enumerate(block.point):
+                    stated.append((first[i] + np.arange(each), block, i, (one, other)))
+                continue
+            for equation, name in zip(first, block.point[:, 0], strict=True):
+                at.setdefault(name, []).append(int(equation))
+                planar[name] = block.measurement.planar
+        if not at:
+            return None
+        number = {name: i for i, name in enumerate(at)}
+        ties = tuple(
+            Tie(equations, block.measurement.name, float(block.y[i, 0]), (number[one], number[other]))
+            for equations, block, i, (one, other) in stated
+            if one in number and other in number
+        )
+        rows = tuple(np.array(first)[:, None] + AXES for first in at.values())
+        return cls(rows, tuple(planar.values()), ties, start)
+
+    def located(self, residual: Array) -> Things:
+        """Return where points and planes are, of a residual (m,) that is -p_i for touches."""
+        kinds = {False: Point, True: Plane}
+        return [kinds[flat].of(-residual[index]) for index, flat in zip(self.rows, self.planar, strict=True)]
+
+    def size(self, residual: Array) -> float:
+        """Return how far all touches spread (RMS distance from their mean) [m], of a residual as `located` has it."""
+        p = -residual[np.concatenate(self.rows)]
+        return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+
+    def centred(self, residual: Array, jacobian: Array | None = None, size: float = 0.0) -> tuple[Array, Array | None]:
+        """Return residual (m,) and Jacobian (m, n) with every point and plane where its touches put it.
+
+        A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
+        units of how far they spread, times the nominal robot's: how large the robot is they do not say.
+
+        Parameters
+        ----------
+        residual
+            (m,) with -p_i for touches.
+        jacobian
+            (m, n) of the modelled values, or None.
+        size
+            How far the nominal robot's touches spread; those that spread by less than `CLOSE` count as they are.
+        """
+        where = self.located(residual)
+        spread = self.size(residual)
+        unit = 1.0
+        if size > CLOSE:
+            unit = size / spread
+        left = residual.copy()
+        for thing, index in zip(where, self.rows, strict=True):
+            centre = np.broadcast_to(thing.centre, index.shape)
+            left[index] = unit * thing.seen((residual[index] + centre)[:, :, None])[:, :, 0]
+        for tie in self.ties:
+            left[tie.equations] = _off(tie, where)
+        if jacobian is None:
+            return left, None
+        slopes = jacobian.copy()
+        for thing, index in zip(where, self.rows, strict=True):
+            slopes[index] = unit * thing.without(thing.seen(jacobian[index]))
+        if size > CLOSE:
+            every = np.concatenate(self.rows)
+            away = -residual[every] - np.mean(-residual[every], axis=0)
+            growth = np.einsum("ki,kin->n", away, jacobian[every]) / len(every) / spread**2
+            slopes[every] += left[every][:, :, None] * growth
+        for tie in self.ties:
+            slopes[tie.equations] = self._through(tie, where, jacobian)
+        return left, slopes
+
+    def _through(self, tie: Tie, where: Things, values: Array) -> Array:
+        """Return how what a tie compares changes (e, c) where positions move by values (m, c)."""
+        ends = [where[end].moved(values[self.rows[end]]) for end in tie.ends]
+        return _compared(tie, where, ends)
+
+    @cached_property
+    def alone(self) -> np.ndarray:
+        """The equations of points that were touched once: they are met whatever the robot."""
+        single = [index.ravel() for index in self.rows if len(index) == 1]
+        return np.concatenate([np.empty(0, dtype=int), *single])
+
+    def kept(self, where: Things) -> np.ndarray:
+        """Return which of the equations' places contrasts have (m,)."""
+        found = np.ones(self.equations, dtype=bool)
+        for thing, index in zip(where, self.rows, strict=True):
+            found[index] = thing.kept
+        return found
+
+    def contrasts(self, values: Array, where: Things) -> Array:
+        """Return what m equations' values (m, c) say without points and planes, (k, c).
+
+        Parameters
+        ----------
+        values
+            As `centred` returns them.
+        where
+            Any places near enough: what is perpendicular to a plane hardly depends on them.
+        """
+        found = values.copy()
+        for thing, index in zip(where, self.rows, strict=True):
+            found[index] = thing.contrasts(values[index])
+        return found[self.kept(where)]
+
+    def noise(self, where: Things) -> Array:
+        """Return by which noise of the m equations that of the contrasts is made, (k, m).
+
+        What a drawing states has the noise of the touches of its two things beside that of its own statement.
+        """
+        eye = np.eye(self.equations)
+        through = eye.copy()
+        for thing, index in zip(where, self.rows, strict=True):
+            through[index] = thing.seen(eye[index])
+        for tie in self.ties:
+            through[tie.equations] += self._through(tie, where, eye)
+        return self.contrasts(through, where)
+
+    def within(self, index: np.ndarray, things: Sequence[int], ties: Sequence[int]) -> Touches:
+        """Return the touches among some equations, counted from the first of these."""
+        place = np.full(self.equations, -1)
+        place[index] = np.arange(len(index))
+        number = {thing: i for i, thing in enumerate(things)}
+        inside = tuple(
+            tie._replace(equations=place[tie.equations], ends=(number[tie.ends[0]], number[tie.ends[1]]))
+            for tie in (self.ties[i] for i in ties)
+        )
+        rows = tuple(place[self.rows[i]] for i in things)
+        return Touches(rows, tuple(self.planar[i] for i in things), inside, len(index))
+
+
+def _off(tie: Tie, where: Things) -> Array:
+    """Return by how much what a drawing states differs from where things are (e,)."""
+    first, second = (where[end] for end in tie.ends)
+    if tie.kind == "known_square":
+        return -np.arcsin(np.clip(first.normal @ second.normal, -1, 1))[None]
+    if tie.kind == "known_parallel":
+        return -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
+    return np.array([tie.value - _distance(first, second)])
+
+
+def _distance(first: Point | Plane, second: Point | Plane) -> float:
+    apart = second.centre - first.centre
+    if isinstance(first, Plane):
+        return abs(float(first.normal @ apart))
+    return float(np.linalg.norm(apart))
+
+
+def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
+    """Return how what a tie compares changes (e, c) where its two things move."""
+    first, second = (where[end] for end in tie.ends)
+    one, other = moved
+    if tie.kind == "known_square":
+        cosine = first.normal @ second.normal
+        turned = second.normal @ one.normal + first.normal @ other.normal
+        return turned[None] / np.sqrt(max(1 - cosine**2, 1e-12))
+    if tie.kind == "known_parallel":
+        same = np.copysign(1.0, first.normal @ second.normal)
+        return first.across @ (same * other.normal - one.normal)
+    apart = second.centre - first.centre
+    if isinstance(first, Plane):
+        along = first.normal @ (other.centre - one.centre) + apart @ one.normal
+        return along[None] * np.copysign(1.0, first.normal @ apart)
+    u = apart / max(float(np.linalg.norm(apart)), 1e-300)
+    return (u @ (other.centre - one.centre))[None]
+
+
+def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
+    """Return what divides the contrasts' noise, of what divides that of the equations.
+
+    Parameters
+    ----------
+    touches
+        Which equations touch what.
+    stacks
+        Of the equations; everything that ties join in one configuration.
+    where
+        Where points and planes are.
+    stop
+        (m,) number of the joint values at which every equation was measured: joints stop anew at every touch.
+    """
+    place = np.cumsum(touches.kept(where)) - 1
+    group = np.full(touches.equations, -1)
+    count = 0
+    for stack in stacks:
+        group[stack.index] = count + np.arange(len(stack.index))[:, None]
+        count += len(stack.index)
+    things: list[list[int]] = [[] for _ in range(count)]
+    ties: list[list[int]] = [[] for _ in range(count)]
+    for i, index in enumerate(touches.rows):
+        things[group[index[0, 0]]].append(i)
+    for i, tie in enumerate(touches.ties):
+        ties[group[tie.equations[0]]].append(i)
+    found: dict[tuple[int, int], list[Stack]] = {}
+    for lone in (lone for stack in stacks for lone in _singly(stack)):
+        index = lone.index[0]
+        number = group[index[0]]
+        part = touches.within(index, things[number], ties[number])
+        there = [where[i] for i in things[number]]
+        made = _stack(part, lone, there, stop[index])
+        made = replace(made, index=place[index[part.kept(there)]][None])
+        for each in _apart(made):
+            found.setdefault((each.index.shape[1], each.joint.shape[2]), []).append(each)
+    return [_together(same) for (size, _), same in found.items() if size]
+
+
+def _stack(touches: Touches, one: Stack, where: Things, stop: np.ndarray) -> Stack:
+    """Return one configuration's contrasts with what divides their noise; ``index`` is left as it is."""
+    m = touches.equations
+    W = touches.noise(where)
+    own = np.ones(m, dtype=bool)
+    for tie in touches.ties:
+        own[tie.equations] = False  # its touches scatter, and not what is stated
+    length = one.length[0] & own
+    stops = np.unique(stop, return_inverse=True)[1]
+    spread = np.zeros((m, stops.max(initial=0) + 1, one.joint.shape[2]))
+    spread[np.arange(m), stops] = one.joint[0] * own[:, None]
+    joint = W @ spread.reshape(m, -1)
+    if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
+        joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
+    kept = touches.kept(where)
+    return Stack(
+        index=one.index,
+        instrument=(W @ one.instrument[0] @ W.T)[None],
+        length=(one.length & own)[:, kept],
+        angle=(one.angle & own)[:, kept],
+        joint=joint[None],
+        unit=((W * length) @ W.T)[None],
+    )
+
+
+def _singly(stack: Stack) -> Iterator[Stack]:
+    """Yield a stack's configurations one by one."""
+    for i in range(len(stack.index)):
+        yield replace(
+            stack,
+            index=stack.index[i : i + 1],
+            instrument=stack.instrument[i : i + 1],
+            length=stack.length[i : i + 1],
+            angle=stack.angle[i : i + 1],
+            joint=stack.joint[i : i + 1],
+        )
+
+
+def _apart(stack: Stack) -> Iterator[Stack]:
+    """Yield a configuration's equations in parts whose noise is independent of each other's."""
+    k = stack.index.shape[1]
+    if stack.joint.shape[2] or stack.unit is None:
+        yield stack
+        return
+    V = stack.instrument[0]
+    U = stack.unit[0]
+    related = (np.abs(V) > ROUNDING * np.abs(V).max(initial=0.0)) | (np.abs(U) > ROUNDING)
+    number = connected_components(related | np.eye(k, dtype=bool))[1]
+    for part in (np.flatnonzero(number == i) for i in range(number.max(initial=-1) + 1)):
+        yield Stack(
+            index=stack.index[:, part],
+            instrument=V[np.ix_(part, part)][None],
+            length=stack.length[:, part],
+            angle=stack.angle[:, part],
+            joint=np.zeros((1, len(part), 0)),
+            unit=U[np.ix_(part, part)][None],
+        )
+
+
+def _together(stacks: Sequence[Stack]) -> Stack:
+    """Return configurations of one size as one stack."""
+    names = ("index", "instrument", "length", "angle", "joint", "unit")
+    return Stack(**{name: np.concatenate([getattr(each, name) for each in stacks]) for name in names})
+
+
+def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
+    """Return the covariance of every row's residual, of those of the rows by themselves, block by block.
+
+    Parameters
+    ----------
+    touches, data
+        Which equations touch what, and the measurements.
+    each
+        (N, k, k) or (1, k, k) of the rows of every block [SI].
+    where
+        Where points and planes are.
+    reading
+        Whether they have the instrument's part: what a drawing states counts as that.
+    """
+    found = []
+    first = []
+    touch = np.zeros((touches.equations, 3, 3))
+    start = 0
+    for block, V in zip(data.blocks, each, strict=True):
+        k = len(block.measurement.components)
+        first.append(start + k * np.arange(len(block.row)))
+        found.append(np.broadcast_to(V, (len(block.row), k, k)).copy())
+        if block.measurement.touching:
+            touch[first[-1]] = found[-1]
+        start += k * len(block.row)
+    left = touch.copy()
+    for thing, index in zip(where, touches.rows, strict=True):
+        left[index[:, 0]] = _left(thing, touch[index[:, 0]])
+    through = {tie.equations[0]: _of_tie(touches, tie, where, touch) for tie in touches.ties}
+    for block, V, numbers in zip(data.blocks, found, first, strict=True):
+        if block.measurement.touching:
+            V[:] = left[numbers]
+        for i, equation in enumerate(numbers):
+            if equation in through:
+                V[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + through[equation]
+    return found
+
+
+def _left(thing: Point | Plane, V: Array) -> Array:
+    """Return the covariances (K, 3, 3) of what touches are off the thing that they put in its place, of their own."""
+    K = len(V)
+    if K == 1:
+        return V
+    values = np.zeros((K, 3, K, 3))
+    values[np.arange(K), :, np.arange(K)] = np.eye(3)
+    through = thing.without(thing.seen(values.reshape(K, 3, 3 * K))).reshape(K, 3, K, 3)
+    found = np.einsum("aibj,bjk,albk->ail", through, V, through)
+    own = np.einsum("kii->ki", found)
+    # directions that a touch does not show have no error: any positive variance serves
+    own += np.where(own > 0, 0.0, V.max())
+    return found
+
+
+def _of_tie(touches: Touches, tie: Tie, where: Things, touch: Array) -> Array:
+    """Return what the touches' noise adds to the covariance (e, e) of what a drawing states."""
+    found = np.zeros((len(tie.equations), len(tie.equations)))
+    for end in tie.ends:
+        index = touches.rows[end]
+        K = len(index)
+        still = [Moved(np.zeros((3, 3 * K)), np.zeros((3, 3 * K)))] * 2
+        still[tie.ends.index(end)] = where[end].moved(np.eye(3 * K).reshape(K, 3, 3 * K))
+        each = _compared(tie, where, still).reshape(-1, K, 3)
+        found += np.einsum("aki,kij,bkj->ab", each, touch[index[:, 0]], each)
+    return found
