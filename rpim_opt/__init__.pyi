@@ -12,6 +12,7 @@ from .basics import InputError as InputError
 from .basics import NoSolutionFound as NoSolutionFound
 from .calibration import baselines as baselines
 from .calibration import calibrate as calibrate
+from .calibration import influence as influence
 from .convex import Formulation as Formulation
 from .convex import bounded as bounded
 from .convex import constraints as constraints
@@ -54,3 +55,5 @@ from .store import load_result as load_result
 from .study import compare as compare
 from .use import read_measurements as read_measurements
 from .use import read_targets as read_targets
+
+__version__: str

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rpim_opt import __version__
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
 from rpim_opt.show.console import arriving, fail, left_out_line, progress, show, written_line, written_to
 from rpim_opt.show.options import carried, corrected_files, require_positive, tool_frame
@@ -32,9 +33,7 @@ ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 def _version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version
-
-        typer.echo(f"rpim-opt {version('rpim-opt')}")
+        typer.echo(f"rpim-opt {__version__}")
         raise typer.Exit
 
 

@@ -1,8 +1,10 @@
-"""Measure the time of calibrations against SciPy and the peers, and time and memory over the number of measurements.
+"""Measure the time of calibrations: against SciPy and the peers, with every rule, over the number of measurements.
 
-Simulated: the benchmark arm of the study `peers` (52 configurations, 27 parameters), and random configurations of the
-same arm with base and reflector (33 parameters) as Parquet tables of 50,000 rows. Times are medians in a warm process,
-of its own where memory is measured; the machines are shared, so that only ratios within a run count.
+And what else a user waits for: a command's start, a bootstrap, influence, reports, models with many parameters.
+
+Simulated: the first arm of the study `peers` (52 configurations, 35 parameters), and random configurations of the
+paper's arm with base and reflector (33 parameters) as Parquet tables of 50,000 rows. Times are medians in a warm
+process, of its own where memory is measured; the machines are shared, so that only ratios within a run count.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.basics.phases import clock
 from rpim_opt.basics.text import markdown
+from rpim_opt.basics.threads import cores
 from rpim_opt.convex import conic
+from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
 from rpim_opt.problem.problem import CalibrationProblem
@@ -32,15 +36,12 @@ from rpim_opt.problem.triangles import ROWS, reduced
 from rpim_opt.study.grid import find_study, load_study
 from rpim_opt.study.report import Metric, Report
 
-QUESTION = "How fast is a calibration, and what do a million configurations cost?"
+QUESTION = "How fast is a calibration with any formulation and rule, and what do a million configurations cost?"
 PART = 50_000
-PEERS = (
-    ("pybotics", "documented"),
-    ("pybotics", "xyz, trf"),
-    ("robotkinecal", "documented"),
-    ("figaroh", "structural"),
-    ("figaroh", "map_cv"),
-)
+HERE = Path(__file__).resolve().parent
+GRID = load_study(HERE / "benchmark_parts" / "grid.py", ("cells", "cell", "figure"))
+OTHERS = load_study(HERE / "benchmark_parts" / "others.py", ("processes", "bootstrap"))
+PEERS = ("pybotics", "robotkinecal", "figaroh")
 METRICS = {
     "over SciPy": Metric("lower", 1.0),
     "robotkinecal, documented over ours": Metric("higher", 0.5),
@@ -49,6 +50,11 @@ METRICS = {
     "bootstrap of 1000 [s]": Metric("lower", 4.0),
     "us per configuration and pass": Metric("lower", 4.0),
     "peak memory, largest over smallest": Metric("lower", 0.3),
+    "calibrate paper_arm over importing SciPy's optimizers": Metric("lower", 0.6),
+    "slowest cell at 40 [s]": Metric("lower", 3.0),
+    "influence over calibration": Metric("lower", 1.0),
+    "report of a robust result [s]": Metric("lower", 4.0),
+    "pass of many parameters over its QR": Metric("lower", 1.0),
 }
 
 
@@ -61,39 +67,69 @@ def cases(quick: bool) -> list[dict[str, Any]]:
     """Return the small problem, its bootstrap, the peers, and growing numbers of rows; run by one worker."""
     counts = (1_000, 10_000, 100_000) if quick else (1_000, 10_000, 100_000, 1_000_000)
     one: list[dict[str, Any]] = [{"part": "small"}, {"part": "bootstrap", "count": 50 if quick else 1000}]
-    one += [{"part": "peer", "tool": t, "method": m} for t, m in PEERS if not (quick and m == "map_cv")]
+    one += [{"part": "peer", "tool": tool, "count": int(quick)} for tool in PEERS]
     one += [{"part": "rows", "count": count} for count in counts]
-    return one if quick else [*one, {"part": "cluster", "count": 10_000_000}]
+    one += [{"part": "process", "count": 3 if quick else 9}, {"part": "influence", "count": 2_000 if quick else 20_000}]
+    one += [{"part": "report", "count": 400, "tool": "robust"}]
+    one += [{"part": "model", "count": count} for count in ((60, 210) if quick else (60, 210, 510, 990))]
+    one += GRID.cells(quick)
+    if quick:
+        return one
+    one += [{"part": "report", "count": n, "tool": "robust"} for n in (2_208, 20_000)]
+    return [*one, {"part": "report", "count": 20_000, "tool": "tikhonov"}, {"part": "cluster", "count": 10_000_000}]
 
 
 def run(part: str, count: int = 0, tool: str = "", method: str = "") -> dict[str, Any]:
     """Return the times of one part [s], or its memory [MB]."""
     if part == "peer":
-        found = load_study(find_study("peers")).run(tool, method, "clean52", 0)
-        return {"seconds": found["seconds"]}
+        found = load_study(find_study("peers")).run(tool, "clean52", 0, bool(count))
+        return {key: value for key, value in found.items() if key.endswith(": seconds")}
     if part in ("rows", "cluster"):
         command = [sys.executable, "-P", __file__, part, str(count)]  # -P: selectors.py here is not Python's
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(done.stderr)
         return json.loads(done.stdout.splitlines()[-1])
-    return _small() if part == "small" else _bootstrap(count)
+    works: dict[str, Callable[[], dict[str, Any]]] = {
+        "small": _small,
+        "bootstrap": lambda: OTHERS.bootstrap(_arm(bounds=True), count),
+        "process": lambda: {"processes": OTHERS.processes(count)},
+        "influence": lambda: OTHERS.influence(GRID.arm(count, 0.0)),
+        "report": lambda: OTHERS.report(GRID.arm(count), FORMULATIONS[tool]),
+        "model": lambda: OTHERS.large_model(count),
+        "cell": lambda: GRID.cell(tool, method, count),
+    }
+    return works[part]()
 
 
-def _arm(bounds: bool) -> tuple[CalibrationProblem, np.ndarray, np.ndarray]:
-    """Return the benchmark's problem, and its tables as SciPy gets them [mm, rad]."""
-    peers = load_study(find_study("peers"))
-    with tempfile.TemporaryDirectory() as folder:
-        peers.write_problem(Path(folder), "clean52", 0)
-        calib = np.loadtxt(Path(folder) / "calib.csv", delimiter=",", skiprows=1)
-    robot = ro.load("paper_arm").problem.robot
-    parameters = ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]})
-    parameters = parameters.scaled({"length_mm": 1, "angle_mrad": 1, "tool_mm": 1})
-    parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "tool_[xyz]"])
-    if bounds:
-        parameters = parameters.toleranced({"length_mm": 0.4, "angle_mrad": 1.0, "tool_mm": 0.5})
-    problem = CalibrationProblem(robot, parameters, ro.Dataset.of(calib[:, 3:], calib[:, :3], 5e-5))
-    return problem, calib[:, 3:], 1e3 * calib[:, :3]
+def _arm(bounds: bool) -> CalibrationProblem:
+    """Return the problem that the peers get."""
+    problem = ro.study.simulated_arm(0, 52, load_study(find_study("peers")).NOISE, 0.0, 0.0).problem
+    if not bounds:
+        return problem
+    tolerances = {"length_mm": 0.4, "angle_mrad": 1.0, "tool_mm": 0.5, "base_mm": 0.5, "base_mrad": 1.0}
+    return problem.with_parameters(problem.parameters.toleranced(tolerances))
+
+
+def _scipy(problem: CalibrationProblem) -> Callable[[], Any]:
+    """Return the same calibration by SciPy alone, on a vectorised forward model in mm and rad."""
+    from scipy.optimize import least_squares
+
+    scripts = find_study("peers").parent / "peer_scripts"
+    sys.path.insert(0, str(scripts))  # the script imports its neighbour
+    try:
+        positions = load_study(scripts / "run_scipy.py", ("positions",)).positions
+    finally:
+        sys.path.remove(str(scripts))
+    nominal = dict(zip(problem.parameters.names, problem.parameters.nominal, strict=True))
+    base = np.array([nominal[f"base_{key}"] for key in ("x", "y", "z", "rx", "ry", "rz")])
+    reflector = 1e3 * np.array([nominal[f"tool_{key}"] for key in "xyz"])
+    parallel = [int(name[4:]) - 1 for name in problem.parameters.free.names if name.startswith("beta")]
+    table = (problem.robot.mdh[:, :4] * [1, 1e3, 1, 1e3]).ravel()
+    x0 = np.concatenate([table, base * [1e3, 1e3, 1e3, 1, 1, 1], reflector, np.zeros(len(parallel))])
+    q = problem.data.q @ problem.robot.joint_map.T
+    p = 1e3 * problem.data.blocks[0].y
+    return lambda: least_squares(lambda x: (positions(x, q, parallel) - p).ravel(), x0, method="lm")
 
 
 def _median(work: Callable[[], Any], runs: int = 31) -> float:
@@ -108,27 +144,24 @@ def _median(work: Callable[[], Any], runs: int = 31) -> float:
 
 def _small() -> dict[str, Any]:
     """Return medians for 52 configurations, and the time of the phases."""
-    from scipy.optimize import least_squares
-
-    problem, q, p = _arm(bounds=False)
-    positions = load_study(find_study("peers").parent / "peer_scripts" / "run_scipy.py", ("positions",)).positions
-    rows = problem.robot.mdh[:, :4] * [1, 1e3, 1, 1e3]
-    x0 = np.append(rows, 1e3 * np.array([0.03, -0.02, 0.06]))
-    times = {
+    problem = _arm(bounds=False)
+    times: dict[str, float | None] = {
         "L-curve": _median(lambda: ro.calibrate(problem, ro.tikhonov, ro.l_curve)),
         "REML": _median(lambda: ro.calibrate(problem, ro.tikhonov, ro.reml)),
-        "SciPy": _median(lambda: least_squares(lambda x: (positions(x, q) - p).ravel(), x0, method="lm"), 11),
+        "SciPy": _median(_scipy(problem), 5),
     }
-    bounded, _, _ = _arm(bounds=True)
-    program = ro.convex.pose(ro.bounded, bounded.linearize(np.zeros(27)))
+    bounded = _arm(bounds=True)
+    n = len(bounded.parameters.free)
+    program = ro.convex.pose(ro.bounded, bounded.linearize(np.zeros(n)))
     s = program.model.svd[1]
     weights = np.geomspace(1e-4 * s[s > 0][-1] ** 2, 10 * s[0] ** 2, 200)
     inside = [float(np.abs(e.z).max()) for e in program.path(weights)]
     times["bounded path"] = _median(lambda: program.path(weights), 11)
     times["bounded"] = _median(lambda: ro.calibrate(bounded, ro.bounded, 1.0))
     times["robust"] = _median(lambda: ro.calibrate(problem, ro.robust, ro.reml), 5)
-    times["program once"] = _median(lambda: program.solve(1.0))
-    times["Clarabel once"] = _clarabel(program)
+    lasso = ro.convex.pose(ro.lasso, bounded.linearize(np.zeros(n)))  # a box has an active set, and needs no Clarabel
+    times["program once"] = _median(lambda: lasso.solve(10.0))
+    times["Clarabel once"] = _clarabel(lasso)
     with clock() as running:
         for _ in range(20):
             ro.calibrate(bounded, ro.bounded, 1.0)
@@ -136,8 +169,8 @@ def _small() -> dict[str, Any]:
     return {**times, "held": float(np.mean(np.array(inside) > 0.99)), "phases": phases}
 
 
-def _clarabel(program: Any) -> float:
-    """Return the median of the time that Clarabel says it took itself [s]."""
+def _clarabel(program: Any) -> float | None:
+    """Return the median of the time that Clarabel says it took itself [s]; None where it is not asked."""
     own, spent = conic.clarabel, []
 
     class Solver:
@@ -149,24 +182,15 @@ def _clarabel(program: Any) -> float:
             spent.append(solution.solve_time)
             return solution
 
-    conic.clarabel = SimpleNamespace(DefaultSolver=Solver, NonnegativeConeT=own.NonnegativeConeT)
+    conic.clarabel = SimpleNamespace(DefaultSolver=Solver, DefaultSettings=own.DefaultSettings)
     try:
         for _ in range(31):
-            program.solve(1.0)
+            program.solve(10.0)
     finally:
         conic.clarabel = own
+    if not spent:  # another method solves it
+        return None
     return float(np.median(spent))
-
-
-def _bootstrap(count: int) -> dict[str, Any]:
-    """Return the seconds of a bounded calibration's bootstrap: rows drawn with replacement."""
-    problem, _, _ = _arm(bounds=True)
-    rng, rows = np.random.default_rng(0), len(problem.data)
-    ro.calibrate(problem, ro.bounded, 1.0)
-    start = time.perf_counter()
-    for _ in range(count):
-        ro.calibrate(problem.on(problem.data.take(rng.integers(rows, size=rows))), ro.bounded, 1.0)
-    return {"seconds": time.perf_counter() - start}
 
 
 def _tables(folder: Path, count: int) -> tuple[PartitionedProblem, np.ndarray]:
@@ -265,14 +289,17 @@ def report(rows: list[dict[str, Any]]) -> Report:
     metrics = {"over SciPy": ours / small["SciPy"]}
     for row in rows:
         if row["part"] == "peer":
-            name = f"{row['tool']}, {row['method']}"
-            metrics[f"{name} over ours"] = row["seconds"] / ours
-            lines.append([name, f"{1e3 * row['seconds']:.0f}", f"{row['seconds'] / ours:.3g}"])
+            for key, seconds in row.items():
+                if key.endswith(": seconds"):
+                    name = f"{row['tool']}, {key.removesuffix(': seconds')}"
+                    metrics[f"{name} over ours"] = seconds / ours
+                    lines.append([name, f"{1e3 * seconds:.0f}", f"{seconds / ours:.3g}"])
     other = [
         ["bounded path over 200 weights", f"{1e3 * small['bounded path']:.1f} ms"],
         ["bounded calibration", f"{1e3 * small['bounded']:.2f} ms"],
         ["robust calibration with REML", f"{1e3 * small['robust']:.0f} ms"],
-        [f"{boot['count']} bootstrap replicates of the bounded calibration, serial", f"{boot['seconds']:.2f} s"],
+        [f"{boot['count']:,} bootstrap replicates of the bounded calibration, one process", f"{boot['seconds']:.2f} s"],
+        [f"{boot['count']:,} bootstrap replicates, two processes", f"{boot['two']:.2f} s"],
     ]
     metrics["bounded path [ms]"] = 1e3 * small["bounded path"]
     metrics["bootstrap of 1000 [s]"] = boot["seconds"] / boot["count"] * 1000
@@ -291,19 +318,93 @@ def report(rows: list[dict[str, Any]]) -> Report:
         [name, f"{1e6 * small['phases'][name]:.0f}", f"{last['phases'][name] / work:.2f}"] for name in last["phases"]
     ]
     text = TEXT.format(
-        times=markdown(["52 configurations, 27 parameters", "ms", "over ours"], lines),
+        times=markdown(["52 configurations, 35 parameters", "ms", "over ours"], lines),
         other=markdown(["also", "time"], other),
         rows=markdown(["configurations", "seconds", "passes", "us each and pass", "peak memory [MB]"], table),
         phases=markdown(["phase", "bounded, 52 configurations [us]", f"{last['count']:,} [us each and pass]"], phases),
         held=100 * small["held"],
         program=1e3 * small["program once"],
-        clarabel=1e3 * small["Clarabel once"],
+        clarabel=_ms_or_none(small["Clarabel once"]),
         qr=last["qr_us"],
         reduction=last["phases"]["reduction"] / work,
         copy=last["copy_us"],
         evaluation=last["phases"]["evaluation"] / work,
+        cores=cores(),
+        floor=(last["qr_us"] + last["copy_us"]) / cores(),
+        over=metrics["us per configuration and pass"] / ((last["qr_us"] + last["copy_us"]) / cores()),
+        waiting=_waiting(rows, metrics),
+        models=_models(rows, metrics),
+        **_cells(rows, metrics),
     )
-    return Report(text, metrics, {"rows": _figure(counted)})
+    grid = [row for row in rows if row["part"] == "cell"]
+    return Report(text, metrics, {"rows": _figure(counted), "grid": GRID.figure(grid)})
+
+
+def _ms_or_none(seconds: float | None) -> str:
+    if seconds is None:
+        return "nothing: it is not asked"
+    return f"{1e3 * seconds:.2f}"
+
+
+def _waiting(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
+    """Return what a user waits for besides: processes, influence, reports; each with what it is compared with."""
+    process = next(row for row in rows if row["part"] == "process")["processes"]
+    floor = process["import scipy.optimize"]
+    name = "calibrate paper_arm over importing SciPy's optimizers"
+    metrics[name] = process["rpim-opt calibrate paper_arm"] / floor
+    lines = [[name, f"{seconds:.3f}", f"{seconds / floor:.2g} times importing scipy.optimize"]
+             for name, seconds in process.items()]  # fmt: skip
+    for row in rows:
+        if row["part"] == "influence":
+            ratio = row["seconds"] / row["calibration"]
+            metrics["influence over calibration"] = ratio
+            lines.append([f"influence of {row['count']:,} rows", f"{row['seconds']:.3f}", f"{ratio:.2g} calibrations"])
+        if row["part"] == "report":
+            said = f"{row['mb']:.1f} MB; the calibration {row['calibration']:.2f} s"
+            lines.append([f"report, {row['tool']}, {row['count']:,} rows", f"{row['seconds']:.2f}", said])
+            if (row["tool"], row["count"]) == ("robust", 400):
+                metrics["report of a robust result [s]"] = row["seconds"]
+    return markdown(["waiting for", "seconds", "beside it"], lines)
+
+
+def _models(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
+    """Return how the cost of a pass grows with the parameters, beside LAPACK's QR of the same rows."""
+    lines = []
+    for row in rows:
+        if row["part"] == "model":
+            each = row["seconds"] / row["passes"]
+            metrics["pass of many parameters over its QR"] = each / row["qr"]
+            lines.append([str(row["parameters"]), f"{row['rows']:,}", f"{row['seconds']:.2f}", f"{1e3 * each:.0f}",
+                          f"{1e3 * row['qr']:.0f}", f"{each / row['qr']:.2g}"])  # fmt: skip
+    head = ["parameters", "rows", "seconds", "ms a pass", "LAPACK's QR [ms]", "over QR"]
+    return markdown(head, lines) + "\n\nAn arm with many reflectors, 20 rows each, Tikhonov at one weight."
+
+
+def _cells(rows: list[dict[str, Any]], metrics: dict[str, float]) -> dict[str, str]:
+    """Return the grid of formulations and rules by numbers of configurations, and a sentence on what is slow."""
+    grid = [row for row in rows if row["part"] == "cell" and row["seconds"] is not None]
+    metrics["slowest cell at 40 [s]"] = max(row["seconds"] for row in grid if row["count"] == 40)
+    tables = []
+    for count in sorted({row["count"] for row in grid}):
+        here = [row for row in grid if row["count"] == count]
+        rules = list(dict.fromkeys(row["method"] for row in here))
+        lines = []
+        for name in dict.fromkeys(row["tool"] for row in here):
+            of = {row["method"]: row for row in here if row["tool"] == name}
+            lines.append([name, *(_of_cell(of.get(rule)) for rule in rules)])
+        tables.append(markdown([f"{count:,} configurations [s] (times Tikhonov)", *rules], lines))
+    ended = [row for row in grid if row["ended"] != "converged"]
+    slow = [f"{row['tool']} with {row['method']} at {row['count']:,}: {row['ended']}" for row in ended]
+    far = "Every cell converged."
+    if slow:
+        far = "Not converged: " + "; ".join(slow) + "."
+    return {"cells": "\n\n".join(tables), "far": far}
+
+
+def _of_cell(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    return f"{row['seconds']:.3f} ({row['seconds'] / row['tikhonov']:.2g})"
 
 
 TEXT = """\
@@ -323,7 +424,16 @@ Positions, 33 parameters, read from Parquet in tables of 50,000 rows at every pa
 
 Floors: LAPACK's QR of the same rows takes {qr:.2f} us a configuration, where the reduction takes {reduction:.2f}; a
 copy of the whitened rows takes {copy:.2f} us, where their evaluation takes {evaluation:.2f}. `other` is the reading of
-the tables and Python. One bounded program takes {program:.2f} ms, of which Clarabel itself {clarabel:.2f}.
+the tables and Python. On {cores} cores the floor of a pass, copy and QR divided by them, is {floor:.2f} us, the pass
+{over:.2g} times that. One lasso takes {program:.2f} ms, of which Clarabel itself {clarabel}.
+
+{waiting}
+
+{models}
+
+{cells}
+
+{far}
 """
 
 

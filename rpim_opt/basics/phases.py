@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 PHASES = ("evaluation", "reduction", "canonicalization", "solve", "selection")
 _running: ContextVar[Clock | None] = ContextVar("clock", default=None)
@@ -30,6 +31,11 @@ class Clock:
         else:
             self._stack.append(phase)
 
+    @property
+    def busy(self) -> bool:
+        """Whether a phase runs."""
+        return bool(self._stack)
+
     def rows(self) -> list[tuple[str, float]]:
         """Return the seconds of every phase, and what is left of the time since the clock was made."""
         other = time.perf_counter() - self.started - sum(self.seconds.values())
@@ -45,6 +51,33 @@ def clock() -> Iterator[Clock]:
         yield running
     finally:
         _running.reset(token)
+
+
+@contextmanager
+def beside(workers: int) -> Iterator[Callable[[Callable[..., Any]], Callable[..., Any]]]:
+    """Count the phases of threads that work at once: ``with beside(2) as counted: threads.map(counted(work), ...)``.
+
+    A second in each of several threads is one second; what runs inside a phase of the caller's counts for that phase.
+    """
+    running = _running.get()
+    clocks: list[Clock] = []
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        if running is None or running.busy:
+            return function
+
+        def timed(*arguments: Any) -> Any:
+            with clock() as own:
+                clocks.append(own)
+                return function(*arguments)
+
+        return timed
+
+    yield counted
+    if running is not None:
+        for own in clocks:
+            for name, seconds in own.seconds.items():
+                running.seconds[name] += seconds / workers
 
 
 class phase:  # noqa: N801 - used like a function

@@ -1,18 +1,55 @@
-"""One thread for linear algebra: the matrices of a calibration are small, and threads that wait for each other cost."""
+"""Threads: one for linear algebra, whose matrices are small; all cores for blocks of rows, whose number is large."""
 
 from __future__ import annotations
 
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
+from rpim_opt.basics.phases import beside
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 _lock = threading.Lock()
 _inside = 0
 _limit: Any = None
+_worker = threading.local()
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+def cores() -> int:
+    """Return how many threads may work at once: the processor's cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> list[Answer]:
+    """Return the answers to items, in their order; as many are worked on at once as there are cores.
+
+    What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
+    thread of its own it works one by one.
+
+    >>> from rpim_opt.basics.threads import on_all_cores
+    >>> on_all_cores(lambda k: k**2, range(4))
+    [0, 1, 4, 9]
+    """
+    waiting = list(items)
+    workers = min(cores(), len(waiting))
+    if workers < 2 or getattr(_worker, "busy", False):
+        return [function(item) for item in waiting]
+    with beside(workers) as counted, ThreadPoolExecutor(workers, initializer=_begin) as threads:
+        return list(threads.map(counted(function), waiting))
+
+
+def _begin() -> None:
+    """Mark a thread as one of those that work at once: it starts no others."""
+    _worker.busy = True
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,8 @@ from . import baselines as baselines
 from .asking import calibrate as calibrate
 from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
+from .leaving_out import Influence as Influence
+from .leaving_out import influence as influence
 from .outcome import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import spatial
 
 SHUFFLES = 300
 LEAST = 8
@@ -70,6 +70,6 @@ def alike(q: Array, errors: Array, kinds: np.ndarray) -> Alike | None:
 def _nearest(points: Array) -> np.ndarray:
     """Return the number (N,) of every point's nearest other one."""
     number = np.arange(len(points))
-    near = np.asarray(KDTree(points).query(points, k=2)[1])
+    near = np.asarray(spatial.KDTree(points).query(points, k=2)[1])
     # of points at the same place either may come first
     return np.where(near[:, 0] == number, near[:, 1], near[:, 0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.formulation import Formulation
@@ -71,7 +71,7 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     limit = outlying(norms, count)
     error = problem.errors(x)
     error = 1e3 * np.where(np.isfinite(error), error, problem.errors(x, "stated length"))
-    noise = limit / np.sqrt(chi2.ppf(1 - RARE / len(norms), count))
+    noise = limit / np.sqrt(chdtri(count, RARE / len(norms)))
     labels = problem.labels
     worst = [i for i in np.argsort(-norms) if norms[i] > limit[i]]
     return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.alike import Alike, alike
@@ -176,6 +176,6 @@ def excess(again: Repeated, total: float, spare: float) -> float:
     if again.rms is None:
         return 0.0
     within = max(again.rms**2, 1e-24)
-    if total / within < fisher.isf(RARE, spare, again.freedom):
+    if total / within < fdtri(spare, again.freedom, 1 - RARE):
         return 0.0
     return float(np.sqrt(total - within))

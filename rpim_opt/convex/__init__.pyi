@@ -14,7 +14,6 @@ from .formulation import robust as robust
 from .formulation import sum_of_norms as sum_of_norms
 from .formulation import tikhonov as tikhonov
 from .given import Given as Given
-from .given import Unknown as Unknown
 from .given import given as given
 from .prior import Prior as Prior
 from .program import Estimate as Estimate
@@ -32,3 +31,4 @@ from .select_scores import quasi_optimality as quasi_optimality
 from .select_scores import reml as reml
 from .select_scores import robust_gcv as robust_gcv
 from .stated import Stated as Stated
+from .unknown import Unknown as Unknown

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.atoms import SQUARES, cp, named
 from rpim_opt.convex.constraints import Ready
 from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.stated import Stated
@@ -46,8 +46,6 @@ class _Believed:
 
     def __reduce__(self) -> Any:
         arguments = [getattr(self, each.name) for each in fields(self)]
-        if self.penalty in NAMED:  # functions of CVXPY do not all travel by themselves
-            arguments[0] = NAMED.index(self.penalty)
         return believed, tuple(arguments)
 
     def _own(self, y: Any) -> Any:
@@ -55,7 +53,7 @@ class _Believed:
         if self.groups is None:
             return penalty(y)
         differences = [np.array(D) for D in self.groups]
-        if penalty is cp.sum_squares:  # of norms: the sum of all squares, and no cone
+        if penalty == SQUARES:  # of norms: the sum of all squares, and no cone
             return cp.sum_squares(np.vstack(differences) @ y)
         return penalty(cp.hstack([cp.norm(D @ y) for D in differences]))
 
@@ -78,7 +76,7 @@ class _ReadyBelieved(_Believed, Ready):
 
     @cached_property
     def _quadratic(self) -> Quadratic | None:
-        if self.penalty not in (None, cp.sum_squares) or (self.penalty is None and not self.rows):
+        if self.penalty not in (None, SQUARES) or (self.penalty is None and not self.rows):
             return None
         n = len(self.centre)
         L = [np.zeros((0, n))]
@@ -107,11 +105,10 @@ def _reduced(L: Array, c: Array) -> Quadratic:
 
 
 def believed(
-    penalty: Callable[[Any], Any] | int | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
+    penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
 ) -> Callable[[Any], Any]:
-    """Return the penalty of a prior; ``penalty`` may be the place of one that has a name."""
-    if isinstance(penalty, int):
-        penalty = NAMED[penalty]
+    """Return the penalty of a prior."""
+    penalty = named(penalty)
     parts: list[Any] = [penalty, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), None]
     if groups is not None:
         parts[-1] = tuple(tuple(map(tuple, D)) for D in groups)

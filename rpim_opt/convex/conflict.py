@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.error import SolverError
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import Conflict
+from rpim_opt.convex.asked import norms
+from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.constraints import Box, spoken
 from rpim_opt.convex.drawn import Drawn
-from rpim_opt.convex.posed import Posed, norms
+from rpim_opt.convex.posed import Posed
 from rpim_opt.problem.linear import LinearModel
 
 FAR = 1e6
@@ -55,7 +55,7 @@ def _possible(demands: Sequence[Stated]) -> bool:
         warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
         try:
             problem.solve(solver=cp.CLARABEL)
-        except SolverError:
+        except cp.SolverError:
             return True
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
@@ -173,7 +173,7 @@ def _least_sum(slack: cp.Variable, demands: list[Any]) -> Array:
         warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
         try:
             problem.solve(solver=cp.CLARABEL)
-        except SolverError:
+        except cp.SolverError:
             return np.zeros(slack.size)
     if slack.value is None:
         return np.zeros(slack.size)

@@ -9,16 +9,15 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
-import clarabel as clarabel_module
-import cvxpy as cp
 import numpy as np
-from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
-from scipy import sparse
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late, sparse
 from rpim_opt.basics.phases import phase
+from rpim_opt.convex.atoms import INFEASIBLE, INFEASIBLE_INACCURATE, OPTIMAL, UNBOUNDED, cp
 
-clarabel: Any = clarabel_module  # a compiled module, without types
+clarabel: Any = Late("clarabel")  # a compiled module, without types
+conif: Any = Late("cvxpy.reductions.solvers.conic_solvers.clarabel_conif")
 SOUGHT, ACCEPTED = 1e-12, 1e-8
 """Tolerances of gap and feasibility, relative or absolute: the solver goes on to the first while it makes progress, and
 has solved the program when it then meets the second, Clarabel's own default."""
@@ -30,11 +29,11 @@ ATTEMPTS: tuple[dict[str, Any], ...] = (
 )
 """Settings, tried in turn: where one factorization stalls short of the tolerance, another does not."""
 STATUS = {
-    "Solved": cp.OPTIMAL,
-    "AlmostSolved": cp.OPTIMAL,
-    "PrimalInfeasible": cp.INFEASIBLE,
-    "AlmostPrimalInfeasible": cp.INFEASIBLE_INACCURATE,
-    "DualInfeasible": cp.UNBOUNDED,
+    "Solved": OPTIMAL,
+    "AlmostSolved": OPTIMAL,
+    "PrimalInfeasible": INFEASIBLE,
+    "AlmostPrimalInfeasible": INFEASIBLE_INACCURATE,
+    "DualInfeasible": UNBOUNDED,
 }
 
 
@@ -97,7 +96,7 @@ class Conic:
         self._rest = np.setdiff1d(np.arange(len(first["c"])), own)
         self._objective = _Affine(P, dP, q, dq, own, self._rest)
         self._size, self._b = len(first["c"]), first["b"]
-        self._cones = dims_to_solver_cones(first["dims"])
+        self._cones = conif.dims_to_solver_cones(first["dims"])
         self._blocks = _blocks(first["dims"], len(self._b))
         A = sparse.csr_array(first["A"])
         self._A_own, self._A_rest = A[:, own], sparse.coo_array(A[:, self._rest])

@@ -8,12 +8,12 @@ from dataclasses import astuple, dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display
+from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.drawn import parse
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.robot.parameters import Parameters

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS
+from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
 from rpim_opt.convex.sentence import Sentence, Sum, sentence
 from rpim_opt.problem.predicting import within_box, within_ranges

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
-from scipy.optimize import minimize
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import optimize
 from rpim_opt.problem.scatter import Scatter, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
@@ -297,7 +297,7 @@ class Evidence:
 
             bounds = list(zip(self.centre - FARTHEST, self.centre + FARTHEST, strict=True))
             options = {"maxiter": 80, "ftol": tolerance, "gtol": 1e-4}
-            best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            best = optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             found.append(self.at(best.x, last))
         return sorted(found, key=lambda point: point.value)
 

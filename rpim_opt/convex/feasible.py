@@ -5,15 +5,16 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.constraints.nonpos import Inequality
-from cvxpy.constraints.zero import Equality
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late
+from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.conic import ATTEMPTS
 from rpim_opt.convex.posed import Posed
 
+nonpos: Any = Late("cvxpy.constraints.nonpos")
+zero: Any = Late("cvxpy.constraints.zero")
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
 _LOCK = threading.Lock()  # a posed formulation's z has one value at a time
@@ -47,7 +48,7 @@ def _missed(constraint: Any, z: cp.Variable) -> float:
         return float("inf")
     if not np.any(missed > 0):
         return 0.0
-    if isinstance(constraint, Inequality | Equality):
+    if isinstance(constraint, nonpos.Inequality | zero.Equality):
         speed = _speeds(constraint.args[0] - constraint.args[1], z)
         if len(speed) != len(missed):
             speed = np.full(len(missed), np.max(speed, initial=0.0))
@@ -68,9 +69,9 @@ def nearest(posed: Posed, z: Array) -> Array:
     """Return the point of the constraints that is nearest to z (n,); z itself where none is found."""
     n = len(z)
     program = posed.projection
-    lift = np.vstack([np.eye(n), np.zeros((posed.r.size, n))])
+    lift = np.vstack([np.eye(n), np.zeros((posed.equations, n))])
     for attempt in range(len(ATTEMPTS)):
-        found = program.solve(lift, np.zeros(n + posed.r.size), 0.0, 2 * np.eye(n), -2 * z, attempt=attempt)
-        if found.status == cp.OPTIMAL:
+        found = program.solve(lift, np.zeros(n + posed.equations), 0.0, 2 * np.eye(n), -2 * z, attempt=attempt)
+        if found.status == OPTIMAL:
             return found.u
     return z

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.shown import Brief, counted
+from rpim_opt.convex.atoms import ATOMS, LARGEST, NORM1, SQUARES, SUM, cp, named
 from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
 from rpim_opt.robot.parameters import Parameters
 
 Function = Callable[[Any], Any]
 HUBER = 2.0
 """Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
-NAMED = (cp.sum_squares, cp.sum, cp.max, cp.norm1, cp.norm2, by_link, by_kind)
+NAMED = (*ATOMS, by_link, by_kind)
 """Functions that mean the same whenever they are asked, besides those that are `Ready`."""
 
 
@@ -74,7 +74,7 @@ class Formulation(Brief):
     """
 
     name: str
-    loss: Function = cp.sum_squares
+    loss: Function = SQUARES
     penalty: Function | None = None
     constraints: tuple[Constraint, ...] = ()
     loss_over: str = "equation"
@@ -91,19 +91,14 @@ class Formulation(Brief):
         return text
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "loss", named(self.loss))
+        object.__setattr__(self, "penalty", named(self.penalty))
         if self.loss_over not in ("equation", "configuration"):
             raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
         if not isinstance(self.constraints, tuple):
             object.__setattr__(self, "constraints", _functions(self.constraints))
         if not self.largest > 0:
             raise InputError("largest", f"{self.largest}", "a number of sigmas above zero, or infinity")
-
-    def __reduce__(self) -> Any:
-        stated = {field.name: getattr(self, field.name) for field in fields(self)}
-        for key in ("loss", "penalty", "penalty_over"):
-            if stated[key] in NAMED:  # functions of CVXPY do not all travel by themselves
-                stated[key] = _Name(NAMED.index(stated[key]))
-        return _arrived, (stated,)
 
     @property
     def ready(self) -> bool:
@@ -125,20 +120,6 @@ def _functions(constraints: Any) -> tuple[Constraint, ...]:
     except TypeError:
         found = f"a {type(constraints).__name__}"
         raise InputError("constraints", found, "functions of z and the parameters, in a tuple") from None
-
-
-class _Name(NamedTuple):
-    """Which of the `NAMED` functions."""
-
-    place: int
-
-
-def _arrived(stated: dict[str, Any]) -> Formulation:
-    """Return the formulation that was pickled."""
-    for key, value in stated.items():
-        if isinstance(value, _Name):
-            stated[key] = NAMED[value.place]
-    return Formulation(**stated)
 
 
 def _is_ready(function: Any) -> bool:
@@ -194,7 +175,7 @@ least_squares = Formulation("least squares")
 >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm")
 0.023 mm
 """
-tikhonov = Formulation("Tikhonov", penalty=cp.sum_squares)
+tikhonov = Formulation("Tikhonov", penalty=SQUARES)
 """|A z - b|^2 + weight |z|^2 (Tikhonov 1963): deviations are expected about as large as their scales.
 
 >>> import rpim_opt as ro
@@ -203,7 +184,7 @@ tikhonov = Formulation("Tikhonov", penalty=cp.sum_squares)
 >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm")
 0.024 mm
 """
-bounded = Formulation("bounded Tikhonov", penalty=cp.sum_squares, constraints=(within_tolerance,))
+bounded = Formulation("bounded Tikhonov", penalty=SQUARES, constraints=(within_tolerance,))
 """`tikhonov` with |x_i| <= tolerance_i, where a tolerance is stated.
 
 >>> import rpim_opt as ro
@@ -212,7 +193,7 @@ bounded = Formulation("bounded Tikhonov", penalty=cp.sum_squares, constraints=(w
 >>> bool((abs(result.x) <= problem.parameters.free.tolerance).all())
 True
 """
-robust = Formulation("Huber", loss=huber(), penalty=cp.sum_squares, loss_over="configuration")
+robust = Formulation("Huber", loss=huber(), penalty=SQUARES, loss_over="configuration")
 """`huber` of the norms of the configurations, + weight |z|^2: blunders hardly pull the fit, and are flagged.
 
 >>> import rpim_opt as ro
@@ -220,7 +201,7 @@ robust = Formulation("Huber", loss=huber(), penalty=cp.sum_squares, loss_over="c
 >>> [flag.label for flag in result.flagged]
 ['c43', 'c39', 'c7', 'c14', 'c1']
 """
-sum_of_norms = Formulation("sum of norms", loss=cp.sum, penalty=cp.sum_squares, loss_over="configuration")
+sum_of_norms = Formulation("sum of norms", loss=SUM, penalty=SQUARES, loss_over="configuration")
 """sum_k |r_k| over the configurations, + weight |z|^2: an L1 loss that does not depend on the axes.
 
 >>> import rpim_opt as ro
@@ -229,7 +210,7 @@ sum_of_norms = Formulation("sum of norms", loss=cp.sum, penalty=cp.sum_squares, 
 >>> [f"{flag.label}: {flag.error_mm:.0f} mm" for flag in result.flagged[:2]]
 ['T8-6: 38 mm', 'T8-7: 15 mm']
 """
-minimax = Formulation("minimax", loss=cp.max, penalty=cp.sum_squares, loss_over="configuration")
+minimax = Formulation("minimax", loss=LARGEST, penalty=SQUARES, loss_over="configuration")
 """max_k |r_k| over the configurations, + weight |z|^2: the worst configuration counts, and nothing else does.
 
 >>> import rpim_opt as ro
@@ -239,7 +220,7 @@ minimax = Formulation("minimax", loss=cp.max, penalty=cp.sum_squares, loss_over=
 0.079 mm
 0.060 mm
 """
-lasso = Formulation("lasso", penalty=cp.norm1)
+lasso = Formulation("lasso", penalty=NORM1)
 """|A z - b|^2 + weight |z|_1 (Tibshirani 1996): parameters that the data do not ask for stay nominal.
 
 >>> import numpy as np
@@ -249,7 +230,7 @@ lasso = Formulation("lasso", penalty=cp.norm1)
 >>> print(f"{moved.sum()} of {len(moved)} parameters moved")
 27 of 34 parameters moved
 """
-group_lasso = Formulation("group lasso by link", penalty=cp.sum, penalty_over=by_link)
+group_lasso = Formulation("group lasso by link", penalty=SUM, penalty_over=by_link)
 """|A z - b|^2 + weight sum_k |z_k| over links and frames (Yuan and Lin 2006): links stay nominal as a whole.
 
 >>> import numpy as np

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.convex.atoms import cp
 from rpim_opt.problem.identified import Identified, Machine
 from rpim_opt.problem.predicting import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
@@ -25,37 +25,7 @@ def places(names: Sequence[str], pattern: str, where: str) -> list[int]:
     return found
 
 
-class Unknown(cp.Variable):
-    """z (n,), deviations in units of their scales, whose entries have names: ``z["a2"]``, ``z["a?"]``.
-
-    Parameters
-    ----------
-    names
-        Of the n identified parameters.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> z = ro.convex.Unknown(("a1", "a2", "d1"))
-    >>> z["a2"].shape, z["a?"].shape, z[1].shape
-    ((), (2,), ())
-    >>> z["a4"]
-    Traceback (most recent call last):
-    rpim_opt.basics.exceptions.InputError: z: found 'a4', accepted: parameters: a1, a2, d1.
-    """
-
-    def __init__(self, names: Sequence[str]):
-        super().__init__(len(names), name="z")
-        self.names = tuple(names)
-
-    def __getitem__(self, key: Any) -> Any:
-        return super().__getitem__(_index(self.names, key, "z"))
-
-    def _ipython_key_completions_(self) -> list[str]:
-        return list(self.names)
-
-
-def _index(names: Sequence[str], key: Any, where: str) -> Any:
+def index_of(names: Sequence[str], key: Any, where: str) -> Any:
     """Return the place of a name, the places that a pattern matches, or any other index as it is."""
     if not isinstance(key, str):
         return key
@@ -90,7 +60,7 @@ class Deviations:
         self._parameters = parameters
 
     def __getitem__(self, key: Any) -> Any:
-        index = _index(self._parameters.names, key, "x")
+        index = index_of(self._parameters.names, key, "x")
         return cp.multiply(self._parameters.scale[index], self._z[index])
 
     def __len__(self) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.atoms import OPTIMAL
 from rpim_opt.convex.conic import ATTEMPTS
 from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.objective import Damping, Objective
@@ -50,10 +50,10 @@ def interior(objective: Objective, weight: float, damping: Damping | None) -> Fo
         found = program.solve(lift, shift, weight, H, g, size, attempt)
         first = first or found.status
         z = T @ found.u + centre
-        if found.status == cp.OPTIMAL and objective.meets(z):
+        if found.status == OPTIMAL and objective.meets(z):
             groups = objective._posed.constraints
             values = [[program.multipliers(found, constraint) for constraint in group] for group in groups]
-            return Found(cp.OPTIMAL, z, multipliers(objective, values), found.iterations)
+            return Found(OPTIMAL, z, multipliers(objective, values), found.iterations)
     return Found(first)
 
 

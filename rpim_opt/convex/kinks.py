@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import sparse
+from rpim_opt.convex.atoms import cp
 
 LARGE = 1000
 """Unknowns up to which a penalty is looked at: what is below is dense."""
@@ -211,7 +210,7 @@ def _substitution(equations: Any, b: Array, own: np.ndarray, tied: np.ndarray) -
     if not len(tied):
         return np.zeros((0, len(own))), np.zeros(0)
     try:
-        factors = splu(sparse.csc_matrix(equations[:, tied]))
+        factors = sparse.linalg.splu(sparse.csc_matrix(equations[:, tied]))
     except RuntimeError:  # singular
         return None
     return -factors.solve(equations[:, own].toarray()), factors.solve(b)

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy.sparse import csr_array
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import sparse
+from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import invariant
 from rpim_opt.convex.terms import Term, term
@@ -90,7 +90,7 @@ class Squares:
         across = slope / (2 * v)
         along = np.maximum(self._along(model, z, which, v, priced), LEAST_CURVATURE * across)
         u = r / v[which]
-        along_u = csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
+        along_u = sparse.csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
         projected = along_u @ model.A  # u'A, group by group
         A = np.sqrt(across)[which, None] * model.A
         A += ((np.sqrt(along) - np.sqrt(across))[which] * u)[:, None] * projected[which]
@@ -169,4 +169,4 @@ def on_triangles(formulation: Formulation, equations: int) -> tuple[Formulation,
     if not separable(formulation.loss, formulation.loss_over):
         raise InputError(where, "a loss that is no sum, with measurements in parts", accepted)
     squares = Squares(formulation.loss, formulation.name, formulation.loss_over)
-    return replace(formulation, loss=cp.sum_squares, loss_over="equation"), squares
+    return replace(formulation, loss=SQUARES, loss_over="equation"), squares

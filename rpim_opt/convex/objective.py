@@ -12,10 +12,11 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief
 from rpim_opt.convex import feasible
+from rpim_opt.convex.asked import configuration_norms
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.faces import Faces
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.posed import Posed, configuration_norms
+from rpim_opt.convex.posed import Posed
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.split import Split
@@ -206,7 +207,7 @@ class Objective(Brief):
     def rows(self) -> tuple[Array, Array]:
         """A and b as the posed residual has them: the triangle, where that says all."""
         n = self.model.A.shape[1]
-        if self._posed.r.size == len(self.model.b):
+        if self._posed.equations == len(self.model.b):
             return self.model.A, self.model.b
         return self.model.triangle[:, :n], self.model.triangle[:, n]
 

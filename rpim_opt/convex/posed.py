@@ -7,27 +7,25 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy.sparse import csr_array
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.asked import Asked, ask, norms
+from rpim_opt.convex.atoms import NORM2, SQUARES, cp
 from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
-from rpim_opt.convex.given import Given, Unknown
-from rpim_opt.convex.given import given as told
 from rpim_opt.convex.kinks import kinks
 from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.split import Split, split
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
-from rpim_opt.convex.terms import Frozen, Term, apart, listed, reason, scalar, term
+from rpim_opt.convex.terms import Frozen, Term, apart, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
-INVARIANT = (cp.sum_squares, cp.norm2)
+INVARIANT = (SQUARES, NORM2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its triangular factor."""
 TINY = 1e-150
 """Norms below have no direction."""
@@ -47,6 +45,20 @@ class Shape:
     groups: np.ndarray = field(compare=False)
 
 
+def declared(formulation: Formulation) -> bool:
+    """Whether the functions themselves say what they are: sums of squares of all equations, in boxes of the package."""
+    penalty = formulation.penalty
+    return (
+        formulation.ready
+        and formulation.loss == SQUARES
+        and formulation.loss_over == "equation"
+        and not np.isfinite(formulation.largest)
+        and formulation.penalty_over is None
+        and (penalty in (None, SQUARES) or (isinstance(penalty, Ready) and penalty.quadratic is not None))
+        and all(isinstance(constraint, Box) for constraint in formulation.constraints)
+    )
+
+
 class Posed:
     """Loss, penalty and constraints of a formulation as CVXPY expressions of a residual r and of z.
 
@@ -57,20 +69,8 @@ class Posed:
     shape
         Of the data.
 
-    Attributes
-    ----------
-    z, r
-        The variables (n,) and (m,).
-    loss, penalty
-        Expressions of r and z; penalty is None where there is none.
-    constraints
-        Of z, one list for every function.
-    predicts
-        Whether constraints asked for positions, which are linear about some point.
-    own
-        Variables that the functions brought along.
-    loss_form, penalty_form
-        The quadratics that loss (of r) and penalty (of z) are; None where they are something else.
+    A formulation whose functions declare what they are (`declared`) is asked when an expression of it is first needed:
+    what a formula solves, it solves without CVXPY.
     """
 
     def __init__(self, formulation: Formulation, shape: Shape):
@@ -78,61 +78,63 @@ class Posed:
         self.n = shape.unknowns
         self.groups = shape.groups
         self.limited = bool(np.isfinite(formulation.largest))
-        self.z = Unknown(self.parameters.names)
-        self.r = cp.Variable(shape.equations, name="r")
-        self._lock = threading.Lock()
-        self._ask()
+        self.equations = shape.equations
+        self._lock = threading.RLock()
+        self._answers: Asked | None = None
+        self._known = declared(formulation)
+        if self._known:
+            self.box  # noqa: B018 - limits that do not fit the parameters are refused now
+        else:  # what a user's functions say may be another thing later
+            self.asked  # noqa: B018
         self.constrained = bool(formulation.constraints) or self.limited
 
-    def _ask(self) -> None:
-        """Ask the functions, and keep copies of what they answered."""
-        f, where = self.formulation, f"formulation '{self.formulation.name}'"
-        seen = self.r
-        if f.loss_over == "configuration":
-            seen = cp.Variable(len(np.unique(self.groups)))
-        self._differences: list[Array] = []
-        given = self.z
-        if f.penalty_over is not None:
-            self._differences = [np.asarray(D, dtype=float) for D in f.penalty_over(self.parameters)]
-            given = cp.Variable(len(self._differences))
-        copy = Frozen([self.z, self.r, seen, given], where)
-        live_loss = scalar(f.loss(seen), f"{where}, loss")
-        self._loss_term = Term(copy(live_loss), seen)
-        live_penalty = None
-        self._penalty_term: Term | None = None
-        if f.penalty is not None:
-            live_penalty = scalar(f.penalty(given), f"{where}, penalty")
-            self._penalty_term = Term(copy(live_penalty), given)
-        known = told(self.z, self.parameters)
-        live = [self._listed(c, known, f"{where}, {called(c, k)}") for k, c in enumerate(f.constraints)]
-        self.predicts = bool(known.asked)
-        self.constraints = [[copy(each) for each in group] for group in live]
-        self.own = copy.own
-        self.live = (self._over_r(live_loss, seen), self._over_z(live_penalty, given), live)
-        self.loss = self._over_r(self._loss_term.expression, seen)
-        self.penalty = None
-        if self._penalty_term is not None:
-            self.penalty = self._over_z(self._penalty_term.expression, given)
-        for part, expression in (("loss", self.loss), ("penalty", self.penalty)):
-            if expression is not None and not expression.is_convex():
-                found = "a program that is not convex"
-                accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
-                raise InputError(f"{where}, {part}", found, accepted)
+    @cached_property
+    def asked(self) -> Asked:
+        """The answers of the functions; asked once, whichever thread needs them first."""
+        with self._lock:
+            if self._answers is None:
+                self._answers = ask(self.formulation, self.parameters, self.equations, self.groups)
+        return self._answers
 
-    def _listed(self, constraint: Any, known: Given, where: str) -> list[Any]:
-        return listed(constraint(self.z, known), where)
+    @cached_property
+    def z(self) -> cp.Variable:
+        """The variable (n,) of penalty and constraints."""
+        return self.asked.z
 
-    def _over_r(self, expression: Any, seen: cp.Variable) -> Any:
-        """Return the loss as a function of r."""
-        if seen is self.r:
-            return expression
-        return expression.tree_copy({id(seen): norms(self.r, self.groups)})
+    @cached_property
+    def r(self) -> cp.Variable:
+        """The variable (m,) of the loss."""
+        return self.asked.r
 
-    def _over_z(self, expression: Any, given: cp.Variable) -> Any:
-        """Return the penalty as a function of z."""
-        if expression is None or given is self.z:
-            return expression
-        return expression.tree_copy({id(given): cp.hstack([cp.norm(D @ self.z) for D in self._differences])})
+    @cached_property
+    def loss(self) -> Any:
+        """The loss, an expression of r."""
+        return self.asked.loss
+
+    @cached_property
+    def penalty(self) -> Any:
+        """The penalty, an expression of z; None where there is none."""
+        return self.asked.penalty
+
+    @cached_property
+    def constraints(self) -> list[list[Any]]:
+        """The constraints of z, one list for every function."""
+        return self.asked.constraints
+
+    @cached_property
+    def own(self) -> list[cp.Variable]:
+        """Variables that the functions brought along."""
+        return self.asked.own
+
+    @cached_property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return not self._known and self.asked.predicts
+
+    @cached_property
+    def live(self) -> tuple[Any, Any, list[list[Any]]]:
+        """Loss, penalty and constraints with the user's own parameters, and no copies of them."""
+        return self.asked.live
 
     # --- structure ---------------------------------------------------------------------------------------------
 
@@ -141,7 +143,7 @@ class Posed:
         """The quadratic of r that the loss is."""
         if self.limited:
             return None
-        form = self._form(self.formulation.loss, self._loss_term)
+        form = self._form(self.formulation.loss, self._sees, "loss_term")
         if form is None or self.formulation.loss_over == "equation":
             return form
         if not form.diagonal or form.c.any():
@@ -156,7 +158,7 @@ class Posed:
             return None
         from rpim_opt.convex.tree import rows_of  # CVXPY's tree is read where a loss is none of the squares
 
-        rows = rows_of(self._loss_term.expression, self._loss_term.variable)
+        rows = rows_of(self.asked.loss_term.expression, self.asked.loss_term.variable)
         if rows is None:
             return None
         starts = None
@@ -175,20 +177,21 @@ class Posed:
     @cached_property
     def penalty_form(self) -> Quadratic | None:
         """The quadratic of z that the penalty is."""
-        if self._penalty_term is None:
+        if self.formulation.penalty is None:
             return None
-        form = self._form(self.formulation.penalty, self._penalty_term)
-        if form is None or not self._differences:
-            return form
-        if not form.diagonal or form.c.any():
+        if self.formulation.penalty_over is None:
+            return self._form(self.formulation.penalty, self.n, "penalty_term")
+        differences = self.asked.differences
+        form = self._form(self.formulation.penalty, len(differences), "penalty_term")
+        if form is None or not form.diagonal or form.c.any():
             return None
-        L = np.vstack([root * D for root, D in zip(form.L, self._differences, strict=True)])
+        L = np.vstack([root * D for root, D in zip(form.L, differences, strict=True)])
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
     @cached_property
     def split(self) -> Split | None:
         """The unknowns in which the penalty is a sum of absolute values and norms; None where there are none such."""
-        if self.penalty is None or self.penalty_form is not None or self.box is None or self.inner:
+        if self.penalty_form is not None or self.box is None or self.inner or self.penalty is None:
             return None
         z = cp.Variable(self.n)
         found = kinks(self.penalty.tree_copy({id(self.z): z}), z)
@@ -196,11 +199,20 @@ class Posed:
             return None
         return split(found)
 
-    def _form(self, function: Any, term: Term) -> Quadratic | None:
-        if function is cp.sum_squares:  # declared; a test holds it against the canonicalization
-            return identity(term.variable.size)
+    @property
+    def _sees(self) -> int:
+        """Of how many numbers the loss is a function."""
+        if self.formulation.loss_over == "equation":
+            return self.equations
+        return len(np.unique(self.groups))
+
+    def _form(self, function: Any, size: int, of: str) -> Quadratic | None:
+        """Return the quadratic that loss or penalty is of so many numbers."""
+        if function == SQUARES:  # declared; a test holds it against the canonicalization
+            return identity(size)
         if isinstance(function, Ready) and function.quadratic is not None:  # so does one against this
             return function.quadratic
+        term: Term = getattr(self.asked, of)
         return quadratic(term.expression, term.variable)
 
     @cached_property
@@ -227,32 +239,34 @@ class Posed:
     @cached_property
     def inner(self) -> list[cp.Variable]:
         """Variables of the functions' own in loss or penalty: a value is a minimum over them."""
+        if self._known:
+            return []
         ids = {v.id for term in (self.loss, self.penalty) if term is not None for v in term.variables()}
         return [variable for variable in self.own if variable.id in ids]
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
-        if self.formulation.loss is cp.sum_squares:
+        if self.formulation.loss == SQUARES:
             return float(r @ r)
-        return self._loss_term(self.seen(r))
+        return self.asked.loss_term(self.seen(r))
 
     def penalty_of(self, z: Array) -> float:
         """Return the penalty of z (n,)."""
-        if self._penalty_term is None:
+        if self.formulation.penalty is None:
             return 0.0
-        if self._differences:
-            z = np.array([float(np.linalg.norm(D @ z)) for D in self._differences])
-        if self.formulation.penalty is cp.sum_squares:
+        if self.formulation.penalty_over is not None:
+            z = np.array([float(np.linalg.norm(D @ z)) for D in self.asked.differences])
+        if self.formulation.penalty == SQUARES:
             return float(z @ z)
         if self._declared is not None:
             return self._declared.value(z)
-        return self._penalty_term(z)
+        return self.asked.penalty_term(z)
 
     @cached_property
     def _declared(self) -> Quadratic | None:
         """The quadratic of z that a penalty of the package's own declares to be."""
         penalty = self.formulation.penalty
-        if isinstance(penalty, Ready) and not self._differences:
+        if isinstance(penalty, Ready) and self.formulation.penalty_over is None:
             return penalty.quadratic
         return None
 
@@ -266,7 +280,7 @@ class Posed:
         """Return the gradient (m,) of the loss by the residual; None where CVXPY knows none."""
         if self.inner:
             return None
-        if self.formulation.loss is cp.sum_squares:  # of the residual or of its configurations' norms
+        if self.formulation.loss == SQUARES:  # of the residual or of its configurations' norms
             return 2 * r
         seen = self.seen(r)
         slope = self.slope_seen(seen)
@@ -276,7 +290,7 @@ class Posed:
 
     def slope_seen(self, seen: Array) -> Array | None:
         """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
-        return self._loss_term.slope(seen)
+        return self.asked.loss_term.slope(seen)
 
     def loss_of_norms(self, v: Array) -> float:
         """Return a loss of the configurations' norms (N,)."""
@@ -299,19 +313,19 @@ class Posed:
 
     def _slope_of_some(self, v: Array) -> Array | None:
         """Return the loss's slopes at numbers, the others being zero."""
-        size = self._loss_term.variable.size
+        size = self.asked.loss_term.variable.size
         if size < len(v):  # posed on a triangle, which has fewer residuals than the data
             return term(self.formulation.loss, len(v), "loss").slope(v)
-        slope = self._loss_term.slope(np.concatenate([v, np.full(size - len(v), SMALL)]))
+        slope = self.asked.loss_term.slope(np.concatenate([v, np.full(size - len(v), SMALL)]))
         if slope is None:
             return None
         return slope[: len(v)]
 
     def penalty_slope(self, z: Array) -> Array | None:
         """Return the gradient (n,) of the penalty by z; None where CVXPY knows none."""
-        if self.inner or self.penalty is None:
+        if self.inner or self.formulation.penalty is None:
             return None
-        if self.formulation.penalty is cp.sum_squares and not self._differences:
+        if self.formulation.penalty == SQUARES and self.formulation.penalty_over is None:
             return 2 * z
         if self._declared is not None:
             return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
@@ -401,14 +415,6 @@ class Posed:
         return norms(self.r, self.groups) <= self.formulation.largest
 
 
-def called(constraint: Any, k: int) -> str:
-    """Return what a person calls the constraint function number k."""
-    name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
-    if name == "<lambda>":
-        return f"constraint {k + 1}"
-    return str(name)
-
-
 def posed(formulation: Formulation, model: LinearModel) -> Posed:
     """Return the formulation posed for the shape of a model; a ready one may have been posed before."""
     m, n = model.A.shape
@@ -471,24 +477,6 @@ def _loss_form(formulation: Formulation, equations: int) -> Quadratic | None:
         return None
 
 
-def configuration_norms(r: Array, groups: np.ndarray) -> Array:
-    """Return the norm of every configuration's part of a residual (m,), in the order of their numbers."""
-    which = np.unique(groups, return_inverse=True)[1]
-    return np.sqrt(np.bincount(which, r**2))
-
-
-def norms(r: Any, group: np.ndarray) -> Any:
-    """Return the norms of a residual (m,) by group in CVXPY, in the order of the groups' numbers."""
-    _, which, count = np.unique(group, return_inverse=True, return_counts=True)
-    order = np.argsort(which, kind="stable")
-    place = np.empty(len(group), dtype=int)
-    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
-    shape = (len(count), int(count.max()))  # shorter groups are filled with zeros
-    at = (which * shape[1] + place, np.arange(len(group)))
-    pick = csr_array((np.ones(len(group)), at), (shape[0] * shape[1], len(group)))
-    return cp.norm(cp.reshape(pick @ r, shape, order="C"), 2, axis=1)
-
-
 class Unposed(Posed):
     """In the place of `Posed` for a formulation whose functions a file could not hold: asking them is an error.
 
@@ -505,9 +493,10 @@ class Unposed(Posed):
         self.formulation, self.parameters = formulation, model.parameters
         self.n = model.A.shape[1]
         self.groups = np.unique(model.group, return_inverse=True)[1]
-        self.z, self.r = cp.Variable(self.n), cp.Variable(len(model.b))
+        self.equations = len(model.b)
         self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []
         self.loss_form, self.penalty_form, self.box, self.split = loss_form, penalty_form, None, None
-        self._penalty_term = None
-        self.live = self.loss = self.penalty = self.values = self.trusted = self.conic = lost(formulation.name)
+        self._known = False
+        self.live: Any = lost(formulation.name)
+        self.loss = self.penalty = self.values = self.trusted = self.conic = lost(formulation.name)

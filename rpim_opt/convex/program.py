@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.by_rows import Met, by_rows
 from rpim_opt.convex.closed import minimum, minimum_between, path_between, shares, values
 from rpim_opt.convex.conflict import advice, conflict
@@ -66,7 +66,7 @@ class Estimate(Brief):
     loss: float
     penalty: float
     duals: tuple[Array, ...] = ()
-    status: str = cp.OPTIMAL
+    status: str = OPTIMAL
     iterations: int = 0
     seconds: float = 0.0
 

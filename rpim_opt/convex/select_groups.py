@@ -8,10 +8,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import optimize
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.groups import Grouped, minimum
 from rpim_opt.convex.program import pose
@@ -284,7 +284,9 @@ def _least(
 def _polished(objective: Objective, start: Array, bounds: tuple[float, float], accuracy: float) -> tuple[float, Array]:
     """Return the minimum next to a start, its value before it."""
     options = {"ftol": accuracy, "gtol": 1e-9, "maxiter": 500}
-    found: Any = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[bounds] * len(start), options=options)
+    found: Any = optimize.minimize(
+        objective, start, jac=True, method="L-BFGS-B", bounds=[bounds] * len(start), options=options
+    )
     return float(found.fun), np.asarray(found.x)
 
 

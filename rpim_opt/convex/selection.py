@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.scalar import least
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, ridge
@@ -151,13 +151,9 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
 
 def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
     """Return the weight of the least score between the neighbours of the best on a grid, and that score."""
-    fine: Any = minimize_scalar(
-        lambda t: score(np.exp([t]))[0],
-        bounds=(np.log(weights[best - 1]), np.log(weights[best + 1])),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
-    return float(np.exp(fine.x)), float(fine.fun)
+    low, high = np.log(weights[[best - 1, best + 1]])
+    at, value = least(lambda t: score(np.exp([t]))[0], float(low), float(high), 1e-6)
+    return float(np.exp(at)), value
 
 
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:

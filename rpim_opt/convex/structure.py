@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import sparse
+from rpim_opt.convex.atoms import cp
 
 DENSE = 2000
 """Variables up to which a quadratic with products of different variables is factored."""
@@ -108,7 +107,7 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
     if not len(rest):
         return H, g
     try:
-        factors = splu(sparse.csc_matrix(A[:, rest]))
+        factors = sparse.linalg.splu(sparse.csc_matrix(A[:, rest]))
     except RuntimeError:  # singular: they do not follow from v
         return None
     M = -sparse.csr_array(factors.solve(A[:, own].toarray()))

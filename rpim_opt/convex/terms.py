@@ -6,12 +6,12 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from scipy import sparse
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import sparse
+from rpim_opt.convex.atoms import cp
 
 
 def scalar(value: Any, where: str) -> Any:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.atoms.elementwise.elementwise import Elementwise
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late
+from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.rows import LINE, SQUARE, Affine, Curve, Kink, Piece, Rows, huber, power, root
 from rpim_opt.convex.terms import Term, apart
+
+elementwise: Any = Late("cvxpy.atoms.elementwise.elementwise")
 
 APART = 1e-5
 """How far from a number, relative to it, the slopes are whose difference is the curvature there."""
@@ -154,7 +156,7 @@ class _Reading:
             return e.shape in ((), (1,), self.shape)
         if e is self.variable:
             return True
-        acts = isinstance(e, Elementwise) or type(e).__name__ in ("AddExpression", "NegExpression")
+        acts = isinstance(e, elementwise.Elementwise) or type(e).__name__ in ("AddExpression", "NegExpression")
         if e.shape != self.shape or not (acts or _multiple(e) is not None):
             return False
         return all(self._elementwise(arg) for arg in e.args)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -24,7 +24,7 @@ SMALL = 1e-6
 def _quantiles(beyond: float, count: np.ndarray) -> Array:
     """Return which chi-squared numbers with ``count`` (N,) degrees of freedom exceed with a probability."""
     several, which = np.unique(count, return_inverse=True)
-    return chi2.isf(beyond, several)[which]
+    return chdtri(several, beyond)[which]
 
 
 def noise_level(norms: Array, count: np.ndarray) -> float:

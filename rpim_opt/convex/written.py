@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.error import SolverError
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.interior import Found, multipliers
 from rpim_opt.convex.objective import Damping, Objective
 
@@ -53,7 +52,7 @@ def _written(
 ) -> Written:
     posed = objective._posed
     A, b, weight = data
-    z, r = cp.Variable(posed.n, name="z"), cp.Variable(posed.r.size, name="r")
+    z, r = cp.Variable(posed.n, name="z"), cp.Variable(posed.equations, name="r")
     instead = {id(posed.z): z, id(posed.r): r}
     groups = [[constraint.tree_copy(instead) for constraint in group] for group in groups]
     every = [r == A @ z - b]
@@ -95,7 +94,7 @@ def by_solver(
             if not settings:
                 raise
             raise InputError("settings", f"{error}".rstrip("."), f"settings that {solver} knows") from None
-        except SolverError as error:
+        except cp.SolverError as error:
             if solver.upper() not in cp.installed_solvers():
                 installed = ", ".join(cp.installed_solvers())
                 raise InputError("solver", f"'{solver}'", f"one that is installed: {installed}") from None

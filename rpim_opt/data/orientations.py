@@ -6,9 +6,9 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import transform
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.data.dialects import Reading
 
@@ -139,5 +139,5 @@ def from_vectors(table: Columns, names: Sequence[str], si: float) -> dict[str, l
     ['1.0']
     """
     vectors = np.column_stack([_numbers(table, name) for name in names])
-    xyzw = Rotation.from_rotvec(si * vectors).as_quat()
+    xyzw = transform.Rotation.from_rotvec(si * vectors).as_quat()
     return {f"q{letter}": [repr(float(v)) for v in xyzw[:, "xyzw".index(letter)]] for letter in "wxyz"}

@@ -200,7 +200,11 @@ def _configurations(table: Columns, q: Array) -> np.ndarray:
     """Return the number of every row's configuration: as stated, or by equal joint values."""
     if "configuration" in table:
         return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
-    return np.unique(q.reshape(len(q), -1), axis=0, return_inverse=True)[1]
+    joints = q.reshape(len(q), -1)
+    first, which = np.unique(joints[:, 0], return_inverse=True)
+    if len(first) == len(joints):  # then it alone decides the order, too; to sort numbers is ten times quicker
+        return which
+    return np.unique(joints, axis=0, return_inverse=True)[1]
 
 
 def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[str]) -> tuple[Block, ...]:

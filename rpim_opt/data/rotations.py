@@ -6,10 +6,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RowError
+from rpim_opt.basics.late import transform
 
 
 def quaternion(T: Any) -> Any:
@@ -58,11 +58,11 @@ def rotation_between(p: Any, q: Any) -> Any:
 
 def turned(y: Array, e: Array) -> Array:
     """Move poses (N, 7) by e (N, 6), the positions and then the rotations about the instrument's axes."""
-    rotation = Rotation.from_rotvec(e[:, 3:]) * Rotation.from_quat(y[:, [4, 5, 6, 3]])
+    rotation = transform.Rotation.from_rotvec(e[:, 3:]) * transform.Rotation.from_quat(y[:, [4, 5, 6, 3]])
     return np.hstack([y[:, :3] + e[:, :3], _w_first(rotation)])
 
 
-def _w_first(rotation: Rotation) -> Array:
+def _w_first(rotation: transform.Rotation) -> Array:
     return rotation.as_quat()[:, [3, 0, 1, 2]]
 
 
@@ -78,7 +78,7 @@ def unit_quaternions(y: Array) -> Array:
 
 def from_angles(y: Array) -> Array:
     """Return poses (N, 7) from roll, pitch, yaw (N, 6), R = Rz Ry Rx."""
-    return np.hstack([y[:, :3], _w_first(Rotation.from_euler("xyz", y[:, 3:]))])
+    return np.hstack([y[:, :3], _w_first(transform.Rotation.from_euler("xyz", y[:, 3:]))])
 
 
 def from_matrices(y: Array) -> Array:
@@ -90,4 +90,4 @@ def from_matrices(y: Array) -> Array:
         row = int(wrong[0])
         found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
-    return np.hstack([y[:, :3], _w_first(Rotation.from_matrix(R))])
+    return np.hstack([y[:, :3], _w_first(transform.Rotation.from_matrix(R))])

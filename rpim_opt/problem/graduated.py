@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.loops import Loops
@@ -81,7 +81,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     first = _weighted(loops, ones, loss, candidates)
     if loss == "squares":
         return first
-    beyond = chi2.ppf(QUANTILES[loss], loops.freedom)
+    beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
     if loss == "huber":
         return _repeated(loops, first, loss, lambda squares: _huber_weights(squares, beyond))
     found = _graduated(loops, first, beyond)
@@ -114,7 +114,7 @@ def _cost(loops: Loops, v: Array, squares: Array, loss: str) -> float:
     expected = float(np.sum((loops.prior @ v) ** 2))
     if loss == "squares":
         return float(np.sum(squares)) + expected
-    beyond = chi2.ppf(QUANTILES[loss], loops.freedom)
+    beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
     if loss == "truncated":
         return float(np.sum(np.minimum(squares, beyond))) + expected
     straight = 2 * np.sqrt(beyond * squares) - beyond

@@ -13,6 +13,7 @@ from scipy.linalg import get_lapack_funcs
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.shown import Brief, counted
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
@@ -86,7 +87,7 @@ class LinearModel(Brief):
     def triangle(self) -> Array:
         """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
         with phase("reduction"):
-            return reduced_rows(np.column_stack([self.A, self.b]))
+            return triangle_of(self.A, self.b)
 
     @property
     def rank(self) -> int:
@@ -102,19 +103,51 @@ class LinearModel(Brief):
         return replace(self, A=self.A * rows[:, None], b=self.b * rows)
 
 
+BLOCK = 430_000
+"""Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
+triangles of the blocks cost little beside them."""
 _geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
 
 
 def reduced_rows(rows: Array, R: Array | None = None) -> Array:
     """Return the upper triangle (n+1, n+1) of R over ``rows`` (m, n+1), by Householder's QR."""
-    n = rows.shape[1]
+    return reduced_equations(rows[:, :-1], rows[:, -1], R)
+
+
+def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
+    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR."""
+    n = A.shape[1] + 1
     above = 0 if R is None else len(R)
-    stacked = np.empty((max(above + len(rows), n), n), order="F")
+    stacked = np.empty((max(above + len(b), n), n), order="F")
     stacked[:above] = 0 if R is None else R
-    stacked[above : above + len(rows)] = rows
-    stacked[above + len(rows) :] = 0.0
+    stacked[above : above + len(b), :-1] = A
+    stacked[above : above + len(b), -1] = b
+    stacked[above + len(b) :] = 0.0
     factors = _geqrf(stacked, lwork=64 * n, overwrite_a=1)[0]
     return np.triu(factors[:n])
+
+
+def triangle_of(A: Array, b: Array) -> Array:
+    """Return the triangle (n+1, n+1) of [A b], A (m, n) and b (m,): that of every `BLOCK`, and of those by twos.
+
+    Blocks are reduced on all cores; which they are depends on the shape of A alone.
+    """
+    columns = A.shape[1] + 1
+    most = max(8 * columns, BLOCK // columns)
+
+    def block(start: int) -> Array:
+        part = slice(start, start + most)
+        return reduced_equations(A[part], b[part])
+
+    return by_twos(on_all_cores(block, range(0, max(len(b), 1), most)))
+
+
+def by_twos(triangles: list[Array]) -> Array:
+    """Return the triangle of several triangles (n+1, n+1), joined by twos."""
+    while len(triangles) > 1:
+        pairs = [triangles[i : i + 2] for i in range(0, len(triangles), 2)]
+        triangles = [reduced_rows(pair[-1], pair[0]) if len(pair) == 2 else pair[0] for pair in pairs]
+    return triangles[0]
 
 
 def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0.0) -> LinearModel:

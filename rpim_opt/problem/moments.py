@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late
+
+if TYPE_CHECKING:
+    import cvxpy as cp
+else:
+    cp = Late("cvxpy")
 
 
 @lru_cache

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.placing import hand_eye, transforms
 from rpim_opt.robot.kinematics import forward_kinematics
@@ -34,4 +34,4 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
     except InputError:
         return float(np.pi)
     error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
-    return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
+    return float(np.sqrt(np.mean(transform.Rotation.from_matrix(error).magnitude() ** 2)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.data.reading import read_data
@@ -48,6 +49,8 @@ class PartitionedProblem:
         Functions that read the parts, at least one; `partitions` makes them from files.
     compute
         Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or `on_cluster` (client).
+        By default files of `partitions` are read and reduced on all cores, while functions of a script are called one
+        after the other. Each part is one triangle, so that no digit depends on who computed it.
 
     Raises
     ------
@@ -84,13 +87,17 @@ class PartitionedProblem:
         parameters: Parameters,
         data: Dataset,
         parts: Sequence[Part] = (),
-        compute: Callable[..., Iterable[Any]] = map,
+        compute: Callable[..., Iterable[Any]] | None = None,
     ):
         if not parts:
             raise InputError("parts", "none", "at least one function that reads measurements")
         self._first = CalibrationProblem(robot, parameters, data)
         self._dropped: frozenset[str] = frozenset()
         self.parts = tuple(parts)
+        if compute is None:
+            compute = map
+            if all(_is_ours(part) for part in self.parts):
+                compute = on_all_cores
         self.compute = compute
 
     @property
@@ -266,6 +273,13 @@ def in_parts(problem: Source) -> Source:
         return problem
     parts = [partial(problem.data.take, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
     return PartitionedProblem(problem.robots, problem.parameters, problem.data, parts)._with(problem)
+
+
+def _is_ours(part: Part) -> bool:
+    """Whether a part is read by this package, which several threads may do at once."""
+    return isinstance(part, partial) and (
+        part.func is read_data or getattr(part.func, "__func__", None) is Dataset.take
+    )
 
 
 def sketch(problem: CalibrationProblem) -> CalibrationProblem:

@@ -529,14 +529,15 @@ class CalibrationProblem(Tabled):
         L = whitening if len(whitening) == 1 else whitening[part]
         residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part)
         each = np.diagonal(L[0])
+        scale = self.parameters.free.scale
         if len(L) == 1 and np.count_nonzero(L[0] - np.diag(each)) == 0:
             # independent and the same for all rows: a product of numbers is several times faster than one of matrices
             r = (residual[:, 0] * each).ravel()
-            A = (jacobian * each[:, None]).reshape(-1, len(x))
+            jacobian *= each[:, None]  # in place: a copy of many rows costs as much as to evaluate them
+            A = jacobian.reshape(-1, len(x))
         else:
             r = (L @ residual.transpose(0, 2, 1)).ravel()
             A = (L @ jacobian).reshape(-1, len(x))
-        scale = self.parameters.free.scale
         A *= scale
         return A, r + A @ (x / scale)
 

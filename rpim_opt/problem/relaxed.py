@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import clarabel as clarabel_module
-import cvxpy as cp
 import numpy as np
-from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
-from scipy import sparse
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late, sparse
 from rpim_opt.basics.phases import phase
 from rpim_opt.problem.moments import relaxation, shares
 
-clarabel: Any = clarabel_module  # a compiled module, without types
+if TYPE_CHECKING:
+    import cvxpy as cp
+else:
+    cp = Late("cvxpy")
+conif: Any = Late("cvxpy.reductions.solvers.conic_solvers.clarabel_conif")
+
+clarabel: Any = Late("clarabel")  # a compiled module, without types
 SOUGHT = 1e-8
 """Tolerance of gap and feasibility, the form being of size one: what follows refines rotations and multipliers."""
 
@@ -99,7 +102,7 @@ def _cone(count: int, shared: int) -> _Cone:
     data = stated.problem.get_problem_data(cp.CLARABEL, solver_opts={})[0]
     start = data["param_prob"].var_id_to_col[stated.multipliers.id]
     own = slice(start, start + stated.multipliers.size)
-    return _Cone(sparse.csc_matrix(data["A"]), data["c"], dims_to_solver_cones(data["dims"]), own, stated.places)
+    return _Cone(sparse.csc_matrix(data["A"]), data["c"], conif.dims_to_solver_cones(data["dims"]), own, stated.places)
 
 
 def relax(Q: Array, shared: int | None = None) -> Moments:

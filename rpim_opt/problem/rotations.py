@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import transform
 from rpim_opt.problem.moments import rotation_constraints
 from rpim_opt.problem.placing import proper
 from rpim_opt.problem.relaxed import Moments, relax
@@ -176,7 +176,7 @@ def _moved(L: Array, rotations: Array, step: Array, value: float) -> tuple[Array
     """Return the rotations after the step, or the first of its halves that lowers the value."""
     part = step
     for _ in range(12):
-        turn = Rotation.from_rotvec(part.reshape(-1, 3)).as_matrix()
+        turn = transform.Rotation.from_rotvec(part.reshape(-1, 3)).as_matrix()
         moved = proper(rotations @ turn)
         lower = _value(L, moved)
         if lower < value:

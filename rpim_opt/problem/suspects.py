@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import listed
@@ -232,7 +232,7 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             best, place, step = gain, int(k), found
     freedom = max(len(r) - n - 6, 1)
     left = max(whole - best, 1e-300)
-    chance = f_distribution.sf(best / 6 / (left / freedom), 6, freedom) * len(places)
+    chance = fdtrc(6, freedom, best / 6 / (left / freedom)) * len(places)
     if best > (1 - MOVED) * whole and chance < RARE:
         yield _moved_text(problem, x, base, place, step, np.sqrt(left / whole))
 

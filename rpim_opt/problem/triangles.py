@@ -11,7 +11,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.data.dataset import whole_configurations
-from rpim_opt.problem.linear import LinearModel, Reweigh, from_triangle, reduced_rows
+from rpim_opt.problem.linear import LinearModel, Reweigh, by_twos, from_triangle, reduced_equations
 from rpim_opt.problem.problem import CalibrationProblem
 
 ROWS = 4096
@@ -53,11 +53,8 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
 def joined(models: Sequence[LinearModel]) -> LinearModel:
     """Return the triangle of several triangles, joined by twos."""
     R = [np.column_stack([model.A, model.b]) for model in models]
-    while len(R) > 1:
-        pairs = [R[i : i + 2] for i in range(0, len(R), 2)]
-        R = [reduced_rows(pair[-1], pair[0]) if len(pair) == 2 else pair[0] for pair in pairs]
     equations = sum(model.equations for model in models)
-    return from_triangle(models[0], R[0], equations, sum(model.offset for model in models))
+    return from_triangle(models[0], by_twos(R), equations, sum(model.offset for model in models))
 
 
 def _rotated(models: Iterable[LinearModel]) -> LinearModel:
@@ -67,7 +64,7 @@ def _rotated(models: Iterable[LinearModel]) -> LinearModel:
         equations += last.equations
         offset += last.offset
         with phase("reduction"):
-            R = reduced_rows(np.column_stack([last.A, last.b]), R)
+            R = reduced_equations(last.A, last.b, R)
     if last is None or R is None:
         raise InputError("data", "no row", "at least one")
     return from_triangle(last, R, equations, offset)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.graduated import Solved
@@ -93,7 +93,7 @@ def judged(
     gap = excess / (1 + solved.cost)
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
-    radius = best.radius(float(chi2.ppf(1 - AS_WELL, loops.unknowns)))
+    radius = best.radius(float(chdtri(loops.unknowns, AS_WELL)))
     doubt = _doubt(solved, gap, uncertainty, radius, scale)
     reason = doubt or f"no other start is better: the bound meets the cost within {gap:.1e} of it"
     return CertifiedStart(

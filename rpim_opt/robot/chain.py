@@ -8,10 +8,10 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import transform
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, link, numeric_frame
 from rpim_opt.robot.mdh import MDH, Robot
 
@@ -78,7 +78,7 @@ class Chain:
 def same_place(one: Array, other: Array) -> bool:
     """Return whether two frames (6,) are within `SAME_PLACE`."""
     T = np.linalg.inv(numeric_frame(one)) @ numeric_frame(other)
-    angle = Rotation.from_matrix(T[:3, :3]).magnitude()
+    angle = transform.Rotation.from_matrix(T[:3, :3]).magnitude()
     return bool(np.linalg.norm(T[:3, 3]) < SAME_PLACE[0] and angle < SAME_PLACE[1])
 
 
@@ -219,7 +219,7 @@ def _to_axis(axis: Array) -> Array:
     v = np.cross([0.0, 0.0, 1.0], axis)
     s = float(np.linalg.norm(v))
     turn = v / s if s > 0 else np.array([1.0, 0.0, 0.0])  # to -z: about x
-    T[:3, :3] = Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
+    T[:3, :3] = transform.Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
     return T
 
 

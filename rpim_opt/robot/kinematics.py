@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.joint_terms import displacement, motion
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.posture import Posture, Symbol
@@ -25,6 +26,8 @@ FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True)
 
 CHUNK = 256
 """Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
+SHARE = 16 * CHUNK
+"""Rows that one thread evaluates before it takes more: enough to be worth handing over."""
 
 
 def rotation_x(angle: Symbol) -> ca.SX:
@@ -198,19 +201,24 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     """
     results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
-    buffers: dict[int, Any] = {}
-    for start in range(0, len(rows), CHUNK):
-        part = slice(start, start + CHUNK)
-        N = len(rows[part])
-        if N not in buffers:
-            buffers[N] = _mapped(function, len(shared), N).buffer()
-            for i, values in enumerate(arguments[:-1]):
-                buffers[N][0].set_arg(i, values.data)
-        buffer, trigger = buffers[N]
-        buffer.set_arg(len(shared), arguments[-1][part].data)
-        for i, values in enumerate(results):
-            buffer.set_res(i, values[part].data)
-        trigger()
+
+    def evaluate(begin: int) -> None:
+        buffers: dict[int, Any] = {}
+        end = min(begin + SHARE, len(rows))
+        for start in range(begin, end, CHUNK):
+            part = slice(start, min(start + CHUNK, end))
+            N = len(rows[part])
+            if N not in buffers:
+                buffers[N] = _mapped(function, len(shared), N).buffer()
+                for i, values in enumerate(arguments[:-1]):
+                    buffers[N][0].set_arg(i, values.data)
+            buffer, trigger = buffers[N]
+            buffer.set_arg(len(shared), arguments[-1][part].data)
+            for i, values in enumerate(results):
+                buffer.set_res(i, values[part].data)
+            trigger()
+
+    on_all_cores(evaluate, range(0, len(rows), SHARE))
     return results
 
 

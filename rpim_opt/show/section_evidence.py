@@ -58,9 +58,16 @@ def _directions(result: Calibration) -> Element:
     return figure(chart, caption, *legend)
 
 
+MOST = 200
+"""Distrusted rows that are named, the worst first: nobody reads on."""
+
+
 def distrusted_section(result: Calibration) -> list[Element]:
     """Return the rows that stand out, and those that were left out."""
-    rows = [[f.label, f"{f.sigmas:.1f}", mm(f.error_mm), "distrusted, in the data"] for f in result.flagged]
+    flagged = result.flagged
+    rows = [[f.label, f"{f.sigmas:.1f}", mm(f.error_mm), "distrusted, in the data"] for f in flagged[:MOST]]
+    if len(flagged) > MOST:
+        rows.append([f"and {len(flagged) - MOST} more", "", "", "distrusted, in the data; result.json names them"])
     rows += [[label, "", "", f"left out: {reason}"] for label, reason in result.record.excluded.items()]
     if not rows:
         text = "No row stands out beyond what one good set of data in a hundred would show, and none was left out."

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.believed import believed
 from rpim_opt.convex.constraints import (
     at_nominal,
@@ -28,11 +28,11 @@ from rpim_opt.store.parts import finite
 from rpim_opt.store.schema import DefinitionPart, QuadraticPart, Term
 
 READY: dict[str, Callable[..., Any]] = {
-    "sum_squares": cp.sum_squares,
-    "sum": cp.sum,
-    "max": cp.max,
-    "norm1": cp.norm1,
-    "norm2": cp.norm2,
+    "sum_squares": SQUARES,
+    "sum": SUM,
+    "max": LARGEST,
+    "norm1": NORM1,
+    "norm2": NORM2,
     "within_tolerance": within_tolerance,
     "by_link": by_link,
     "by_kind": by_kind,

@@ -13,9 +13,10 @@ from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
 from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.constraints import Box, Constraint
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.given import Unknown, given
+from rpim_opt.convex.given import given
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
@@ -26,6 +27,7 @@ from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
+from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.named import named_formulation, named_weight
 from rpim_opt.store.observations import Tables, read_tables
@@ -201,13 +203,23 @@ def _formulation(stated: Stated, problem: CalibrationProblem) -> Formulation:
     demands = table.constraints.all(problem.robot, problem.data)
     formulation = replace(formulation, constraints=(*formulation.constraints, *demands))
     parameters = identified_of(problem.robot, problem.parameters, problem.data)
-    z = Unknown(parameters.names)
     for constraint in formulation.constraints:
-        constraint(z, given(z, parameters))
+        if isinstance(constraint, Box):
+            constraint.bounds(parameters)
+        else:
+            _require_fit(constraint, parameters)
     for demand in demands:
         if isinstance(demand, Drawn):
             demand.require_near(parameters)
     return formulation
+
+
+def _require_fit(constraint: Constraint, parameters: Parameters) -> None:
+    """Ask a constraint of the file for what it demands of the parameters, or raise its InputError."""
+    from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
+
+    z = Unknown(parameters.names)
+    constraint(z, given(z, parameters))
 
 
 def _published(table: ProblemTable, tables: Tables, path: Path) -> dict[str, Mapping[str, float]]:

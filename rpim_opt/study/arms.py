@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import find_robot
@@ -115,7 +115,7 @@ def flange(robot: Robot, q: Array, errors: Array) -> Array:
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, turned.T, errors, strict=True):
         before = _small(np.array([a, 0, 0, alpha, 0, 0]))
         turn = np.tile(np.eye(4), (len(q), 1, 1))
-        turn[:, :3, :3] = Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+        turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ before @ turn @ behind @ _small(error)
     return T
@@ -148,7 +148,7 @@ class _Moved:
         T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
         for (alpha, a, theta, d, beta), angle in zip(self.robot.mdh, (q @ self.robot.joint_map.T).T, strict=True):
             turn = np.tile(np.eye(4), (len(q), 1, 1))
-            turn[:, :3, :3] = Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+            turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
             T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ _small(np.array([0, 0, d, 0, beta, 0]))
             frames.append(T)
         places = [frame[:, :3, 3] for frame in frames]
@@ -174,6 +174,6 @@ def _errors(dof: int, rng: np.random.Generator) -> Array:
 def _small(numbers: Array) -> Array:
     """Return the transform (4, 4) of a translation and a rotation vector."""
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(numbers[3:]).as_matrix()
+    T[:3, :3] = transform.Rotation.from_rotvec(numbers[3:]).as_matrix()
     T[:3, 3] = numbers[:3]
     return T

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.late import spatial
 from rpim_opt.calibration.intervals import position_noise, scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
@@ -267,7 +267,7 @@ class Cell(NamedTuple):
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
         seen = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
-        distance = cdist(poses[:, :3], seen[:, :3], "sqeuclidean")
+        distance = spatial.distance.cdist(poses[:, :3], seen[:, :3], "sqeuclidean")
         if poses.shape[1] == 7:
             distance += 8 * (1 - np.abs(poses[:, 3:] @ seen[:, 3:].T))  # the angle's square, nearly
         closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]

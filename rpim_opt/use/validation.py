@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import f as fisher
+from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
@@ -273,4 +273,4 @@ def _judged(result: Calibration, data: Dataset) -> tuple[Array, Array, float | N
 
 def _limit(k: int, freedom: float, rows: int) -> float:
     """Return above which norm one of so many rows with k components lies with probability `RARE`."""
-    return float(np.sqrt(k * fisher.isf(RARE / rows, k, max(freedom, 1.0))))
+    return float(np.sqrt(k * fdtri(k, max(freedom, 1.0), 1 - RARE / rows)))

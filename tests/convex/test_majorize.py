@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.majorize import Squares, on_triangles, separable
 from tests.convex.test_formulation import model
 
@@ -125,7 +126,7 @@ def test_what_triangles_cannot_hold_is_refused() -> None:
 
 def test_a_loss_over_triangles_is_a_sum_of_squares_and_its_maker() -> None:
     solved, squares = on_triangles(ro.robust, 120)
-    assert (solved.loss, solved.loss_over, solved.penalty) == (cp.sum_squares, "equation", ro.robust.penalty)
+    assert (solved.loss, solved.loss_over, solved.penalty) == (SQUARES, "equation", ro.robust.penalty)
     assert squares is not None
     assert (squares.loss, squares.over, squares.before) == (ro.robust.loss, "configuration", None)
     assert squares.after(Z).before is Z

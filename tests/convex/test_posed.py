@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex.asked import configuration_norms, norms
 from rpim_opt.convex.conflict import Stated, _irreducible, _least, conflict, name_of
-from rpim_opt.convex.posed import configuration_norms, invariant, norms
+from rpim_opt.convex.posed import invariant
 from rpim_opt.convex.select_linear import Rule, linear_rule
 from rpim_opt.convex.selection import EDGES
 from rpim_opt.convex.structure import quadratic

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.basics import threads
 from rpim_opt.convex.majorize import Squares
 from rpim_opt.convex.trust import trusted_parts
 from rpim_opt.problem import parts as parts_module
-from rpim_opt.problem.parts import PartitionedProblem, on_cluster
+from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster
 from rpim_opt.problem.triangles import whole_configurations
 
 
@@ -229,3 +230,39 @@ def test_frames_far_off_are_found_from_the_first_part() -> None:
     assert here.converged
     # deviations count from where a third of the rows put the base: the prior of 100 mm hardly pulls
     assert here.errors().mean() == pytest.approx(there.errors().mean(), rel=0.05)
+
+
+def many(rows: int) -> ro.CalibrationProblem:
+    problem = ro.load("position").problem
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (rows, problem.robot.dof))
+    return problem.on(ro.Dataset.of(q, rng.normal(size=(rows, 3)), 5e-5))
+
+
+@pytest.mark.parametrize("rows", [9_000, 70_000])
+def test_no_digit_depends_on_the_number_of_cores(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    problem = in_parts(many(rows))
+    x = np.zeros(len(problem.parameters.free))
+    found = []
+    for count in (1, 2, 5):
+        monkeypatch.setattr(threads, "cores", lambda count=count: count)
+        model = problem.linearize(x)
+        found.append((model.triangle, problem.errors(x)))
+    for triangle, errors in found[1:]:
+        assert np.array_equal(triangle, found[0][0])
+        assert np.array_equal(errors, found[0][1])
+
+
+def test_a_triangle_of_many_equations_is_that_of_all() -> None:
+    model = many(9_000).linearize(np.zeros(34))
+    R = model.triangle
+    rows = np.column_stack([model.A, model.b])
+    assert pytest.approx(rows.T @ rows, rel=1e-10, abs=1e-10 * float(np.abs(rows.T @ rows).max())) == R.T @ R
+
+
+def test_functions_of_a_script_are_called_one_after_the_other() -> None:
+    whole = ro.load("position").problem
+    own = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
+    assert PartitionedProblem(whole.robot, whole.parameters, own[0](), own).compute is map
+    files = ro.problem.partitions(["a.csv", "b.csv"], whole.robot, {"position_mm": 0.03})
+    assert PartitionedProblem(whole.robot, whole.parameters, own[0](), files).compute is threads.on_all_cores

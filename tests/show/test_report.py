@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex.program import Program
+from rpim_opt.show import section_evidence, section_weight
 from rpim_opt.show.report import page
 from rpim_opt.show.svg import Axis
 from tests.browser import NAMES, PROGRAM, Browser, browser
@@ -298,3 +300,27 @@ def test_it_prints(opened: Browser, tmp_path: Path) -> None:
     opened.print(tmp_path / "report.pdf")
     pages = (tmp_path / "report.pdf").read_bytes().count(b"/Type /Page\n")
     assert 3 <= pages <= 12
+
+
+def test_a_robust_result_of_many_rows_is_drawn_by_what_it_trusts(monkeypatch) -> None:
+    problem = ro.load("blunders").problem
+    result = ro.calibrate(problem, ro.robust, weight=1.0)
+    sentence = "The curve is that of the squares which the loss trusts"
+    assert sentence not in page(result)
+    monkeypatch.setattr(section_weight, "MANY", 100)  # 150 equations
+    asked = []
+    solve = Program.solve
+    monkeypatch.setattr(Program, "solve", lambda program, *a, **k: asked.append(program) or solve(program, *a, **k))
+    text = page(result)
+    assert sentence in text
+    assert not [program for program in asked if not program.quadratic]
+    assert "reml" in text
+
+
+def test_many_distrusted_rows_are_not_all_named(monkeypatch) -> None:
+    result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
+    monkeypatch.setattr(section_evidence, "MOST", 2)
+    text = page(result)
+    assert "and 3 more" in text
+    named = [flag.label for flag in result.flagged]
+    assert f">{named[1]}<" in text

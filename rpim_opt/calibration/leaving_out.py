@@ -1,0 +1,317 @@
+"""What every configuration does to the result: the change of each parameter if it had not been measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import display
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.terms import term
+from rpim_opt.convex.trust import SMALL
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_equations
+from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.problem import CalibrationProblem
+
+TINY = 1e-300
+"""Where numbers end that something may be divided by."""
+ALONE = 1e-9
+"""A configuration decides a direction alone where it leaves less than this part of what is known of it to others."""
+UNSEEN = 1e-9
+"""Standard deviations below, in scales, are rounding: the data do not see the parameter, and nothing moves it."""
+BALANCED = 1e-4
+"""What the slopes of weighted equations and penalty may leave of each other at the solution, relative to those of the
+data at nominal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Influence:
+    """What C configurations do to n parameters.
+
+    Parameters
+    ----------
+    label
+        C labels, of a configuration's first row.
+    configuration
+        (C,) numbers.
+    parameters, dimensions
+        Names of the n identified parameters, and what they measure.
+    leverage
+        (C,) trace of a configuration's part of the influence matrix: how many degrees of freedom of the fit are its
+        own. They sum to those of the fit.
+    cook
+        (C,) Cook's distance (1977): how far all predictions move without the configuration, in units of the noise and
+        a degree of freedom. About 1 and above: the result hangs on it.
+    change
+        (C, n) by how much every parameter would change without the configuration [SI]; NaN where no other decides it.
+    deviation
+        (n,) standard deviations of the parameters from the noise [SI]; zero where the data do not see one.
+    weight
+        (C,) what a robust loss gave the configuration at the end, against a squared loss; 1 for a squared one.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
+    >>> found = ro.calibration.influence(result)
+    >>> found.change.shape, f"{found.leverage.sum():.1f}", f"{result.degrees_of_freedom:.1f}"
+    ((40, 34), '26.7', '26.7')
+    """
+
+    label: tuple[str, ...]
+    configuration: np.ndarray
+    parameters: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    leverage: Array
+    cook: Array
+    change: Array
+    deviation: Array
+    weight: Array
+
+    @property
+    def standardized(self) -> Array:
+        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
+        >>> moved = ro.calibration.influence(result).standardized
+        >>> moved.shape, bool(np.abs(moved).max() > 0.5)
+        ((40, 34), True)
+        """
+        return np.divide(self.change, self.deviation, out=np.zeros_like(self.change), where=self.deviation > 0)
+
+    def strongest(self) -> dict[str, tuple[str, float]]:
+        """Return for every parameter the configuration that moves it most, and by how many standard deviations.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("blunders").problem, ro.tikhonov, weight=1.0)
+        >>> label, moved = ro.calibration.influence(result).strongest()["d2"]
+        >>> label, round(moved, 1)
+        ('c1', 0.7)
+        """
+        moved = self.standardized
+        size = np.where(np.isnan(moved), np.inf, np.abs(moved))
+        most = np.argmax(size, axis=0)
+        columns = range(len(self.parameters))
+        return {self.parameters[j]: (self.label[most[j]], float(moved[most[j], j])) for j in columns}
+
+    def to_frame(self) -> Any:
+        """Return a data frame (pandas), one row a configuration; a parameter's change in its unit, ``a2_mm``.
+
+        >>> import rpim_opt as ro
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
+        >>> frame = ro.calibration.influence(result).to_frame()
+        >>> frame.shape, list(frame.columns[:6])
+        ((9, 31), ['label', 'configuration', 'leverage', 'cook', 'weight', 'alpha1_deg'])
+        """
+        import pandas
+
+        columns: dict[str, Any] = {"label": self.label, "configuration": self.configuration}
+        columns |= {"leverage": self.leverage, "cook": self.cook, "weight": self.weight}
+        for j, (name, dimension) in enumerate(zip(self.parameters, self.dimensions, strict=True)):
+            unit, si = display(dimension)
+            columns[f"{name}_{unit}"] = self.change[:, j] / si
+        return pandas.DataFrame(columns)
+
+
+def influence(result: Calibration) -> Influence:
+    """Return what leaving out every configuration would do to every parameter.
+
+    At the solution z the data's equations A z ~ b with their weights W and the penalty w |L z - c|^2 have the
+    information H = A'WA + w L'L. Without configuration k, whose weighted equations are A_k and residuals r_k,
+
+        z_-k - z = H^-1 A_k' (I - A_k H^-1 A_k')^-1 r_k
+
+    which is exact for the last linearization at the same weight, and costs one pass over the equations for all of
+    them. With a robust loss W are the weights with which the loss ended; they are held, so that what is left out
+    changes no other configuration's weight. Parameters at a bound stay there.
+
+    Parameters
+    ----------
+    result
+        With a squared penalty or none.
+
+    Raises
+    ------
+    InputError
+        For another penalty, and a loss that weighs no equations (minimax rests on a few).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("blunders").problem
+    >>> found = ro.calibration.influence(ro.calibrate(problem, ro.tikhonov, weight=1.0))
+    >>> [found.label[k] for k in np.argsort(-found.cook)[:3]]  # blunders
+    ['c43', 'c14', 'c1']
+    >>> robust = ro.calibration.influence(ro.calibrate(problem, ro.robust, weight=1.0))
+    >>> print(f"{robust.weight[list(robust.label).index('c39')]:.3f}")
+    0.020
+    """
+    program = result.program
+    if not program.linear_penalty:
+        found = f"formulation '{result.formulation.name}'"
+        raise InputError("influence", found, "a squared penalty or none")
+    free = _moving(result)
+    pieces = list(_weighted(result))
+    R = _triangle([piece.model for piece in pieces])
+    _require_balance(result, R, free)
+    T = _inverse_root(result, R, free)
+    parts = [_of_piece(piece, result.z, T) for piece in pieces]
+    leverage, change, squares = (np.concatenate(each) for each in zip(*parts, strict=True))
+    used = float(np.sum(leverage))
+    spare = sum(len(piece.model.b) for piece in pieces) - used
+    variance = 1.0
+    if spare > 1e-6:
+        variance = float(np.sum(squares)) / spare
+    moved = change @ R[:, :-1].T
+    spread = np.sqrt(variance * np.sum((R[:, :-1] @ T @ T.T) ** 2, axis=0))
+    spread[spread < UNSEEN] = 0.0
+    stated = result.problem.parameters.free
+    return Influence(
+        label=tuple(label for piece in pieces for label in piece.label),
+        configuration=np.concatenate([piece.configuration for piece in pieces]),
+        parameters=stated.names,
+        dimensions=stated.dimensions,
+        leverage=leverage,
+        cook=np.sum(moved**2, axis=1) / (max(used, TINY) * max(variance, TINY)),
+        change=change * stated.scale,
+        deviation=spread * stated.scale,
+        weight=np.concatenate([piece.weight for piece in pieces]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    """Weighted equations of some configurations, sorted by them; how many each has, and its mean weight."""
+
+    model: LinearModel
+    count: np.ndarray
+    weight: Array
+    configuration: np.ndarray
+    label: tuple[str, ...]
+
+
+def _weighted(result: Calibration) -> Iterator[_Piece]:
+    """Yield the equations of the last linearization, with the weights that the loss ended with."""
+    model = result.program.model
+    if model.stands_for is None and isinstance(result.problem, CalibrationProblem):
+        if result.squared_loss:
+            model = result.program.squared
+        yield _piece(result, model, result.problem.data)
+        return
+    for part in in_parts(result.problem).rows():
+        yield _piece(result, part.linearize(result.x), part.data)
+
+
+def _piece(result: Calibration, model: LinearModel, data: Dataset) -> _Piece:
+    order = np.argsort(model.group, kind="stable")
+    model = replace(model, A=model.A[order], b=model.b[order], group=model.group[order])
+    numbers, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
+    weight = _weights(result, model, which, len(count))
+    first = dict(zip(data.configuration[::-1], data.label[::-1], strict=True))
+    label = tuple(first[number] for number in numbers)
+    mean = np.bincount(which, weight) / count
+    return _Piece(model.scaled(np.sqrt(weight)), count, mean, numbers, label)
+
+
+def _weights(result: Calibration, model: LinearModel, which: np.ndarray, configurations: int) -> Array:
+    """Return loss'(v) / (2 v) of every equation (m,): the squares that the loss ended with."""
+    if result.squared_loss:
+        return np.ones(len(model.b))
+    residual = model.A @ result.z - model.b
+    stated = result.formulation
+    v = np.abs(residual)
+    if stated.loss_over == "configuration":
+        v = np.sqrt(np.bincount(which, residual**2, minlength=configurations))
+    v = np.maximum(v, SMALL)
+    slope = term(stated.loss, len(v), f"formulation '{stated.name}', loss").slope(v)
+    if slope is None:
+        raise _unweighted(result)
+    each = np.maximum(slope, 0.0) / (2 * v)
+    if stated.loss_over == "configuration":
+        return each[which]
+    return each
+
+
+def _unweighted(result: Calibration) -> InputError:
+    found = f"formulation '{result.formulation.name}'"
+    return InputError("influence", found, "a loss that weighs its equations by their residuals: squares, Huber's")
+
+
+def _triangle(models: list[LinearModel]) -> Array:
+    """Return the triangle (n+1, n+1) of all weighted equations."""
+    R = None
+    for model in models:
+        R = reduced_equations(model.A, model.b, R)
+    if R is None:
+        raise InputError("data", "no row", "at least one")
+    return R
+
+
+def _price(result: Calibration) -> tuple[Array, Array]:
+    """Return L and c, times the root of the weight, of the penalty |L z - c|^2."""
+    form = result.program.penalty_form
+    root = np.sqrt(result.penalty_weight)
+    if form is None:
+        return np.zeros((0, len(result.z))), np.zeros(0)
+    return root * form.matrix, root * form.c
+
+
+def _moving(result: Calibration) -> np.ndarray:
+    """Return which parameters (n,) no bound holds."""
+    held = {each.name for each in result.held}
+    return np.array([name not in held for name in result.problem.parameters.free.names])
+
+
+def _require_balance(result: Calibration, R: Array, free: np.ndarray) -> None:
+    """Refuse a solution that is none of the weighted equations: the loss is no matter of weights."""
+    n = len(result.z)
+    A, b = R[:, :n], R[:, n]
+    L, c = _price(result)
+    slope = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
+    if np.linalg.norm(slope[free]) > BALANCED * np.linalg.norm(A.T @ b):
+        raise _unweighted(result)
+
+
+def _inverse_root(result: Calibration, R: Array, free: np.ndarray) -> Array:
+    """Return T (n, k) with H^-1 = T T' over the parameters that move, and what decides them."""
+    n = len(result.z)
+    rows = np.vstack([R[:, :n], _price(result)[0]])[:, free]
+    _, s, Vt = np.linalg.svd(rows, full_matrices=False)
+    seen = s > RANK_TOLERANCE * np.max(s, initial=0.0)
+    T = np.zeros((n, np.count_nonzero(seen)))
+    T[free] = Vt[seen].T / s[seen]
+    return T
+
+
+def _of_piece(piece: _Piece, z: Array, T: Array) -> tuple[Array, Array, Array]:
+    """Return leverages (C,), changes (C, n) in scales, and the sum of squares (C,) of the configurations."""
+    residual = piece.model.A @ z - piece.model.b
+    Q = piece.model.A @ T
+    first = np.cumsum(piece.count) - piece.count
+    leverage = np.empty(len(first))
+    squares = np.empty(len(first))
+    change = np.empty((len(first), len(z)))
+    for count in np.unique(piece.count):
+        chosen = np.flatnonzero(piece.count == count)
+        rows = first[chosen][:, None] + np.arange(count)
+        q, r = Q[rows], residual[rows]
+        hat = q @ q.transpose(0, 2, 1)
+        leverage[chosen] = np.einsum("kii->k", hat)
+        squares[chosen] = np.sum(r**2, axis=1)
+        spare = np.eye(count) - hat
+        alone = np.linalg.eigvalsh(spare)[:, 0] < ALONE
+        spare[alone] = np.eye(count)
+        pull = np.linalg.solve(spare, r[:, :, None])[:, :, 0]
+        moved = np.einsum("kij,ki->kj", q, pull) @ T.T
+        moved[alone] = np.nan
+        change[chosen] = moved
+    return leverage, change, squares

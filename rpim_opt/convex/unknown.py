@@ -1,0 +1,40 @@
+"""The unknowns of a formulation as a variable of CVXPY whose entries have names; importing it imports CVXPY."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cvxpy as cp
+
+from rpim_opt.convex.given import index_of
+
+
+class Unknown(cp.Variable):
+    """z (n,), deviations in units of their scales, whose entries have names: ``z["a2"]``, ``z["a?"]``.
+
+    Parameters
+    ----------
+    names
+        Of the n identified parameters.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> z = ro.convex.Unknown(("a1", "a2", "d1"))
+    >>> z["a2"].shape, z["a?"].shape, z[1].shape
+    ((), (2,), ())
+    >>> z["a4"]
+    Traceback (most recent call last):
+    rpim_opt.basics.exceptions.InputError: z: found 'a4', accepted: parameters: a1, a2, d1.
+    """
+
+    def __init__(self, names: Sequence[str]):
+        super().__init__(len(names), name="z")
+        self.names = tuple(names)
+
+    def __getitem__(self, key: Any) -> Any:
+        return super().__getitem__(index_of(self.names, key, "z"))
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.names)
