@@ -182,7 +182,7 @@ class Objective(Brief):
     @property
     def on_triangles(self) -> bool:
         """Whether triangles of some of the equations, instead of these, give this program of them."""
-        posed_on_triangle = self._posed.r.size == self.model.A.shape[1] + 1
+        posed_on_triangle = self._posed.equations == self.model.A.shape[1] + 1
         return posed_on_triangle and self.linear_or_split and self.squared_rows
 
     @property

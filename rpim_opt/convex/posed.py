@@ -294,13 +294,13 @@ class Posed:
 
     def loss_of_norms(self, v: Array) -> float:
         """Return a loss of the configurations' norms (N,)."""
-        return self._loss_term(v)
+        return self.asked.loss_term(v)
 
     def row_slopes(self, v: Array) -> Array | None:
         """Return the gradient of the loss by what it gets: residuals (m,) or configurations' norms (N,)."""
-        if self.inner or self._loss_term.variable.size != len(v):
+        if self.inner or self.asked.loss_term.variable.size != len(v):
             return None
-        return self._loss_term.slope(v)
+        return self.asked.loss_term.slope(v)
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, stdtrit
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.study.replicate import UNCONVERGED
@@ -169,7 +169,7 @@ def _parts(label: str, ratios: Mapping[Pair, float], drawn: AbstractSet[str]) ->
 
 def _ends(means: Array, count: int) -> tuple[float, float]:
     """Return the ends of the interval of a mean of ``count`` things, from means (draws,) of things drawn anew."""
-    beyond = norm.cdf(np.sqrt(count / (count - 1)) * t.ppf((1 - CONFIDENCE) / 2, count - 1))
+    beyond = ndtr(np.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - CONFIDENCE) / 2))
     low, high = np.quantile(means, [beyond, 1 - beyond])
     return float(np.exp(low)), float(np.exp(high))
 
