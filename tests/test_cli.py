@@ -194,7 +194,7 @@ def test_a_solver_failure_writes_nothing(monkeypatch, capsys, folder) -> None:
     for solver in ("interior", "by_solver"):
         monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
     out = folder / "out"
-    assert run(monkeypatch, "calibrate", str(folder), "--formulation", "robust", "--out", str(out)) == 3
+    assert run(monkeypatch, "calibrate", str(folder), "--formulation", "minimax", "--out", str(out)) == 3
     assert "out of luck" in capsys.readouterr().err
     assert not out.exists()
 

@@ -486,7 +486,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
     for solver in ("interior", "by_solver"):
         monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
-    assert run(monkeypatch, "calibrate", str(made), "--formulation", "robust", "--json") == 3
+    assert run(monkeypatch, "calibrate", str(made), "--formulation", "minimax", "--json") == 3
     said = capsys.readouterr()
     assert said.out == ""
     assert "out of luck" in json.loads(said.err)["error"]

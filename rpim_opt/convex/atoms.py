@@ -32,6 +32,10 @@ class Atom:
     def __repr__(self) -> str:
         return f"cp.{self.name}"
 
+    @property
+    def __name__(self) -> str:
+        return self.name
+
 
 SQUARES, SUM, LARGEST, NORM1, NORM2 = (Atom(name) for name in ("sum_squares", "sum", "max", "norm1", "norm2"))
 ATOMS = (SQUARES, SUM, LARGEST, NORM1, NORM2)

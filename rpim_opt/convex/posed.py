@@ -191,7 +191,7 @@ class Posed:
     @cached_property
     def split(self) -> Split | None:
         """The unknowns in which the penalty is a sum of absolute values and norms; None where there are none such."""
-        if self.formulation.penalty is None or self.penalty_form is not None or self.box is None or self.inner:
+        if self.penalty_form is not None or self.box is None or self.inner or self.penalty is None:
             return None
         z = cp.Variable(self.n)
         found = kinks(self.penalty.tree_copy({id(self.z): z}), z)

@@ -23,7 +23,7 @@ LABELS = tuple("abcdefgh")
 def flags(norms: np.ndarray) -> tuple[Flag, ...]:
     """Of rows that have these whitened norms, and errors of as many millimetres."""
     problem: Any = SimpleNamespace(
-        whitened_errors=lambda x: (norms, COUNT), labels=LABELS, errors=lambda x: 1e-3 * norms
+        whitened_errors=lambda x: (norms, COUNT), labels=LABELS, errors=lambda x, dimension="length": 1e-3 * norms
     )
     return flagged(problem, np.zeros(3))
 

@@ -49,6 +49,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
     stand_in: Any = SimpleNamespace(
         flagged=flags,
         held=held,
+        prices=(),
         squared_loss=squared_loss,
         problem=RESULT.problem,
         formulation=ro.tikhonov,
@@ -77,7 +78,7 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
 
 def test_what_a_file_could_not_hold_is_said() -> None:
     stand_in: Any = SimpleNamespace(
-        flagged=(), held=(), formulation=replace(ro.tikhonov, solvable=False), message="Done."
+        flagged=(), held=(), prices=(), formulation=replace(ro.tikhonov, solvable=False), message="Done."
     )
     assert "cannot be solved again" in words.remarks(stand_in)[0]
 
