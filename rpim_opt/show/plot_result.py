@@ -30,20 +30,21 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
     >>> ax = ro.plot.errors(result, instance.validation)
-    >>> ax.get_ylabel(), len(ax.patches)  # two bars a row
-    ('error [mm]', 32)
+    >>> ax.get_ylabel(), [len(line.get_xdata()) for line in ax.lines]  # two points a row
+    ('error [mm]', [16, 16])
     """
     ax = axes_of(ax)
     labels = (data or result.problem.data).label
     place = np.arange(len(labels))
     before = 1e3 * result.nominal_errors(data)
     after = 1e3 * result.errors(data)
-    ax.bar(place - 0.2, before, 0.4, color=BEFORE, label="nominal")
-    ax.bar(place + 0.2, after, 0.4, color=AFTER, label="identified")
+    ax.vlines(place, after, before, color=BEFORE, lw=0.8)  # no bars: a logarithmic axis has no zero to begin at
+    ax.plot(place, before, "o", color=BEFORE, ms=5, label="nominal")
+    ax.plot(place, after, "o", color=AFTER, ms=5, label="identified")
     flagged = {flag.label for flag in result.flagged} if data is None else set()
     wrong = [i for i, label in enumerate(labels) if label in flagged]
     if wrong:
-        ax.plot(place[wrong] + 0.2, after[wrong], "v", color=MARK, label="distrusted")
+        ax.plot(place[wrong], after[wrong], "v", color=MARK, label="distrusted")
     ax.set_yscale("log")
     ax.set_ylim(
         bottom=max(0.5 * min(np.nanmin(before), np.nanmin(after)), 1e-4)

@@ -47,7 +47,8 @@ def test_distrusted_rows_are_marked(ax) -> None:
     instance = ro.load("blunders")
     result = ro.calibrate(instance.problem, ro.robust, 1.0)
     ro.plot.errors(result, ax=ax)
-    assert len(ax.lines[0].get_xdata()) == len(result.flagged) == 5
+    marked = next(line for line in ax.lines if line.get_label() == "distrusted")
+    assert len(marked.get_xdata()) == len(result.flagged) == 5
     assert ax.get_ylabel() == "error [mm]"
 
 
