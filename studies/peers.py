@@ -2,8 +2,8 @@
 
 Simulated arms (`ro.study.simulated_arm`): three ready robots in turn with errors in all six directions behind every
 link, sizes that differ from arm to arm and from link to link, every other one with a joint that is off by a degree;
-base and reflector known to some millimetres; 0.03 mm noise a coordinate; 10, 25 or 52 configurations, 52 with three errors
-of 3 mm, or 52 of arms that sag and have eccentric encoders. Judged at 200 other configurations without noise.
+base and reflector known to some millimetres; 0.03 mm noise a coordinate; 10, 25 or 52 configurations, 52 with three
+errors of 3 mm, or 52 of arms that sag and have eccentric encoders. Judged at 200 other configurations without noise.
 
 All tools have the same data, the same nominal arm with base and reflector as they are known (as URDF or as rows alpha,
 a, theta, d), and identify a complete model: geometry, base and reflector. Joint values are those of the model.

@@ -99,8 +99,9 @@ class KnownAngle:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5).measurement.name
-    'known_square'
+    >>> known = ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5)
+    >>> known.measurement.name, known.value
+    ('known_square', 0.0)
     """
 
     between: tuple[str, str]
@@ -112,7 +113,7 @@ class KnownAngle:
 
     @property
     def value(self) -> float:
-        """By how much the angle differs from that: not at all."""
+        """By how much the angle differs from that [rad]: not at all."""
         return 0.0
 
     @property
