@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> int:
         return run("rpim-opt", *rest)
     os.chdir(ROOT)
     if what == "test":
-        return run("pytest", *rest)
+        return run("pytest", "-n", "auto", *rest)  # on all cores
     if what == "docs":
         return docs(*rest)
     failed = [name for name, command in CHECKS.items() if run(*command)]
