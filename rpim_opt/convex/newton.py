@@ -40,20 +40,21 @@ _potrs: Any
 _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
 
 
-class Point(NamedTuple):
-    """Where the method is: z (n,), coordinates a (p,), residual (m,), and the smoothed loss there."""
-
-    z: Array
-    a: Array
-    r: Array
-    smooth: Smoothed
-
-
 class Kinked(NamedTuple):
     """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
 
     multipliers: list[Array]
     sharpness: float
+
+
+class Point(NamedTuple):
+    """Where the method is: z (n,), coordinates a (p,), residual (m,), the kinks' state, and the smoothed loss there."""
+
+    z: Array
+    a: Array
+    r: Array
+    kinked: Kinked
+    smooth: Smoothed
 
 
 class Ended(NamedTuple):
@@ -140,52 +141,68 @@ class Newton:
             return np.zeros_like(ended.z)
         return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
 
-    def minimum(self, z: Array, kinked: Kinked | None = None, most: int = MOST) -> Ended:
-        """Return the minimum, or the best point of so many steps, begun at z (n,) with the multipliers of a neighbour.
+    def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
+        """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
 
         Where the neighbour was too far for kinks as sharp as there, they begin blunter.
         """
-        if self.loss.kinks and kinked is not None and most == MOST:
-            ended = self.minimum(z, kinked, SOON)
-            if ended.good:
-                return ended
-            blunt = self._begun(self.at.rows @ (self.at.inverse @ (ended.z - self.at.offset)) - self.at.b)
-            sharpness = min(BLUNT * blunt.sharpness, kinked.sharpness)
-            return self.minimum(ended.z, Kinked(ended.kinked.multipliers, sharpness), MOST - 1)
+        if kinked is None or not self.loss.kinks:
+            return self._descent(self._placed(z, kinked), MOST)
+        ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
+        if ended.good:
+            return ended
+        point = self._placed(ended.z, ended.kinked)
+        sharpness = min(BLUNT * self._begun(point.r).sharpness, kinked.sharpness)
+        return self._descent(self._about(point, ended.kinked._replace(sharpness=sharpness)), MOST)
+
+    def _descent(self, point: Point, most: int, hasty: bool = False) -> Ended:
+        """Return the best point of so many steps; a hasty one ends where some lower the gap no more."""
+        best: Any = None
+        vain = 0
+        for steps in range(most):
+            slope = self._slope(point)
+            ended = self._judged(point, slope, steps)
+            vain += 1
+            if best is None or ended.gap < best.gap:
+                best = ended
+                vain = 0
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or hasty)):
+                break
+            point = self._next(point, slope, ended.gap)
+        return best
+
+    def _placed(self, z: Array, kinked: Kinked | None) -> Point:
+        """Return the point at z (n,), or the one beside it that the coordinates can say."""
         if self.box is not None:
             z = np.clip(z, *self.box)
         a = np.where(self.unit > 0, self.at.inverse @ (z - self.at.offset), 0.0)
         if self.box is None:
             z = self.at.offset + self.at.B @ a
         r = self.at.rows @ a - self.at.b
-        if self.loss.kinks and kinked is None:
-            kinked = self._begun(r)
-        kinked = kinked or Kinked([], 1.0)
-        point = Point(z, a, r, self.loss.smoothed(r, *kinked))
-        best: Any = None
-        vain = 0
-        for steps in range(most):
-            slope = self._slope(point)
-            ended = self._judged(point, kinked, slope, steps)
-            vain += 1
-            if best is None or ended.gap < best.gap:
-                best = ended
-                vain = 0
-            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or most == SOON)):
-                break
-            if self.loss.kinks and ended.gap - point.smooth.missing <= SETTLED * point.smooth.missing:
-                kinked = Kinked(point.smooth.multipliers, min(SHARPER * kinked.sharpness, SHARPEST))
-                point = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
-                continue
-            ahead = self._stepped(point, slope, kinked)
-            if ahead is point and self.loss.kinks:  # no step is short enough for kinks so sharp
-                kinked = kinked._replace(sharpness=kinked.sharpness / SHARPER)
-                ahead = point._replace(smooth=self.loss.smoothed(point.r, *kinked))
-            point = ahead
-        return best
+        kinked = kinked or self._begun(r)
+        return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked))
+
+    def _about(self, point: Point, kinked: Kinked) -> Point:
+        """Return the same point with kinks in another state."""
+        return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked))
+
+    def _next(self, point: Point, slope: Array, gap: float) -> Point:
+        """Return the point after a step of Newton's, or of the multipliers where little else is left of the gap."""
+        if not self.loss.kinks:
+            return self._stepped(point, slope)
+        missing = point.smooth.missing
+        sharpness = point.kinked.sharpness
+        if gap - missing <= SETTLED * missing:
+            return self._about(point, Kinked(point.smooth.multipliers, min(SHARPER * sharpness, SHARPEST)))
+        ahead = self._stepped(point, slope)
+        if ahead is point:  # no step is short enough for kinks so sharp
+            return self._about(point, point.kinked._replace(sharpness=sharpness / SHARPER))
+        return ahead
 
     def _begun(self, r: Array) -> Kinked:
         """Return multipliers of zero, and kinks as blunt as the residuals are large."""
+        if not self.loss.kinks:
+            return Kinked([], 1.0)
         sizes = [np.median(np.abs(a * r + c)) for _, (a, c) in self.loss.kinks]
         factors = [np.median(factor) for factor, _ in self.loss.kinks]
         sharpness = max(f / max(s, 1e-9) for f, s in zip(factors, sizes, strict=True))
@@ -223,10 +240,10 @@ class Newton:
         lower, upper = self.box or (-np.inf, np.inf)
         return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
 
-    def _judged(self, point: Point, kinked: Kinked, slope: Array, steps: int) -> Ended:
+    def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
         gap, by_z = self._bound(point, slope)
         objective = point.smooth.loss + float(self.pull @ point.a**2)
-        state = Kinked(point.smooth.multipliers, kinked.sharpness)
+        state = point.kinked._replace(multipliers=point.smooth.multipliers)
         return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
 
     @cached_property
@@ -234,21 +251,21 @@ class Newton:
         """(p, n) inverse of the coordinates in their units."""
         return self.at.inverse / self.unit[:, None]
 
-    def _stepped(self, point: Point, slope: Array, kinked: Kinked) -> Point:
+    def _stepped(self, point: Point, slope: Array) -> Point:
         """Return the point after a step of Newton's."""
-        H = self._hessian(self.loss.curvature(point.r, *kinked))
+        H = self._hessian(self.loss.curvature(point.r, *point.kinked))
         factor, failed = _potrf(H)
         if failed:
             factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
         if self.box is None:
             step = -self.unit * _potrs(factor, slope)[0]
-            return self._searched(point, point.z, step, kinked)
+            return self._searched(point, point.z, step)
         u = self.back @ (point.z - self.at.offset)
         R = np.triu(factor)
         target = R @ u - solve_triangular(R, slope, trans=1)
         z, _ = minimum_in_box(R @ self.back, target + R @ (self.back @ self.at.offset), *self.box, point.z)
         step = self.unit * (self.back @ (z - point.z))
-        return self._searched(point, z, step, kinked)
+        return self._searched(point, z, step)
 
     def _hessian(self, curvatures: list[Curvature]) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
@@ -276,16 +293,17 @@ class Newton:
         X = self.loss.projected(self.at.rows, u, bent)
         return X.T @ (along[bent][:, None] * X)
 
-    def _searched(self, point: Point, z: Array, step: Array, kinked: Kinked) -> Point:
+    def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""
         ahead = self.at.rows @ step
 
         def at(t: float) -> Point:
-            a, r = point.a + t * step, point.r + t * ahead
+            a = point.a + t * step
+            r = point.r + t * ahead
             place = self.at.offset + self.at.B @ a
             if self.box is not None:
                 place = np.clip(point.z + t * (z - point.z), *self.box)
-            return Point(place, a, r, self.loss.smoothed(r, *kinked))
+            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked))
 
         def rise(p: Point) -> float:
             slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)
