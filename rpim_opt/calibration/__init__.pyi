@@ -7,7 +7,5 @@ from .leaving_out import influence as influence
 from .outcome import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
-from .sag import bends_upwards as bends_upwards
-from .sag import said_of_bending as said_of_bending
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo

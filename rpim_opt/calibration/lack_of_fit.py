@@ -102,7 +102,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     Parameters
     ----------
     result
-        Any calibration, of this session or of a file.
+        Any calibration, just made or read from a file.
 
     Examples
     --------

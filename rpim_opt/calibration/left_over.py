@@ -12,7 +12,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.alike import Alike, alike
 from rpim_opt.calibration.compared import OWNED, SPEAK, Comparison, Judged
 from rpim_opt.calibration.families import TURNED
-from rpim_opt.calibration.sag import SURE
 from rpim_opt.convex.prior import family_of
 from rpim_opt.problem.loads import measured_torques
 from rpim_opt.problem.problem import CalibrationProblem
@@ -28,6 +27,8 @@ FEWEST = 6
 """Equations that must be left over, or repeated, to judge by."""
 NOTABLE = 0.5
 """Effect of a joint's compliance over the largest, below which wrong masses explain its sign."""
+SURE = 3.0
+"""Standard deviations by which a compliance is below zero before a joint is said to bend upwards."""
 UNSEEN = 1e-10
 """Relative singular value of a direction of the geometry that the data do not see."""
 RARE = 1e-3

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.sag import bends_upwards, said_of_bending
+from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.data.models import position
 from rpim_opt.store.content import digest
 from rpim_opt.store.simulation import write_simulation
@@ -195,17 +195,16 @@ def test_free_first_moments_are_predicted_and_compensated() -> None:
 # --- the wrong way up -----------------------------------------------------------------------------------------------
 
 
-def upwards(result: ro.calibration.Calibration) -> list[int]:
-    return bends_upwards(result.problem, result.x, np.sqrt(np.diag(result.covariance)))
+def upwards(result: ro.calibration.Calibration) -> tuple[int, ...]:
+    return lack_of_fit(result).upward
 
 
 def test_a_robot_that_hangs_otherwise_than_stated_seems_to_bend_upwards() -> None:
     right, *_ = calibrated(arm())
-    assert upwards(right) == []
-    assert said_of_bending([]) == ""
+    assert upwards(right) == ()
     wrong, *_ = calibrated(arm("ceiling"), believed=arm("floor"))
     assert {2, 3} <= set(upwards(wrong))
-    assert "bend upwards, which gravity cannot do" in said_of_bending(upwards(wrong))
+    assert any("bend upwards, which gravity cannot do" in said for said in lack_of_fit(wrong).sentences())
 
 
 def test_a_table_whose_first_axis_points_down_warns_until_it_is_told_so() -> None:
@@ -217,15 +216,20 @@ def test_a_table_whose_first_axis_points_down_warns_until_it_is_told_so() -> Non
     wrong, *_ = calibrated(real, believed=down)
     assert {2, 3} <= set(upwards(wrong))
     right, *_ = calibrated(real)
-    assert upwards(right) == []
+    assert upwards(right) == ()
 
 
 def test_measured_torques_have_the_sign_of_their_controller() -> None:
-    result, *_ = calibrated(arm("ceiling"), believed=arm("floor"))
-    data = result.problem.data
-    loaded = replace(data, blocks=(replace(data.blocks[0], torque=np.ones((len(data), 1, 6))),))
-    measured = ro.CalibrationProblem(ARM, result.problem.parameters, loaded)
-    assert bends_upwards(measured, result.x, np.sqrt(np.diag(result.covariance))) == []
+    """The torques that gravity would have in the wrong mounting, but measured: the arm gives way the other way."""
+    wrong, *_ = calibrated(arm("ceiling"), believed=arm("floor"))
+    data = wrong.problem.data
+    torque = ro.robot.gravity_torques(arm("floor"), wrong.problem.joint_values)
+    loaded = replace(data, blocks=(replace(data.blocks[0], torque=torque[:, None]),))
+    problem = ro.CalibrationProblem(arm("floor"), wrong.problem.parameters, loaded)
+    measured = ro.calibrate(problem, ro.tikhonov, 1.0)
+    named = dict(zip(measured.problem.parameters.free.names, measured.x, strict=True))
+    assert named["compliance2"] < -1e-6
+    assert upwards(measured) == ()
 
 
 # --- files ----------------------------------------------------------------------------------------------------------
