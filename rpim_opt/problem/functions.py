@@ -11,10 +11,10 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
-from rpim_opt.problem.loads import Loads
+from rpim_opt.problem.loads import Loads, Stated
 from rpim_opt.robot.kinematics import FRAME, chain, frame
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.posture import SYMBOLS, Posture, Symbol
+from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
 
 Functions = Mapping[str, ca.Function]
@@ -114,62 +114,75 @@ def _derived(of: Row) -> Functions:
     }
 
 
+class _Parameters(NamedTuple):
+    """The parameters of a row by name: where they start, and the deviations of those that are identified."""
+
+    x: ca.SX
+    nominal: ca.SX
+    start: Mapping[str, Symbol]
+    deviation: Mapping[str, Symbol]
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], identified: bytes, absent: bytes) -> _Parameters:
+        free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
+        zero = np.frombuffer(absent, dtype=bool)
+        x = ca.SX.sym("x", len(free))
+        nominal = ca.SX.sym("nominal", len(names))
+        start = {name: nominal[i] for i, name in enumerate(names)}
+        start.update({names[i]: ca.SX(0) for i in np.flatnonzero(zero)})
+        deviation = dict.fromkeys(names, ca.SX(0))
+        deviation.update({names[i]: x[k] for k, i in enumerate(free)})
+        return cls(x, nominal, start, deviation)
+
+    def value(self, name: str) -> Symbol:
+        """Return a parameter, zero where there is none of this name."""
+        if name not in self.start:
+            return ca.SX(0)
+        return self.start[name] + self.deviation[name]
+
+    def place(self, prefix: str) -> ca.SX:
+        """Return the frame whose six parameters begin with a prefix."""
+        names = [prefix + component for component in FRAME]
+        return frame([self.start[name] for name in names], [self.deviation[name] for name in names])
+
+
 def _expressions(of: Structure, measurement: Measurement) -> Row:
-    dof = len(of.joint_types)
-    points = len(of.markers)
-    free = np.flatnonzero(np.frombuffer(of.identified, dtype=bool))
-    zero = np.frombuffer(of.absent, dtype=bool)
-    x = ca.SX.sym("x", len(free))
-    nominal = ca.SX.sym("nominal", len(of.names))
-    loads = of.loads
-    q = ca.SX.sym("q", dof * points)
-    tau = ca.SX.sym("tau", dof * points if loads.torques else 0)
-    payload = ca.SX.sym("payload", 1 if loads.payload else 0)
-    approach = ca.SX.sym("approach", dof * points if loads.approach else 0)
-    columns = ca.SX.sym("columns", len(loads.columns))
+    p = _Parameters.of(of.names, of.identified, of.absent)
+    stated = of.loads.symbols(len(of.joint_types), len(of.markers))
     y = ca.SX.sym("y", len(measurement.columns))
-    start = {name: ca.SX(0) if zero[i] else nominal[i] for i, name in enumerate(of.names)}
-    deviation = dict.fromkeys(of.names, ca.SX(0))
-    deviation.update({of.names[i]: x[k] for k, i in enumerate(free)})
-
-    def place(prefix: str) -> ca.SX:
-        return frame([start[prefix + c] for c in FRAME], [deviation[prefix + c] for c in FRAME])
-
-    def value(name: str) -> ca.SX:
-        return start[name] + deviation[name] if name in start else ca.SX(0)
-
-    def posture(point: int) -> Posture:
-        at = slice(point * dof, (point + 1) * dof)
-        joints = ca.vertsplit(q[at])
-        return loads.posture(of.joint_types, joints, start.__getitem__, tau, payload, approach, columns, point)
-
-    def reflector(point: int, marker: str) -> ca.SX:
-        flange = chain(of.joint_types, posture(point), value, of.terms)
-        if measurement.touching and not of.several:  # touches differ by as much wherever the robot stands
-            return flange @ place(tool_prefix(marker))
-        return place("base_") @ flange @ place(tool_prefix(marker))
-
-    own = {name: place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
-    in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
-    for name in measurement.parameters:
-        if not name.startswith(in_frames):
-            own[name] = value(of_fixture(name, of.fixture))
-    own |= _seen(measurement, loads.named(columns) | _of_joints(q, tau, points))
-    transforms = [reflector(point, marker) for point, marker in enumerate(of.markers)]
-    modelled = ca.densify(measurement.model(*transforms, **own))
+    transforms = _reflectors(of, measurement, p, stated)
+    modelled = ca.densify(measurement.model(*transforms, **_keywords(of, measurement, p, stated)))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
     if residual.numel() != len(measurement.components):
         found = f"{residual.numel()} components of the residual"
         raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
-    return Row(x, nominal, ca.vertcat(q, tau, payload, approach, columns, y), residual, modelled)
+    return Row(p.x, p.nominal, ca.vertcat(*stated, y), residual, modelled)
 
 
-def _of_joints(q: ca.SX, tau: ca.SX, points: int) -> dict[str, Symbol]:
-    """Return joint values and measured torques, one column a point."""
-    found = {"q": ca.reshape(q, -1, points)}
-    if tau.numel():
-        found["torque"] = ca.reshape(tau, -1, points)
+def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> list[ca.SX]:
+    """Return the transform of each point's reflector in the frame that measures."""
+    found = []
+    for point, marker in enumerate(of.markers):
+        posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
+        flange = chain(of.joint_types, posture, p.value, of.terms)
+        if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
+            flange = p.place("base_") @ flange
+        found.append(flange @ p.place(tool_prefix(marker)))
     return found
+
+
+def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> dict[str, Symbol]:
+    """Return the frames, parameters and columns that a measurement's model takes by name."""
+    own = {name: p.place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
+    in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
+    for name in measurement.parameters:
+        if not name.startswith(in_frames):
+            own[name] = p.value(of_fixture(name, of.fixture))
+    points = len(of.markers)
+    known = of.loads.named(stated) | {"q": ca.reshape(stated.q, -1, points)}
+    if stated.torque.numel():
+        known["torque"] = ca.reshape(stated.torque, -1, points)
+    return own | _seen(measurement, known)
 
 
 def _seen(measurement: Measurement, known: Mapping[str, Symbol]) -> dict[str, Symbol]:

@@ -36,35 +36,53 @@ class Loads(NamedTuple):
     weighs: bool = False
     columns: tuple[str, ...] = ()
 
+    def symbols(self, dof: int, points: int) -> Stated:
+        """Return the symbols of a row of some points: empty for what it does not state."""
+        joints = dof * points
+        return Stated(
+            q=ca.SX.sym("q", joints),
+            torque=ca.SX.sym("tau", joints * self.torques),
+            payload=ca.SX.sym("payload", int(self.payload)),
+            approach=ca.SX.sym("approach", joints * self.approach),
+            columns=ca.SX.sym("columns", len(self.columns)),
+        )
+
     def posture(
-        self,
-        joint_types: Sequence[str],
-        q: Sequence[Symbol],
-        nominal: Callable[[str], Symbol],
-        tau: ca.SX,
-        payload: ca.SX,
-        approach: ca.SX,
-        columns: ca.SX,
-        point: int = 0,
+        self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: Stated, point: int = 0
     ) -> Posture:
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
-        at = slice(point * len(q), (point + 1) * len(q))
+        dof = len(joint_types)
+        at = slice(point * dof, (point + 1) * dof)
+        q = ca.vertsplit(stated.q[at])
         torque = None
         if self.torques:
-            torque = ca.vertsplit(tau[at])
+            torque = ca.vertsplit(stated.torque[at])
         elif not self.weighs:
-            torque = [0.0] * len(q)
+            torque = [0.0] * dof
         weight = None
         if self.gravity is not None:
-            weight = Statics(joint_types, q, nominal, self.gravity, payload if self.payload else None)
+            weight = Statics(joint_types, q, nominal, self.gravity, stated.payload if self.payload else None)
         directions = None
         if self.approach:
-            directions = ca.vertsplit(approach[at])
-        return Posture(q, torque, directions, weight, self.named(columns))
+            directions = ca.vertsplit(stated.approach[at])
+        return Posture(q, torque, directions, weight, self.named(stated))
 
-    def named(self, columns: ca.SX) -> dict[str, Symbol]:
-        """Return the symbols of columns (c, 1) by name."""
-        return {name: columns[i] for i, name in enumerate(self.columns)}
+    def named(self, stated: Stated) -> dict[str, Symbol]:
+        """Return the symbols of columns by name."""
+        return {name: stated.columns[i] for i, name in enumerate(self.columns)}
+
+
+class Stated(NamedTuple):
+    """The symbols of what a row states of its joints, in the order in which `columns` lays it side by side.
+
+    ``q``, ``torque`` and ``approach`` are (dof x points, 1), point by point; ``payload`` (1, 1), ``columns`` (c, 1).
+    """
+
+    q: ca.SX
+    torque: ca.SX
+    payload: ca.SX
+    approach: ca.SX
+    columns: ca.SX
 
 
 class Needs(NamedTuple):

@@ -41,16 +41,13 @@ class Arm:
 
         ``values`` are the parameters' by name, ``stated`` their nominal ones, by which gravity acts.
         """
-        n = robot.dof
-        q = ca.SX.sym("q", n)
-        tau = ca.SX.sym("tau", n if loads.torques else 0)
-        payload = ca.SX.sym("payload", 1 if loads.payload else 0)
+        command = loads.symbols(robot.dof, 1)
         y = ca.SX.sym("y", len(kind.columns))
 
         def value(name: str) -> float:
             return values.get(name, 0.0)
 
-        posture = loads.posture(robot.joint_types, ca.vertsplit(q), stated.__getitem__, tau, payload, ca.SX(), ca.SX())
+        posture = loads.posture(robot.joint_types, stated.__getitem__, command)
         terms = robot.model.terms
         after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
         flange = ca.DM(before) @ chain(robot.joint_types, posture, value, terms)
@@ -59,10 +56,10 @@ class Arm:
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
         moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))
         # gravity bends a joint by the values of all of them
-        J = (ca.horzcat(*twists) @ ca.jacobian(moved, q))[: len(kind.components), :]
+        J = (ca.horzcat(*twists) @ ca.jacobian(moved, command.q))[: len(kind.components), :]
         modelled = kind.model(T)
         outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
-        return cls(ca.Function("arm", [ca.vertcat(q, tau, payload, y)], outputs), robot.joint_map)
+        return cls(ca.Function("arm", [ca.vertcat(*command, y)], outputs), robot.joint_map)
 
     def at(self, q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
