@@ -243,25 +243,32 @@ def _spread(line: Sequence[str]) -> list[str]:
 
 def _data(grid: Grid, full: Sequence[int], above: Sequence[int]) -> tuple[list[list[str]], list[str]]:
     """Return the rows of data, and what was left out below the header."""
+    summing = [i for i in full if _first(grid.rows[i]).lower().rstrip(":") in SUMMARIES]
+    notes = _between(grid, full, above)
+    notes += [f"line {grid.lines[i]} sums others up: left out '{_first(grid.rows[i])}'." for i in summing]
+    kept = sorted(set(full) - set(summing))
+    return [grid.rows[i] for i in kept], notes
+
+
+def _first(row: Sequence[str]) -> str:
+    return next(cell for cell in row if cell)
+
+
+def _between(grid: Grid, full: Sequence[int], above: Sequence[int]) -> list[str]:
+    """Say which lines below the header are no rows of data: the header once more, and others."""
     header = [grid.rows[i] for i in above]
-    kept = set(full)
-    notes = []
-    below = [i for i in range(full[0], len(grid.rows)) if i not in kept]
+    below = sorted(set(range(full[0], len(grid.rows))) - set(full))
     again = [i for i in below if grid.rows[i] in header]
+    others = [i for i in below if grid.rows[i] not in header]
+    notes = []
     if again:
         notes.append(f"the header stands there again in {_lines(grid, again)}: left out.")
-    others = [i for i in below if grid.rows[i] not in header]
     for i in others[:MOST_NAMED]:
         text = ", ".join(cell for cell in grid.rows[i] if cell)
         notes.append(f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'.")
     if len(others) > MOST_NAMED:
         notes.append(f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out.")
-    for i in list(full):
-        first = next(cell for cell in grid.rows[i] if cell)
-        if first.lower().rstrip(":") in SUMMARIES:
-            kept.discard(i)
-            notes.append(f"line {grid.lines[i]} sums others up: left out '{first}'.")
-    return [grid.rows[i] for i in sorted(kept)], notes
+    return notes
 
 
 def _lines(grid: Grid, rows: Sequence[int]) -> str:

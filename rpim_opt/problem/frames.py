@@ -120,29 +120,38 @@ def relocated(problem: Source) -> Source | None:
     if len(problem.arms) > 1:
         return _each_relocated(problem)
     p = problem.parameters
-    index = {name: i for i, name in enumerate(p.names)}
-    at = {"base_": [index[f"base_{c}"] for c in FRAME]}
-    if not p.identified[at["base_"]].all():
+    base = _frame_of(p, "base_")
+    if not p.identified[base].all():
         return None
     data = problem.sample().data
-    for block in data.blocks:
-        at[tool_prefix(block.markers[0])] = [index[tool_prefix(block.markers[0]) + c] for c in FRAME]
-    tools = {b.markers[0]: p.nominal[at[tool_prefix(b.markers[0])]] for b in data.blocks}
+    at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
     try:
-        base, places, _ = locate(problem.robot, data, tools)
+        found, places, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
     except InputError:
         return None
-    found = {"base_": base} | {tool_prefix(b.markers[0]): places[b.markers[0]] for b in data.blocks}
-    nominal, moved = p.nominal.copy(), False
-    for prefix, place in found.items():
-        k = np.array(at[prefix])
+    nominal = p.nominal.copy()
+    for k, place in [(base, found), *((k, places[marker]) for marker, k in at.items())]:
         free = p.identified[k]
-        if not (free[:3].all() and (free[3:].all() or not free[3:].any())):
-            continue
-        far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
-        if (far & free).any():
-            nominal[k[free]], moved = place[free], True
-    return problem.with_parameters(replace(p, nominal=nominal)) if moved else None
+        if _misplaced(p, k, place):
+            nominal[k[free]] = place[free]
+    if (nominal == p.nominal).all():
+        return None
+    return problem.with_parameters(replace(p, nominal=nominal))
+
+
+def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
+    """Return the places (6,) of a frame in a table."""
+    index = {name: i for i, name in enumerate(p.names)}
+    return np.array([index[prefix + component] for component in FRAME])
+
+
+def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
+    """Whether an identified frame at places k (6,) of a table is surely not where it is stated."""
+    position, orientation = np.split(p.identified[k], 2)
+    if not position.all() or orientation.any() != orientation.all():
+        return False
+    far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
+    return bool((far & p.identified[k]).any())
 
 
 def _each_relocated(problem: Source) -> Source | None:

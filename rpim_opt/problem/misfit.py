@@ -109,10 +109,11 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
     turns = None
     if all(b.measurement.name == "pose" for b in blocks) and len(markers) == 1:
         turns = np.concatenate([transforms(b.y)[:, :3, :3] for b in blocks])
+    marker = np.array([markers.index(b.markers[0]) for b in blocks])
     whole = Points(
         np.concatenate([b.q[:, 0] for b in blocks]),
         np.concatenate([b.y[:, :3] for b in blocks]),
-        np.concatenate([np.full(len(b.row), markers.index(b.markers[0])) for b in blocks]),
+        np.repeat(marker, [len(b.row) for b in blocks]),
         tools,
         turns,
         np.concatenate([b.row for b in blocks]),
