@@ -70,7 +70,7 @@ def displacement(
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
-    """Return by how much link i's frame, or the flange's, is displaced (6, 1) [m, rad]; None for not at all."""
+    """Return the displacement (6, 1) [m, rad] of link i's frame, the robot's or the flange's; None for none at all."""
     total = None
     for term in terms:
         if term.at == at and i in term.places(joint_types):

@@ -117,9 +117,12 @@ def transforms(
 ) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
 
-    ``value("alpha2")`` gives the parameters; joints move by `motion`, and ``terms`` may displace links besides.
+    ``value("alpha2")`` gives the parameters; joints move by `motion`, and ``terms`` may displace base and links.
     """
     T = ca.SX.eye(4)
+    displaced = displacement("base", joint_types, 1, posture, value, terms)
+    if displaced is not None:
+        T = frame((0,) * 6, ca.vertsplit(displaced))
     after = []
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)

@@ -39,8 +39,8 @@ class Model:
     Parameters
     ----------
     terms
-        What moves joints, links or the tool besides the terms that every arm has (``ratio``, ``ecc_cos``, ...,
-        ``compliance``, ``backlash``, ``bend``).
+        What moves joints, links, the base or the tool besides the terms that every arm has (``ratio``, ``ecc_cos``,
+        ..., ``compliance``, ``backlash``, ``bend``).
 
     Raises
     ------

@@ -72,7 +72,7 @@ class Posture:
 class Joint:
     """What a term sees of joint ``number`` (from 1), and of the link that it moves.
 
-    A term of the tool sees the last joint.
+    A term of the base sees the first joint, one of the tool the last.
 
     Parameters
     ----------

@@ -14,11 +14,13 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import DISPLAY, SMALLEST, UNITS, number, split_unit
 from rpim_opt.robot.posture import Joint, Symbol
 
-Place = Literal["joint", "link", "tool"]
+Place = Literal["joint", "link", "base", "tool"]
 _STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
 _FRAME = re.compile(r"\w*_r[xyz]")
-SIZES: dict[Place, int] = {"joint": 1, "link": 6, "tool": 6}
+SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}
 """How many numbers a term returns."""
+ENDS = ("base", "tool")
+"""Places that an arm has once: parameters there have no number."""
 
 
 class Entry(NamedTuple):
@@ -38,14 +40,14 @@ class Term:
     ----------
     moves
         ``moves(joint, *parameters)`` in CasADi, from what it sees (`Joint`) and the parameters in the order of
-        ``scales``. Of a joint: by how much it moves further [rad or m]. Of a link, or of the tool: six numbers x, y, z
-        [m], rx, ry, rz [rad], by which the frame behind the link, or the flange's, is displaced along and about its own
-        axes. Small terms of a link add up.
+        ``scales``. Of a joint: by how much it moves further [rad or m]. Of a link, of the base or of the tool: six
+        numbers x, y, z [m], rx, ry, rz [rad], by which the frame behind the link, the robot's or the flange's, is
+        displaced along and about its own axes. Small terms of a link add up.
     scales
         The parameters by name, with their unit and expected size: ``{"play_mrad": 0.1}``. Every joint or link has its
         own, ``play2``; ``{}`` in a name stands for the number.
     at
-        ``"joint"``, ``"link"`` or ``"tool"``.
+        ``"joint"``, ``"link"``, ``"base"`` or ``"tool"``.
     joints
         Numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints or links that have it; by default the
         revolute joints, and all links.
@@ -119,13 +121,15 @@ class Term:
         return ", ".join(entry.stem.partition("{}")[0] for entry in self.entries) or "without parameters"
 
     def names(self, i: int) -> tuple[str, ...]:
-        """Return the names of joint or link i's parameters; of the tool's, which has no number."""
-        if self.at == "tool":
+        """Return the names of joint or link i's parameters; of the base's and the tool's, which have no number."""
+        if self.at in ENDS:
             return tuple(entry.stem for entry in self.entries)
         return tuple(_numbered(entry.stem, i) for entry in self.entries)
 
     def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
-        """Return the numbers of the joints or links that have it; the last joint for the tool."""
+        """Return the numbers of the joints or links that have it; the first for the base, the last for the tool."""
+        if self.at == "base":
+            return (1,)
         if self.at == "tool":
             return (len(joint_types),)
         wanted = tuple(self.joints)
@@ -157,8 +161,8 @@ def _require_name(entry: Entry, at: Place) -> None:
     if not _STEM.fullmatch(entry.stem) or _FRAME.fullmatch(entry.stem):
         accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx, which are frames'"
         raise InputError(where, "a name that is another's", accepted)
-    if at == "tool" and "{}" in entry.stem:
-        raise InputError(where, "a place for a number", "none: the tool has one parameter")
+    if at in ENDS and "{}" in entry.stem:
+        raise InputError(where, "a place for a number", f"none: the {at} has one parameter")
     if not entry.scale >= SMALLEST:
         raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
 

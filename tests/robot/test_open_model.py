@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.kinematics import frame
+from rpim_opt.robot.kinematics import FRAME, frame, numeric_frame
 from tests.simulate import ALL, ARM, simulated
 
 N = 60
@@ -158,6 +158,64 @@ def _bent(q: np.ndarray, temperature: float, truth: dict[str, float]) -> np.ndar
         T = T @ ca.DM(frame((0,) * 6, moved)).full()
     T = T @ ca.DM(frame((0,) * 6, [*(truth["sag"] * down), 0, 0, 0])).full()
     return (T @ [0.03, -0.02, 0.06, 1])[:3]
+
+
+def test_a_base_that_was_set_up_anew_is_displaced_along_its_own_axes() -> None:
+    def moved(base, x, turn):
+        return [base.column("later") * v for v in (x, 0, 0, 0, 0, turn)]
+
+    term = ro.robot.Term(moved, {"shift_mm": 0.1, "turn_mrad": 0.1}, at="base", columns={"later": ""})
+    later = np.arange(N) % 2
+    problem = blank(later=later).with_model(ro.Model([term]))
+    assert problem.parameters.free.names[-2:] == ("shift", "turn")
+    x = np.zeros(len(problem.parameters.free))
+    before = problem.modelled(x)[0]
+    x[-2:] = (2e-3, 0.3)
+    found = problem.modelled(x)[0]
+    base = numeric_frame([problem.parameters.nominal[problem.parameters.names.index(f"base_{c}")] for c in FRAME])
+    inside = np.column_stack([before, np.ones(N)]) @ np.linalg.inv(base).T
+    after = inside @ (base @ numeric_frame([2e-3, 0, 0, 0, 0, 0.3])).T
+    expected = np.where(later[:, None] == 1, after[:, :3], before)
+    assert np.abs(found - expected).max() < 1e-14
+    with pytest.raises(ro.InputError, match="the base has one parameter"):
+        ro.robot.Term(moved, {"shift{}a_mm": 0.1, "turn_mrad": 0.1}, at="base")
+
+
+def test_sessions_are_a_component_of_their_own_size() -> None:
+    """Simulated: the tracker stands elsewhere, by tenths of a millimetre, after every tenth configuration."""
+    names = ("noon", "evening", "night")
+    instance = ro.load("position")
+    block = instance.problem.data.blocks[0]
+    session = np.arange(len(block.y)) // 10
+    moved = 2e-4 * np.random.default_rng(0).normal(size=(4, 3))
+    moved[0] = 0
+    columns = {name: session == k for k, name in enumerate(names, start=1)}
+    data = ro.Dataset.of(block.q, block.y + moved[session], 3e-5, columns=columns)
+    terms = [
+        ro.robot.Term(
+            lambda base, *shift, name=name: [*(base.column(name) * v for v in shift), 0, 0, 0],
+            {f"{name}_{axis}_mm": 0.1 for axis in "xyz"},
+            at="base",
+            columns={name: ""},
+        )
+        for name in names
+    ]
+    apart = instance.problem.on(data).with_model(ro.Model(terms))
+    with_sessions = ro.calibrate(apart, prior=ro.convex.Prior(groups=["noon_* evening_* night_*"]))
+    without = ro.calibrate(instance.problem.on(data))
+    first = dict.fromkeys(names, np.zeros(len(instance.validation)))
+    y = instance.validation.blocks[0].y
+    q = instance.validation.q
+    # the first session's frame is the one that stays, by which nothing was moved
+    error = [
+        np.sqrt(np.mean(np.sum((found.position - y) ** 2, axis=1)))
+        for found in (with_sessions.predict(q, columns=first), without.predict(q))
+    ]
+    assert error[0] < 3.5e-5 < 1e-4 < error[1]
+    said = [str(found).partition("The data scatter ")[2] for found in (with_sessions, without)]
+    assert said[0].startswith("as declared")
+    assert said[1].startswith(("3", "4", "5", "6"))  # tenths of a millimetre over 0.03 mm
+    assert "noon_* evening_* night_*" in str(with_sessions)
 
 
 def test_a_correction_without_parameters_is_always_there() -> None:
@@ -370,7 +428,7 @@ def test_a_problem_file_identifies_and_scales_what_a_script_adds(tmp_path: Path)
         (lambda: ro.robot.Term(lambda j, s: s, {"wave3_mrad": 1.0}), "no digit at the end"),
         (lambda: ro.robot.Term(lambda j, s: s, {"sag_rx_mrad": 1.0}, at="tool"), "a name that is another's"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0, "play_mm": 1.0}), "one name in two units"),
-        (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0}, at="elbow"), "'joint', 'link', 'tool'"),
+        (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0}, at="elbow"), "'joint', 'link', 'base', 'tool'"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0}, nominal={"gap_mrad": 1.0}), "a key of its scales"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0}, columns={"t": "heat"}), "column t"),
         (lambda: ro.Model([ro.robot.Term(lambda j, s: s, {"play_mrad": 1.0})] * 2), "'play' twice"),
