@@ -174,8 +174,8 @@ class Parameters(Tabled):
         """
         if not robot:
             return np.arange(len(self))
-        mine = [name in (own_name(name), f"{robot}.{own_name(name)}") for name in self.names]
-        return np.flatnonzero(mine)
+        shared_or_own = ("", robot)
+        return np.flatnonzero([name.rpartition(".")[0] in shared_or_own for name in self.names])
 
     @property
     def of_frames(self) -> np.ndarray:
