@@ -8,8 +8,21 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.figure import AFTER, BEFORE, MARK, Axes, axes_of, legend_above
+from rpim_opt.show.figure import (
+    AFTER,
+    BEFORE,
+    MARK,
+    Axes,
+    axes_of,
+    extent,
+    in_millimetres,
+    label_rows,
+    legend_above,
+)
 from rpim_opt.show.scales import error_bins, magnification
+
+FEW = 100
+"""Rows up to which each has its line and its large dot."""
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -38,9 +51,12 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     place = np.arange(len(labels))
     before = 1e3 * result.nominal_errors(data)
     after = 1e3 * result.errors(data)
-    ax.vlines(place, after, before, color=BEFORE, lw=0.8)  # no bars: a logarithmic axis has no zero to begin at
-    ax.plot(place, before, "o", color=BEFORE, ms=5, label="nominal")
-    ax.plot(place, after, "o", color=AFTER, ms=5, label="identified")
+    dot = 2
+    if len(labels) <= FEW:
+        dot = 5
+        ax.vlines(place, after, before, color=BEFORE, lw=0.8)  # no bars: a logarithmic axis has no zero to begin at
+    ax.plot(place, before, "o", color=BEFORE, ms=dot, label="nominal")
+    ax.plot(place, after, "o", color=AFTER, ms=dot, label="identified")
     flagged = {flag.label for flag in result.flagged} if data is None else set()
     wrong = [i for i, label in enumerate(labels) if label in flagged]
     if wrong:
@@ -50,8 +66,9 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
         bottom=max(0.5 * min(np.nanmin(before), np.nanmin(after)), 1e-4)
     )  # a row that a norm fits exactly is below
     ax.set_ylabel("error [mm]")
-    if len(labels) <= 60:
-        ax.set_xticks(place, labels, rotation=90, fontsize=7)
+    in_millimetres(ax.yaxis)
+    if label_rows(ax.xaxis, labels, extent(ax)[0]):
+        ax.tick_params(axis="x", rotation=90)
     else:
         ax.set_xlabel("row")
     return legend_above(ax)
@@ -83,6 +100,7 @@ def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes =
     for errors, color, label in zip(sets, (BEFORE, AFTER), ("nominal", "identified"), strict=True):
         ax.hist(np.maximum(errors, edges[0]), edges, color=color, alpha=0.85, label=label)
     ax.set_xscale("log")
+    in_millimetres(ax.xaxis)
     ax.set_xlabel("error [mm]")
     ax.set_ylabel("rows")
     return legend_above(ax)
@@ -109,6 +127,7 @@ def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None
     ['x', 'y', 'z']
     """
     ax = axes_of(ax)
+    ax.set_yscale("symlog", linthresh=0.1)
     for nominal, color, label, shift in ((True, "0.55", "nominal", -0.1), (False, AFTER, "identified", 0.1)):
         vectors = 1e3 * result.error_vectors(data, nominal=nominal)
         vectors = vectors[np.isfinite(vectors).all(axis=1)]
@@ -119,7 +138,7 @@ def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None
     ax.set_xticks(range(3), ["x", "y", "z"])
     ax.set_xlim(-0.5, 2.5)
     ax.set_xlabel("axis of the instrument")
-    ax.set_yscale("symlog", linthresh=0.1)
+    in_millimetres(ax.yaxis)
     ax.set_ylabel("measured minus modelled [mm]")
     return legend_above(ax)
 
@@ -151,7 +170,13 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     points, vectors = (a[np.isfinite(vectors).all(axis=1)] for a in (points, vectors))
     times = magnification(points, vectors)
     ax.scatter(*points.T, s=6, color="0.3")
-    ax.quiver(*points.T, *(times * vectors).T, color=BEFORE if nominal else AFTER, arrow_length_ratio=0.2)
+    color = AFTER
+    if nominal:
+        color = BEFORE
+    width = 1.5
+    if len(points) > FEW:
+        width = 0.5
+    ax.quiver(*points.T, *(times * vectors).T, color=color, lw=width, arrow_length_ratio=0.2)
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
     ax.set_title(f"{'nominal' if nominal else 'identified'} errors, enlarged {times:,.0f} times", fontsize=9)
     return ax
@@ -179,9 +204,9 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     >>> ax.get_xlabel(), len(ax.get_yticks())
     ('deviation from nominal [deg]', 13)
     """
-    ax = axes_of(ax)
     free = result.problem.parameters.free
     own = ~free.of_frames & (np.array(free.dimensions) == dimension)
+    ax = axes_of(ax, int(own.sum()))
     unit, si = display(dimension)
     place = np.arange(own.sum())
     x = result.x[own] / si
@@ -196,7 +221,8 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     if np.isfinite(bound).any():
         ax.plot(np.r_[-bound, bound], np.r_[place, place], "|", color=MARK, ms=9, label="tolerance")
     ax.axvline(0, color="0.8", lw=1)
-    ax.set_yticks(place, [name for name, is_own in zip(free.names, own, strict=True) if is_own])
+    names = [name for name, is_own in zip(free.names, own, strict=True) if is_own]
+    label_rows(ax.yaxis, names, extent(ax)[1], largest=10)
     ax.invert_yaxis()
     ax.set_xlabel(f"deviation from nominal [{unit}]")
     return legend_above(ax)

@@ -46,7 +46,8 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     for k, (name, weight) in enumerate(marked.items()):
         e = program.path([weight])[0]
         label = f"{name}, weight {weight:.2g}"
-        ax.plot(np.sqrt(e.loss), np.sqrt(e.penalty), "osD^v<>"[k % 7], color=f"C{k}", ms=8, mec="white", label=label)
+        mark = {"marker": "osD^v<>"[k % 7], "color": f"C{k}", "ms": 8, "mfc": "none", "mew": 1.6}  # one shows another
+        ax.plot(np.sqrt(e.loss), np.sqrt(e.penalty), ls="none", label=label, **mark)
     ax.set_xlabel("whitened residual norm")
     ax.set_ylabel("norm of the deviations [scales]")
     if marked:

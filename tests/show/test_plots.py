@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -80,6 +82,46 @@ def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
     ax.clear()
     ro.plot.selectors(result.program, {"reml": result.selection}, ax)
     assert ax.lines[0].get_xdata()[0] == result.weight
+
+
+def overlapping(axis) -> int:
+    """Count labels of ticks that touch the next one."""
+    axis.figure.canvas.draw()
+    boxes = [label.get_window_extent() for label in axis.get_ticklabels() if label.get_text()]
+    return sum(one.overlaps(other) for one, other in pairwise(boxes))
+
+
+@pytest.mark.parametrize("count", [40, 60, 120, 1000])
+def test_labels_of_rows_do_not_overlap(ax, fitted, count: int) -> None:
+    _, result = fitted
+    data = result.problem.data.take(np.arange(count) % len(result.problem.data))
+    ro.plot.errors(result, data, ax)
+    assert overlapping(ax.xaxis) == 0
+    named = ax.get_xlabel() == ""
+    assert named == (count <= 60)  # beyond, letters would be too small to be read
+    ax.clear()
+    ro.plot.error_histogram(result, data, ax)
+    assert overlapping(ax.xaxis) == 0
+
+
+def test_names_of_many_parameters_do_not_overlap(fitted) -> None:
+    _, result = fitted
+    both = ro.together(spring=result.problem, autumn=result.problem, shared=["tool_*"])
+    ax = ro.plot.parameters(ro.calibrate(both, ro.tikhonov, 1.0), "angle")
+    assert len(ax.get_yticks()) > 24
+    assert overlapping(ax.yaxis) == 0
+    assert min(label.get_fontsize() for label in ax.get_yticklabels()) > 6
+    plt.close(ax.figure)
+
+
+def test_spreads_end_inside_the_axes(ax, fitted) -> None:
+    instance, result = fitted
+    ro.plot.error_axes(result, instance.validation, ax)
+    low, high = ax.transData.inverted().transform(ax.transAxes.transform([[0, 0.02], [0, 0.98]]))[:, 1]
+    ends = [line.get_ydata() for line in ax.lines if line.get_marker() == "_"]
+    assert len(ends) == 4
+    assert low < np.min(ends)
+    assert np.max(ends) < high
 
 
 def test_axes_are_made_and_carry_units(fitted) -> None:
