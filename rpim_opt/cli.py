@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from rpim_opt import __version__
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
@@ -25,7 +26,19 @@ From a table of measurements to a corrected robot: new, calibrate, export, repor
 
 Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found.
 """
-app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
+
+
+class Commands(TyperGroup):
+    """The commands with their first lines, which are wrapped and never cut."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands."""
+        said = {name: self.commands[name].help or "" for name in self.list_commands(ctx)}
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text.partition("\n\n")[0]) for name, text in said.items()])
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 ABORT: Any = (KeyboardInterrupt, typer.Abort)

@@ -201,6 +201,20 @@ def test_what_the_stubs_promise_is_there() -> None:
             assert getattr(module, name) is not None
 
 
+TOP_LEVEL = {"README.md", "pyproject.toml", "rpim_opt", "problems", "tests", "studies", "dev.py"}
+"""What the repository is made of."""
+DEMANDED = {
+    ".ci", ".github", ".gitignore", "LICENSE", "CHANGELOG.md", "CITATION.cff", "constraints.txt", "requirements.txt"
+}  # fmt: skip
+"""What tools look for at the top level: continuous integration, hosts, Git, package indexes, pip."""
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no repository says what belongs to it")
+def test_nothing_strays_to_the_top_level() -> None:
+    names = subprocess.run(["git", "-C", ROOT, "ls-files"], capture_output=True, text=True, check=True).stdout
+    assert {name.partition("/")[0] for name in names.splitlines()} == TOP_LEVEL | DEMANDED
+
+
 @pytest.mark.parametrize(("place", "names"), ro._MOVED.items())
 def test_a_name_that_moved_says_where_it_is(place: str, names: tuple[str, ...]) -> None:
     for name in names:

@@ -204,3 +204,15 @@ def test_an_unwritable_result_leaves_the_old_one(monkeypatch, capsys, folder) ->
     assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "out")) == 2
     assert "cannot be written" in capsys.readouterr().err
     assert (folder / "out").read_text() == "a file where the folder should be"
+
+
+def test_the_list_of_commands_says_each_first_line_whole(monkeypatch, capsys) -> None:
+    """On a terminal of 80 columns a line that is too long is wrapped, and never cut."""
+    monkeypatch.setenv("COLUMNS", "80")
+    run(monkeypatch, "--help")
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 80
+    words = " ".join(said.partition("Commands:")[2].split())
+    for command in cli.app.registered_commands:
+        first = command.callback.__doc__.partition("\n\n")[0]
+        assert f"{command.callback.__name__} {' '.join(first.split())}" in words
