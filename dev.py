@@ -1,9 +1,11 @@
-"""Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``, ``docs``.
+"""Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``, ``docs`` and so on.
 
 Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet. That
 file has the hashes of all that may be downloaded, and is made by ``uv pip compile --universal --python-version 3.11
 --generate-hashes --no-header --no-annotate --all-extras pyproject.toml -o constraints.txt``. ``requirements.txt``, for
-an installation without tools, is the same without ``--all-extras`` and with ``-c constraints.txt``.
+an installation without tools, is the same without ``--all-extras`` and with ``-c constraints.txt``; so is
+``studies/gallery/notebooks.txt``, with ``--group notebooks --extra studies --extra tables``: Jupyter has an environment
+of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +19,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
 ENVIRONMENT = Path(os.environ.get("RPIM_OPT_VENV", ROOT / ".venv"))
-BIN = ENVIRONMENT / ("Scripts" if os.name == "nt" else "bin")
+PROGRAMS = "Scripts" if os.name == "nt" else "bin"
+BIN = ENVIRONMENT / PROGRAMS
+GALLERY = ROOT / "studies" / "gallery"
+JUPYTER = ROOT / "studies" / ".environments" / "notebooks"
 CHECKS = {
     "format": ["ruff", "format", "--check", "."],
     "lint": ["ruff", "check", "."],
@@ -25,17 +30,17 @@ CHECKS = {
 }
 
 
-def environment() -> None:
-    """Make the environment, or bring it up to date with the project's requirements."""
-    wanted = hashlib.sha256(b"".join((ROOT / f).read_bytes() for f in ("pyproject.toml", "constraints.txt")))
-    stamp = ENVIRONMENT / "requirements.sha256"
+def environment(folder: Path = ENVIRONMENT, locked: Path = ROOT / "constraints.txt") -> None:
+    """Make an environment, or bring it up to date with what is locked."""
+    wanted = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + locked.read_bytes())
+    stamp = folder / "requirements.sha256"
     if stamp.is_file() and stamp.read_text() == wanted.hexdigest():
         return
-    print(f"Setting up {ENVIRONMENT.name} (once, about a minute) ...", file=sys.stderr, flush=True)
-    venv.create(ENVIRONMENT, with_pip=True, clear=ENVIRONMENT.exists())
-    pip = [BIN / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+    print(f"Setting up {folder.name} (once, about a minute) ...", file=sys.stderr, flush=True)
+    venv.create(folder, with_pip=True, clear=folder.exists())
+    pip = [folder / PROGRAMS / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
     # what is downloaded must have the hashes that were tested; the build backend comes from there, too
-    subprocess.run([*pip, "--require-hashes", "-r", ROOT / "constraints.txt"], check=True)
+    subprocess.run([*pip, "--require-hashes", "-r", locked], check=True)
     subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", ROOT], check=True)
     stamp.write_text(wanted.hexdigest())
 
@@ -53,12 +58,22 @@ def docs(folder: str = "docs") -> int:
     return run("pdoc", *modules, "--docformat", "numpy", "--no-show-source", "--output-directory", folder)
 
 
+def notebooks(folder: str = "notebooks", *pages: str) -> int:
+    """Write README and gallery, or some pages, as notebooks that Jupyter has executed, and as HTML."""
+    environment(JUPYTER, GALLERY / "notebooks.txt")
+    command = [JUPYTER / PROGRAMS / "python", GALLERY / "notebooks.py", Path(folder).resolve(), *pages]
+    return subprocess.run(command, check=False).returncode
+
+
 def main(arguments: list[str]) -> int:
     """Carry out one command line."""
     what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check", "docs"):
-        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check | docs [FOLDER]")
+    if what not in ("run", "test", "check", "docs", "pictures", "notebooks"):
+        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
+        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures")
         return 2
+    if what == "notebooks":
+        return notebooks(*rest)
     environment()
     if what == "run":
         return run("rpim-opt", *rest)
@@ -67,6 +82,8 @@ def main(arguments: list[str]) -> int:
         return run("pytest", "-n", "auto", *rest)  # on all cores
     if what == "docs":
         return docs(*rest)
+    if what == "pictures":
+        return run("python", GALLERY / "pages.py")
     failed = [name for name, command in CHECKS.items() if run(*command)]
     print(f"checks failed: {', '.join(failed)}" if failed else "all checks passed")
     return len(failed)

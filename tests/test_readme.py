@@ -8,24 +8,26 @@ import re
 import shlex
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 
+import rpim_opt as ro
+from studies.gallery import pages
 from tests import ROOT
 from tests.test_cli import run
 from tests.test_commands import write_cell
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = {"README": README} | {
-    path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies" / "gallery").glob("*.md"))
-}
-BLOCKS = [
-    (page, *found)
-    for page, text in PAGES.items()
-    for found in re.findall(r"```(\w+)\n(.*?)```(?:\n+```text\n(.*?)```)?", text, flags=re.DOTALL)
-]
-PYTHON = [(page, code, printed) for page, language, code, printed in BLOCKS if language == "python"]
-SHELL = [(page, code.splitlines()) for page, language, code, _ in BLOCKS if language == "sh"]
+mpl.use("Agg")
+from matplotlib import image, pyplot
+
+PAGES = {path.stem: path.read_text(encoding="utf-8") for path in pages.pages()}
+README = PAGES["README"]
+BLOCKS = [(page, snippet) for page, text in PAGES.items() for snippet in pages.snippets(text)]
+PYTHON = [(page, snippet) for page, snippet in BLOCKS if snippet.language == "python"]
+SHELL = [(page, snippet.code.splitlines()) for page, snippet in BLOCKS if snippet.language == "sh"]
+SLIGHT = 0.01
+"""Mean difference of two pictures' values, from 0 to 1: other last digits move a line by less, other data by more."""
 
 
 def test_there_are_snippets() -> None:
@@ -35,14 +37,43 @@ def test_there_are_snippets() -> None:
     assert "python3 dev.py test" in lines
 
 
-@pytest.mark.parametrize(("page", "code", "printed"), PYTHON, ids=lambda value: value.strip()[:30])
-def test_python(page: str, code: str, printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("page", "snippet"), PYTHON, ids=lambda value: getattr(value, "code", value)[:60])
+def test_python(page: str, snippet: pages.Snippet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It prints what its page says, and draws the page's pictures."""
     monkeypatch.chdir(tmp_path)
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        exec(compile(code, page, "exec"), {})
-    for line in printed.splitlines():
+        exec(compile(snippet.code, page, "exec"), {})
+    for line in snippet.printed.splitlines():
         assert line.strip() in out.getvalue()
+    for name in set(snippet.saved) & set(pages.shown(PAGES[page])):
+        assert difference(Path(name), pages.PICTURES / name) < SLIGHT
+    pyplot.close("all")
+
+
+def difference(one: Path, other: Path) -> float:
+    """Return the mean difference of two pictures, of which those of another size have nothing in common."""
+    values = [image.imread(path) for path in (one, other)]
+    if values[0].shape != values[1].shape:
+        return 1.0
+    return float(np.abs(values[0] - values[1]).mean())
+
+
+def test_every_picture_is_made_by_the_code_of_its_page() -> None:
+    """`python3 dev.py pictures` makes all of them."""
+    made = {name for page, snippet in PYTHON for name in set(snippet.saved) & set(pages.shown(PAGES[page]))}
+    assert made == {name for text in PAGES.values() for name in pages.shown(text)}
+    assert made == {path.name for path in pages.PICTURES.iterdir()}
+
+
+def test_another_picture_is_found_out(tmp_path: Path) -> None:
+    """The bound of `test_python` is far below what another robot's errors would differ by."""
+    instance = ro.load("position")
+    for weight in (1.0, 1e5):
+        result = ro.calibrate(instance.problem, ro.tikhonov, weight)
+        ro.plot.errors(result, instance.validation).figure.savefig(tmp_path / f"{weight:g}.png")
+    pyplot.close("all")
+    assert difference(tmp_path / "1.png", tmp_path / "100000.png") > SLIGHT
 
 
 def runs(line: str) -> bool:
@@ -124,8 +155,6 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 def test_every_name_that_texts_say_is_there() -> None:
-    import rpim_opt as ro
-
     said = [*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sorted((ROOT / "studies").glob("*.py")))]
     names = {name for text in said for name in re.findall(r"\bro\.(\w+(?:\.\w+)?)", text)}
     assert len(names) > 40

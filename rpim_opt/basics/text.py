@@ -19,7 +19,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     for row in rows:
         grid.add_row(*row)
     stream = StringIO()
-    Console(file=stream, width=120, color_system=None, markup=False).print(grid)
+    Console(file=stream, width=120, color_system=None, markup=False, force_jupyter=False).print(grid)
     return "\n".join(line.rstrip() for line in stream.getvalue().strip("\n").splitlines() if line.strip())
 
 
