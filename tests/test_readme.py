@@ -24,7 +24,7 @@ from matplotlib import image, pyplot
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in pages.pages()}
 README = PAGES["README"]
 BLOCKS = [(page, snippet) for page, text in PAGES.items() for snippet in pages.snippets(text)]
-PYTHON = [(page, snippet) for page, snippet in BLOCKS if snippet.language == "python"]
+PYTHON = [(page, program) for page, text in PAGES.items() for program in pages.programs(text)]
 SHELL = [(page, snippet.code.splitlines()) for page, snippet in BLOCKS if snippet.language == "sh"]
 SLIGHT = 0.01
 """Mean difference of two pictures' values, from 0 to 1: other last digits move a line by less, other data by more."""

@@ -40,6 +40,12 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Element:
     return tag("table", tag("thead", head), tag("tbody", *body))
 
 
-def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str] = ()) -> str:
-    """Return a table, with sentences below it, as HTML."""
-    return html(tag("div", table(header, rows), *(tag("p", note) for note in notes)))
+BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
+"""How a long table stands in a notebook: it scrolls, and its border says that it goes on."""
+
+
+def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str] = (), title: str = "") -> str:
+    """Return a table with a line above it and sentences below it as HTML; a long one scrolls in a box."""
+    above = [tag("p", tag("b", title))] if title else []
+    box = tag("div", table(header, rows), style=BOX)
+    return html(tag("div", *above, box, *(tag("p", note) for note in notes)))

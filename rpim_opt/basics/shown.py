@@ -10,6 +10,7 @@ from rpim_opt.basics.tables import frame_of
 
 MOST = 60
 """Rows of a table in a notebook."""
+YES_OR_NO = {True: "yes", False: "no"}
 LONGEST = 60
 """Characters of a title in one line."""
 
@@ -36,6 +37,10 @@ class Tabled(Brief):
     def _frame_rows(self) -> list[dict[str, Any]]:
         raise NotImplementedError
 
+    def _shown_rows(self) -> list[dict[str, Any]]:
+        """Return the rows for a notebook, where they are others."""
+        return self._frame_rows()
+
     def _notes(self) -> Sequence[str]:
         """Return sentences below the table."""
         return ()
@@ -59,25 +64,29 @@ class Tabled(Brief):
 
     def _repr_html_(self) -> str:
         """Return the table for a notebook."""
-        return as_html(self._frame_rows(), [repr(self).strip("<>"), *self._notes()])
+        return as_html(self._shown_rows(), self._notes(), f"{type(self).__name__} {self._short()}")
 
 
-def as_html(rows: Sequence[dict[str, Any]], notes: Sequence[str]) -> str:
-    """Return rows as a table of HTML, with sentences below it."""
+def as_html(rows: Sequence[dict[str, Any]], notes: Sequence[str], title: str = "") -> str:
+    """Return rows as a table of HTML with a line above and sentences below; columns without any value are left out."""
     head: list[str] = []
     if rows:
-        head = list(rows[0])
+        head = [key for key in rows[0] if any(row[key] is not None for row in rows)]
     cells = [[_cell(row[key]) for key in head] for row in rows[:MOST]]
     if len(rows) > MOST:
         notes = [f"... and {len(rows) - MOST} rows more.", *notes]
-    return html_table(head, cells, notes=notes)
+    return html_table(head, cells, notes=notes, title=title)
 
 
 def _cell(value: Any) -> str:
     if value is None:
         return ""
+    if isinstance(value, bool):
+        return YES_OR_NO[value]
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_cell, value))
     return str(value)
 
 

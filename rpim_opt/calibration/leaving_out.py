@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.terms import term
@@ -30,8 +31,8 @@ BALANCED = 1e-4
 data at nominal."""
 
 
-@dataclass(frozen=True, eq=False)
-class Influence:
+@dataclass(frozen=True, eq=False, repr=False)
+class Influence(Tabled):
     """What C configurations do to n parameters.
 
     Parameters
@@ -111,14 +112,34 @@ class Influence:
         >>> frame.shape, list(frame.columns[:6])
         ((9, 31), ['label', 'configuration', 'leverage', 'cook', 'weight', 'alpha1_deg'])
         """
-        import pandas
+        return super().to_frame()
 
-        columns: dict[str, Any] = {"label": self.label, "configuration": self.configuration}
-        columns |= {"leverage": self.leverage, "cook": self.cook, "weight": self.weight}
-        for j, (name, dimension) in enumerate(zip(self.parameters, self.dimensions, strict=True)):
-            unit, si = display(dimension)
-            columns[f"{name}_{unit}"] = self.change[:, j] / si
-        return pandas.DataFrame(columns)
+    def _short(self) -> str:
+        most = int(np.argmax(self.cook))
+        return f"of {len(self.label)} configurations: {self.label[most]} has Cook's distance {self.cook[most]:.2g}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        units = [display(dimension) for dimension in self.dimensions]
+        for k, label in enumerate(self.label):
+            row: dict[str, Any] = {"label": label, "configuration": int(self.configuration[k])}
+            row |= {"leverage": float(self.leverage[k]), "cook": float(self.cook[k]), "weight": float(self.weight[k])}
+            for name, (unit, si), change in zip(self.parameters, units, self.change[k], strict=True):
+                row[f"{name}_{unit}"] = float(change / si)
+            rows.append(row)
+        return rows
+
+    def _shown_rows(self) -> list[dict[str, Any]]:
+        """Return the configurations from the strongest to the weakest, with what each moves most."""
+        moved = self.standardized
+        size = np.where(np.isnan(moved), np.inf, np.abs(moved))
+        rows: list[dict[str, Any]] = []
+        for k in np.argsort(-self.cook):
+            most = int(np.argmax(size[k]))
+            row: dict[str, Any] = {"label": self.label[k], "leverage": float(self.leverage[k])}
+            row |= {"cook": float(self.cook[k]), "weight": float(self.weight[k])}
+            rows.append(row | {"moves most": self.parameters[most], "by [std]": float(moved[k, most])})
+        return rows
 
 
 def influence(result: Calibration) -> Influence:

@@ -63,7 +63,7 @@ class Uncertainty(Tabled):
     confidence: float = 0.95
 
     def _short(self) -> str:
-        return f"at confidence {self.confidence:g} of {self.result!r}"
+        return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""

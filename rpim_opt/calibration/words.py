@@ -75,7 +75,7 @@ def as_text(result: Outcome) -> str:
 
 def as_html(result: Outcome) -> str:
     """Return the same for a notebook."""
-    return html_table(*_columns(result), notes=_sentences(result))
+    return html_table(*_columns(result), notes=_sentences(result), title=in_short(result).strip("<>"))
 
 
 def in_short(result: Outcome) -> str:

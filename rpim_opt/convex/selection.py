@@ -23,6 +23,9 @@ LEAST, MOST = 1e-9, 1e-6
 """Between which parts of its largest weight a grid of a penalty with kinks begins: below the first, what it adds to the
 objective is less than the accuracy to which that is known."""
 
+AROUND = 5
+"""Weights on either side of the choice that a notebook shows."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection(Tabled):
@@ -74,6 +77,14 @@ class Selection(Tabled):
     def _frame_rows(self) -> list[dict[str, Any]]:
         pairs = zip(self.weights, self.score, strict=True)
         return [{"weight": float(weight), "score": float(score)} for weight, score in pairs]
+
+    def _shown_rows(self) -> list[dict[str, Any]]:
+        """Return those about the choice."""
+        rows = self._frame_rows()
+        if not rows:
+            return rows
+        near = int(np.argmin(np.abs(self.weights - self.weight)))
+        return rows[max(near - AROUND, 0) : near + AROUND + 1]
 
     def _notes(self) -> list[str]:
         return [self.note]

@@ -91,7 +91,7 @@ class Instance(Tabled):
     noise: str = "robot"
 
     def _short(self) -> str:
-        return f"'{shortened(self.title)}': {self.problem!r}"
+        return f"'{shortened(self.title)}' {self.problem._short()}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the identified parameters."""

@@ -163,7 +163,7 @@ class Comparison:
     def _repr_html_(self) -> str | None:
         """Return the summary for a notebook."""
         if any(row["status"] in NUMBERS for row in self.rows):
-            return f"<p>{self!r}</p>{self.summary()._repr_html_()}"
+            return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}"
         return None
 
 

@@ -21,6 +21,13 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from pages import FENCE, PICTURE, Snippet, pages
 
 LINK = re.compile(r"(\]\()([^)\s:#]*)(#[\w-]+)?(\))")
+STYLE = """\
+<style>
+.jp-RenderedMarkdown .highlight { background: var(--jp-cell-editor-background); padding: 0.5em; margin: 0.5em 0 1em }
+.jp-OutputArea-output pre { word-break: normal; overflow-wrap: anywhere; font-size: 85% }
+</style>
+</head>"""
+"""Room about shell commands, and printed tables that fit."""
 BROKEN = "the notebook answers otherwise than its page"
 
 
@@ -100,7 +107,7 @@ def export(book: nbformat.NotebookNode, target: Path) -> None:
     exporter = HTMLExporter(embed_images=True)
     body, _ = exporter.from_notebook_node(book, {"metadata": {"path": str(target.parent), "name": book.metadata.title}})
     linked = re.sub(r'href="(\w+)\.ipynb(#[^"]*)?"', r'href="\1.html\2"', body)
-    target.write_text(linked, encoding="utf-8")
+    target.write_text(linked.replace("</head>", STYLE, 1), encoding="utf-8")
 
 
 def main(folder: Path, names: Sequence[str]) -> int:

@@ -44,6 +44,19 @@ def snippets(text: str) -> list[Snippet]:
     return [Snippet(*found) for found in FENCE.findall(text)]
 
 
+def programs(text: str) -> list[Snippet]:
+    """Return a page's Python, each as it runs alone: a block that imports nothing goes on with the one before it."""
+    found: list[Snippet] = []
+    for each in snippets(text):
+        if each.language != "python":
+            continue
+        if found and "import " not in each.code:
+            before = found.pop()
+            each = Snippet(each.language, f"{before.code}\n{each.code}", before.printed + each.printed)
+        found.append(each)
+    return found
+
+
 def shown(text: str) -> list[str]:
     """Return the names of a page's own pictures."""
     return PICTURE.findall(text)
@@ -54,7 +67,7 @@ def main() -> None:
     os.environ["MPLBACKEND"] = "Agg"
     for page in pages():
         text = page.read_text(encoding="utf-8")
-        for snippet in snippets(text):
+        for snippet in programs(text):
             wanted = set(snippet.saved) & set(shown(text))
             if wanted:
                 _draw(snippet, wanted)

@@ -28,13 +28,17 @@ OBJECTS = {
     "program": RESULT.program,
     "estimate": RESULT.program.solve(1.0),
     "uncertainty": ro.calibration.Uncertainty(RESULT),
+    "influence": ro.influence(RESULT),
     "inspection": ro.problem.inspect(INSTANCE.problem),
     "observability": ro.problem.observe(INSTANCE.problem),
     "formulation": ro.robust,
     "prediction": RESULT.predict(INSTANCE.validation.q[:3]),
     "learned": ro.calibrate(INSTANCE.problem).learned,
 }
-TABLED = ("instance", "problem", "data", "parameters", "result", "selection", "uncertainty", "inspection", "identified")
+TABLED = (
+    "instance", "problem", "data", "parameters", "result", "selection", "uncertainty", "inspection", "identified",
+    "influence",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -49,7 +53,28 @@ def test_a_repr_is_one_short_line(name: str) -> None:
 def test_a_notebook_shows_a_table(name: str) -> None:
     page = ElementTree.fromstring(OBJECTS[name]._repr_html_())
     assert len(page.findall(".//tr")) > 3
-    assert page.findall("p")
+    first = page.find("p/b")
+    assert first is not None
+    assert page[0][0] is first  # what it is stands above the table
+    assert first.text == repr(OBJECTS[name])[1:-1]
+    cells = [cell.text or "" for cell in page.findall(".//td")]
+    assert not {"True", "False", "None"} & set(cells)
+    assert max(map(len, cells)) < 30
+
+
+def test_a_notebook_shows_the_scores_about_the_choice() -> None:
+    page = ElementTree.fromstring(RESULT.selection._repr_html_())
+    shown = np.array([float(cell.text or "") for cell in page.findall(".//tbody/tr/th")])
+    assert len(shown) == 11
+    assert shown[5] == pytest.approx(RESULT.weight, rel=0.1)
+
+
+def test_a_notebook_shows_the_strongest_configuration_first() -> None:
+    bad = ro.calibrate(ro.load("blunders").problem, ro.tikhonov, weight=1.0)
+    page = ElementTree.fromstring(ro.influence(bad)._repr_html_())
+    first = [cell.text for cell in page.findall(".//tbody/tr/th")]
+    wrong = {flag.label for flag in ro.calibrate(bad.problem, ro.robust, weight=1.0).flagged}
+    assert set(first[:3]) <= wrong
 
 
 def test_long_tables_are_cut_in_notebooks_and_whole_in_frames() -> None:
