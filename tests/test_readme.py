@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -132,6 +134,74 @@ def test_the_table_of_real_arms_is_the_studys() -> None:
             assert f"{np.exp(np.mean(np.log(ratios))):.2f}" == figure, (count, other)
         assert f"{max(row['learned, model auto'] / row['reml'] for row in own):.2f}" == stated[2]
         assert f"{100 * np.mean([row['learned, model auto, covers'] for row in own]):.0f}" == stated[3]
+
+
+def rows_of(study: str) -> list[dict[str, Any]]:
+    """Return the replicates of a study's result."""
+    from pyarrow import parquet
+
+    return parquet.read_table(ROOT / "studies" / "results" / study / "replicates.parquet").to_pylist()
+
+
+def over(rows: list[dict[str, Any]], one: str, other: str) -> str:
+    """Return the geometric mean of the ratios of two columns as a text says it."""
+    return f"{np.exp(np.mean([np.log(row[one] / row[other]) for row in rows])):.2f}"
+
+
+def test_figures_of_real_arms_in_texts_are_the_studys() -> None:
+    rows = rows_of("real_data")
+    counts = (10, 20, None)
+    geometry = [over([row for row in rows if (row["count"] or None) == count], "learned", "reml") for count in counts]
+    said = "geometry alone has {} and {} of REML's error with 10 and 20 configurations, and {} with all"
+    assert said.format(*geometry) in README
+    ten = [row for row in rows if row["count"] == 10]
+    auto = [over(ten, "learned, model auto", other) for other in ("least squares", "reml")]
+    said = "{} times the error of least squares with ten configurations, and {} times that of REML"
+    assert said.format(*auto) in PAGES["weights"]
+    others = [row["learned, model auto"] / row["reml"] for row in rows if "cable" not in row["name"]]
+    assert f"none is above {max(others):.2f}" in README
+
+
+def test_figures_of_simulated_arms_in_texts_are_the_studys() -> None:
+    rows = rows_of("noise_and_poses")
+    unknown = [row for row in rows if row["truth"] == "unknown"]
+    ratios = {
+        rule: [over([row for row in unknown if row["count"] == n], rule, "least_squares") for n in (8, 10, 15, 52)]
+        for rule in ("learned", "reml")
+    }
+    said = "{}, {}, {} and {} times the error of least squares with 8, 10, 15 and 52 configurations".format
+    assert said(*ratios["learned"]) in PAGES["weights"]
+    assert "(REML {}, {}, {} and {})".format(*ratios["reml"]) in PAGES["weights"]
+    worst = max(row["learned"] / row["least_squares"] for row in unknown if row["count"] == 10)
+    assert f"{worst:.0f} times worse" in PAGES["limitations"]
+
+
+def test_figures_of_one_size_in_texts_are_the_studys() -> None:
+    rows = [row for row in rows_of("noise_and_poses") if row["truth"] is None]
+    cells = sorted({(row["noise_mm"], row["count"]) for row in rows})
+    assert len(cells) == 24
+    found = {
+        cell: {
+            rule: np.sqrt(np.mean([row[rule] for row in own]) / np.mean([row["bound"] for row in own]))  # of squares
+            for rule in ("learned", "reml")
+        }
+        for cell in cells
+        if (own := [row for row in rows if (row["noise_mm"], row["count"]) == cell])
+    }
+    few = {rule: [found[cell][rule] for cell in cells if cell[1] == 8] for rule in ("learned", "reml")}
+    said = (
+        "{:.2f} to {:.2f} times the error that is possible in the mean with eight configurations, REML {:.2f} to {:.2f}"
+    )
+    bounds = [end(few[rule]) for rule in ("learned", "reml") for end in (min, max)]
+    assert said.format(*bounds) in PAGES["weights"]
+    many = max(value for cell in cells if cell[1] >= 20 for value in found[cell].values())
+    assert f"both have at most {many:.2f}" in PAGES["weights"]
+
+
+def test_least_squares_with_many_clean_configurations_is_as_good_as_said() -> None:
+    metrics = json.loads((ROOT / "studies" / "results" / "peers" / "metrics.json").read_text())
+    better = 100 * (1 - 1 / metrics["clean52 over best peer"])
+    assert f"{better:.0f} % better" in PAGES["limitations"]
 
 
 LINKED = ["README.md", ".github/CONTRIBUTING.md", *(f"studies/gallery/{page}.md" for page in PAGES if page != "README")]
