@@ -55,6 +55,16 @@ def test_an_installation_without_tools_is_part_of_the_tested_one() -> None:
     assert not {"pytest", "ruff", "hatchling", "distributed"} & set(plain)
 
 
+def test_notebooks_run_with_what_was_tested() -> None:
+    known = locked("constraints.txt")
+    there = locked("studies/gallery/notebooks.txt")
+    for name in set(known) & set(there):
+        assert known[name] == there[name]
+    for text in [*project()["project"]["dependencies"], *project()["dependency-groups"]["notebooks"]]:
+        requirement = Requirement(text)
+        assert Version(there[canonicalize_name(requirement.name)][0]) in requirement.specifier, text
+
+
 def test_the_build_backend_has_a_bound() -> None:
     for text in project()["build-system"]["requires"]:
         assert any(part.operator in ("<", "==", "~=") for part in Requirement(text).specifier), text
