@@ -24,6 +24,7 @@ LINK = re.compile(r"(\]\()([^)\s:#]*)(#[\w-]+)?(\))")
 STYLE = """\
 <style>
 .jp-RenderedMarkdown .highlight { background: var(--jp-cell-editor-background); padding: 0.5em; margin: 0.5em 0 1em }
+.jp-RenderedMarkdown .highlight pre { background: none }
 .jp-OutputArea-output pre { word-break: normal; overflow-wrap: anywhere; font-size: 85% }
 </style>
 </head>"""
