@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -308,10 +309,10 @@ def test_every_selector_works_on_touches(selector: str) -> None:
     assert np.nanmean(result.errors(instance.validation)) < 5e-5
 
 
-def test_a_result_survives_its_file() -> None:
+def test_a_result_survives_its_file(tmp_path: Path) -> None:
     result = replace(ro.load("contact").calibrate(weight=1.0), record=ro.load("contact").record)
-    ro.store.save_result(result, "result.json")
-    again = ro.store.load_result("result.json")
+    ro.store.save_result(result, tmp_path / "result.json")
+    again = ro.store.load_result(tmp_path / "result.json")
     assert again.x == pytest.approx(result.x, abs=0)
     assert again.problem.data.blocks[0].point.tolist() == result.problem.data.blocks[0].point.tolist()
     assert np.array_equal(again.errors(), result.errors(), equal_nan=True)
