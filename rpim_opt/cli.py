@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +24,8 @@ HELP = """Robot calibration by convex optimization.
 
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
-Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found.
+Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found;
+4 whether a limit is kept cannot be decided.
 """
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
 # click's, or typer's own copy, depending on typer's version
@@ -50,6 +52,13 @@ Problem = Annotated[str, typer.Argument(help="A problem folder, or the name of o
 Variant = Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, typer.Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
+Limit = Annotated[
+    float | None,
+    typer.Option(help="How far the robot may miss, for acceptance [mm]: exit code 1 if rejected, 4 if undecided."),
+]
+Box = Annotated[
+    str | None, typer.Option(help="Where: x0,x1,y0,y1,z0,z1 [mm] in the base frame; else all that was measured.")
+]
 Marker = Annotated[str | None, typer.Option(help="Which reflector, where there are several.")]
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout instead of text, errors as JSON on stderr.")
@@ -157,21 +166,28 @@ def calibrate(
         typer.Option(help="What of the noise is learned: robot (beside the instrument's), free, level, declared."),
     ] = None,
     refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
+    refit_all: Annotated[
+        bool, typer.Option("--refit-all", help="Validate, then calibrate once more from all rows, both figures said.")
+    ] = False,
+    limit: Limit = None,
+    box: Box = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
     profile: Annotated[bool, typer.Option(help="Say where the time went.")] = False,
     as_json: Json = False,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if it did not converge.
+    Exit code 1 if it did not converge, or a limit is not kept; 4 where that cannot be decided.
     """
     with progress() as say:
         from rpim_opt.basics.phases import clock
+        from rpim_opt.show.options import required
         from rpim_opt.show.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
+        instance = replace(instance, requirement=required(limit, box, instance.requirement))
         with clock() as running:
             result = _calibrated(instance, select, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())
@@ -180,6 +196,12 @@ def calibrate(
             say("calibrating without the distrusted rows")
             without = [flag.label for flag in result.flagged]
             result = result.without_flagged()
+        if refit_all:
+            from rpim_opt.calibration.refit import refit_all as refitted
+
+            say("calibrating from all rows")
+            result = refitted(result)
+        say("summing up")
         found = summary(result, instance.published)
     text = describe(result, found)
     if without:
@@ -193,6 +215,13 @@ def calibrate(
     show(text, {**found, "refitted_without": without, "written": written}, as_json)
     if not result.converged:
         raise typer.Exit(1)
+    _end_by(found["acceptance"])
+
+
+def _end_by(acceptance: dict[str, Any] | None) -> None:
+    """End with the exit code of a verdict, unless it accepts or there is none."""
+    if acceptance is not None and acceptance["verdict"] != "accepted":
+        raise typer.Exit({"rejected": 1, "undecided": 4}[acceptance["verdict"]])
 
 
 def _calibrated(
@@ -282,6 +311,39 @@ def validate(
     show(text + written_line(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
     if failed:
         raise typer.Exit(1)
+
+
+@app.command()
+def accept(
+    result: Result,
+    limit: Limit = None,
+    box: Box = None,
+    data: Annotated[Path | None, typer.Option(help="New measurements that check it, instead of those it has.")] = None,
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say whether the calibrated robot keeps a limit wherever it will go, by the bound of what it may miss by.
+
+    Exit code 0 if it is accepted, 1 if it is rejected, 4 where that cannot be decided: then it says what is lacking.
+    """
+    with progress() as say:
+        from rpim_opt.calibration.acceptance import accept
+        from rpim_opt.show.options import required
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.validation import read_measurements
+
+        say("reading the result")
+        loaded = load_result(result)
+        rows = None
+        left_out: tuple[str, ...] = ()
+        if data is not None:
+            rows, left_out = read_measurements(loaded, data, measurement, units)
+        say("looking for the largest bound")
+        found = accept(loaded, required(limit, box, loaded.record.requirement), rows)
+    document = {**found.content(), "left_out": left_out}
+    show(str(found) + left_out_line(left_out), document, as_json)
+    _end_by(document)
 
 
 @app.command()
