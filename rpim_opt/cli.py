@@ -347,6 +347,38 @@ def accept(
 
 
 @app.command()
+def iso9283(
+    table: Annotated[Path, typer.Argument(help="Repeated approaches: pose, x_mm, y_mm, z_mm; command_x_mm, ...")],
+    units: Units = "",
+    limit: Annotated[float | None, typer.Option(help="Largest AP_p that is allowed [mm]; exit code 1 above.")] = None,
+    repeatability: Annotated[
+        float | None, typer.Option(help="Largest RP_l that is allowed [mm]; exit code 1 above.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the figures, pose by pose.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
+    from rpim_opt.use.approaches import read_approaches
+
+    require_positive("--limit", limit)
+    require_positive("--repeatability", repeatability)
+    found = read_approaches(table, units)
+    if limit is not None and found.accuracy is None:
+        raise InputError("--limit", "a table without commands", "command_x_mm, command_y_mm, command_z_mm in it")
+    checks = [("AP_p", found.accuracy, limit), ("RP_l", found.repeatability, repeatability)]
+    over = [(name, value, most) for name, value, most in checks if value is not None and most is not None]
+    lines = [
+        f"The largest {n} is {1e3 * v:.4f} mm, {'above' if 1e3 * v > m else 'within'} {m:g} mm." for n, v, m in over
+    ]
+    within = all(1e3 * value <= most for _, value, most in over)
+    document = {**found.content(), "limit_mm": limit, "repeatability_limit_mm": repeatability,
+                "within_limits": within if over else None, "written": written_to(out, found.csv())}  # fmt: skip
+    show("\n".join([str(found), *lines]) + written_line(out), document, as_json)
+    if not within:
+        raise typer.Exit(1)
+
+
+@app.command()
 def export(
     result: Result,
     urdf: Annotated[Path | None, typer.Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
@@ -482,6 +514,9 @@ def design(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random candidates.")] = 0,
+    beside: Annotated[
+        bool, typer.Option("--next", help="Count what is measured already: which help most besides.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -501,7 +536,10 @@ def design(
             q = postures_at(instance.problem, touched_place(instance.problem, point)[None].repeat(candidates, 0), seed)
         else:
             q = random_candidates(robot, candidates, seed)
-        found = choose(instance.problem, q, count, criterion, progress=say)
+        measured = None
+        if beside:
+            measured = instance.problem.data
+        found = choose(instance.problem, q, count, criterion, progress=say, measured=measured)
     columns = joint_cells(robot, q[found.chosen], found.chosen)
     text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap,

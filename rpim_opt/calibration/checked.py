@@ -68,8 +68,8 @@ class Checked:
             lines.append(f"Lacking: at least {fewest} rows that the calibration did not see; there are {self.rows}.")
         if self.beyond:
             lines.append(
-                f"Lacking: intervals that hold. {listed(list(self.beyond), 3)} beyond what the prediction's uncertainty "
-                "allows: measure again, or find what the model lacks."
+                f"Lacking: intervals that hold. Beyond what the prediction's uncertainty allows: "
+                f"{listed(list(self.beyond), 3)}. Measure again, or find what the model lacks."
             )
         if self.coverage is not None:
             # coordinates of a row are not independent of each other: a row counts once
