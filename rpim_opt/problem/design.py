@@ -256,7 +256,8 @@ def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tu
     known = there.linearize(np.zeros(len(there.parameters.free))).A
     L = np.linalg.cholesky(np.eye(A.shape[2]) + known.T @ known)
     B = np.linalg.solve(L, A.reshape(-1, A.shape[2]).T).T.reshape(A.shape)
-    return B, np.linalg.solve(L, np.linalg.solve(L, C).T)
+    W = np.linalg.solve(L, np.linalg.solve(L, C).T)
+    return np.asarray(B, dtype=float), np.asarray(W, dtype=float)
 
 
 def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:
