@@ -66,8 +66,10 @@ class Performance(Tabled):
     >>> import rpim_opt as ro
     >>> reached = 1e-3 * np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0]])
     >>> found = ro.use.iso9283(["P1"] * 4, reached, command=np.full((4, 3), 1e-3))
-    >>> print(f"{1e3 * found.poses[0].AP:.3f} mm, {1e3 * found.poses[0].RP:.3f} mm")
+    >>> print(f"{1e3 * found.accuracy:.3f} mm, {1e3 * found.repeatability:.3f} mm")
     1.732 mm, 0.100 mm
+    >>> round(found.content()["poses"][0]["RP_l_mm"], 3), found.csv().splitlines()[0]
+    (0.1, 'pose,cycles,AP_p_mm,AP_x_mm,AP_y_mm,AP_z_mm,RP_l_mm')
     >>> print(found.notes()[0])
     The standard has 5 poses approached 30 times each: there is 1 pose, approached 4 times.
     """
