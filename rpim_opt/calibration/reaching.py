@@ -9,6 +9,8 @@ import numpy as np
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.learned import Size
+from rpim_opt.calibration.learned_words import VAGUE
 from rpim_opt.calibration.region import Region
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
@@ -24,11 +26,9 @@ class Reaching(NamedTuple):
 class Share(NamedTuple):
     """What a bound at a configuration is made of [m].
 
-    The distance that is exceeded with the confidence, and what the bound would be if all parameters were known: the
-    robot's own scatter, as it is estimated and at the least.
+    What the bound would be if all parameters were known: the robot's own scatter, as it is estimated and at the least.
     """
 
-    least: float
     scatter: float
     least_scatter: float
 
@@ -95,10 +95,7 @@ def reaching(result: Calibration, region: Region, q: Array, confidence: float) -
 
 def share(result: Calibration, region: Region, q: Array, confidence: float) -> Share:
     """Return what the bound at one configuration (dof,) is made of; arguments and errors as for `reaching`."""
-    covariance = result.predict(q[None], region.marker, of="reached").covariance
-    least = distance_quantile(covariance, result.freedom, 1 - confidence)
-    at = [_own(each, region, q, confidence) for each in (result, _still(result))]
-    return Share(float(least[0]), *at)
+    return Share(*(_own(each, region, q, confidence) for each in (result, _still(result))))
 
 
 def _own(result: Calibration | None, region: Region, q: Array, confidence: float) -> float:
@@ -117,5 +114,12 @@ def _still(result: Calibration) -> Calibration | None:
     if scatter is None:
         return None
     learned = {} if result.learned is None else result.learned.noise
-    least = {kind: size.value * np.exp(-2 * size.spread) for kind, size in learned.items()}
+    least = {kind: _least(size) for kind, size in learned.items()}
     return replace(result, problem=result.problem.scattered(replace(scatter, **least)))
+
+
+def _least(size: Size) -> float:
+    """Return the lower end of a scatter; zero where the data know no more than an upper one."""
+    if size.spread > VAGUE:
+        return 0.0
+    return size.value * float(np.exp(-2 * size.spread))

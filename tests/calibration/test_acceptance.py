@@ -123,7 +123,17 @@ def test_the_three_verdicts(result) -> None:
     between = accept(result, Requirement(0.8 * bound))
     assert between.verdict == "undecided"
     assert "design PROBLEM --next" in between.reasons[0]
-    assert accept(result, Requirement(0.1 * bound)).verdict == "rejected"
+    few = accept(result, Requirement(0.1 * bound))
+    assert few.verdict == "undecided"  # nothing shows that a better calibration would not do
+    assert "scatter" in few.reasons[0]
+
+
+def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
+    problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
+    found = accept(ro.calibrate(problem), Requirement(2e-4))
+    assert found.verdict == "rejected"
+    assert "own scatter alone" in found.reasons[0]
+    assert found.scatter > 2e-4
 
 
 def test_the_mean_of_the_errors_does_not_decide(result) -> None:
@@ -287,10 +297,15 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     assert "Accepted: limit 0.2 mm" in text
     assert "Measured by: A. Person" in text
     assert "The parameters given here come from all 80" in text
-    assert run(monkeypatch, "accept", out, "--limit", "0.001", "--json") == 1
+    head, *rows = (folder / "validation.csv").read_text(encoding="utf-8").splitlines()
+    column = head.split(",").index("x_mm")
+    cells = [row.split(",") for row in rows]
+    off = [[*row[:column], str(float(row[column]) + 5), *row[column + 1 :]] for row in cells]
+    (tmp_path / "off.csv").write_text("\n".join([head, *(",".join(row) for row in off)]), encoding="utf-8")
+    assert run(monkeypatch, "accept", out, "--limit", "1", "--data", str(tmp_path / "off.csv"), "--json") == 1
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "rejected"
-    assert document["limit_mm"] == pytest.approx(0.001)
+    assert document["limit_mm"] == pytest.approx(1.0)
     assert run(monkeypatch, "accept", out, "--box", "0,800,-900,900,0,900") == 0
     assert "the box x 0 to 800, y -900 to 900, z 0 to 900 mm" in capsys.readouterr().out
     bound = document["bound_mm"]
