@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,7 +25,8 @@ HELP = """Robot calibration by convex optimization.
 
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
-Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found.
+Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found;
+4 whether a limit is kept cannot be decided.
 """
 
 
@@ -63,6 +65,13 @@ Problem = Annotated[str, typer.Argument(help="A problem folder, or the name of o
 Variant = Annotated[str | None, typer.Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, typer.Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, typer.Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
+Limit = Annotated[
+    float | None,
+    typer.Option(help="How far the robot may miss, for acceptance [mm]: exit code 1 if rejected, 4 if undecided."),
+]
+Box = Annotated[
+    str | None, typer.Option(help="Where: x0,x1,y0,y1,z0,z1 [mm] in the base frame; else all that was measured.")
+]
 Marker = Annotated[str | None, typer.Option(help="Which reflector, where there are several.")]
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on stdout instead of text, errors as JSON on stderr.")
@@ -170,21 +179,28 @@ def calibrate(
         typer.Option(help="What of the noise is learned: robot (beside the instrument's), free, level, declared."),
     ] = None,
     refit: Annotated[bool, typer.Option(help="Calibrate once more without the rows that it distrusts.")] = False,
+    refit_all: Annotated[
+        bool, typer.Option("--refit-all", help="Validate, then calibrate once more from all rows, both figures said.")
+    ] = False,
+    limit: Limit = None,
+    box: Box = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json.")] = None,
     profile: Annotated[bool, typer.Option(help="Say where the time went.")] = False,
     as_json: Json = False,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if it did not converge.
+    Exit code 1 if it did not converge, or a limit is not kept; 4 where that cannot be decided.
     """
     with progress() as say:
         from rpim_opt.basics.phases import clock
+        from rpim_opt.show.options import required
         from rpim_opt.show.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
+        instance = replace(instance, requirement=required(limit, box, instance.requirement))
         with clock() as running:
             result = _calibrated(instance, select, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())
@@ -193,6 +209,12 @@ def calibrate(
             say("calibrating without the distrusted rows")
             without = [flag.label for flag in result.flagged]
             result = result.without_flagged()
+        if refit_all:
+            from rpim_opt.calibration.refit import refit_all as refitted
+
+            say("calibrating from all rows")
+            result = refitted(result)
+        say("summing up")
         found = summary(result, instance.published)
     text = describe(result, found)
     if without:
@@ -206,6 +228,13 @@ def calibrate(
     show(text, {**found, "refitted_without": without, "written": written}, as_json)
     if not result.converged:
         raise typer.Exit(1)
+    _end_by(found["acceptance"])
+
+
+def _end_by(acceptance: dict[str, Any] | None) -> None:
+    """End with the exit code of a verdict, unless it accepts or there is none."""
+    if acceptance is not None and acceptance["verdict"] != "accepted":
+        raise typer.Exit({"rejected": 1, "undecided": 4}[acceptance["verdict"]])
 
 
 def _calibrated(
@@ -294,6 +323,71 @@ def validate(
         text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
     show(text + written_line(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
     if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def accept(
+    result: Result,
+    limit: Limit = None,
+    box: Box = None,
+    data: Annotated[Path | None, typer.Option(help="New measurements that check it, instead of those it has.")] = None,
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say whether the calibrated robot keeps a limit wherever it will go, by the bound of what it may miss by.
+
+    Exit code 0 if it is accepted, 1 if it is rejected, 4 where that cannot be decided: then it says what is lacking.
+    """
+    with progress() as say:
+        from rpim_opt.calibration.acceptance import accept
+        from rpim_opt.show.options import required
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.validation import read_measurements
+
+        say("reading the result")
+        loaded = load_result(result)
+        rows = None
+        left_out: tuple[str, ...] = ()
+        if data is not None:
+            rows, left_out = read_measurements(loaded, data, measurement, units)
+        say("looking for the largest bound")
+        found = accept(loaded, required(limit, box, loaded.record.requirement), rows)
+    document = {**found.content(), "left_out": left_out}
+    show(str(found) + left_out_line(left_out), document, as_json)
+    _end_by(document)
+
+
+@app.command()
+def iso9283(
+    table: Annotated[Path, typer.Argument(help="Repeated approaches: pose, x_mm, y_mm, z_mm; command_x_mm, ...")],
+    units: Units = "",
+    limit: Annotated[float | None, typer.Option(help="Largest AP_p that is allowed [mm]; exit code 1 above.")] = None,
+    repeatability: Annotated[
+        float | None, typer.Option(help="Largest RP_l that is allowed [mm]; exit code 1 above.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file for the figures, pose by pose.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
+    from rpim_opt.use.approaches import read_approaches
+
+    require_positive("--limit", limit)
+    require_positive("--repeatability", repeatability)
+    found = read_approaches(table, units)
+    if limit is not None and found.accuracy is None:
+        raise InputError("--limit", "a table without commands", "command_x_mm, command_y_mm, command_z_mm in it")
+    checks = [("AP_p", found.accuracy, limit), ("RP_l", found.repeatability, repeatability)]
+    over = [(name, value, most) for name, value, most in checks if value is not None and most is not None]
+    lines = [
+        f"The largest {n} is {1e3 * v:.4f} mm, {'above' if 1e3 * v > m else 'within'} {m:g} mm." for n, v, m in over
+    ]
+    within = all(1e3 * value <= most for _, value, most in over)
+    document = {**found.content(), "limit_mm": limit, "repeatability_limit_mm": repeatability,
+                "within_limits": within if over else None, "written": written_to(out, found.csv())}  # fmt: skip
+    show("\n".join([str(found), *lines]) + written_line(out), document, as_json)
+    if not within:
         raise typer.Exit(1)
 
 
@@ -433,6 +527,9 @@ def design(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random candidates.")] = 0,
+    beside: Annotated[
+        bool, typer.Option("--next", help="Count what is measured already: which help most besides.")
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="CSV file for the chosen configurations.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -452,7 +549,10 @@ def design(
             q = postures_at(instance.problem, touched_place(instance.problem, point)[None].repeat(candidates, 0), seed)
         else:
             q = random_candidates(robot, candidates, seed)
-        found = choose(instance.problem, q, count, criterion, progress=say)
+        measured = None
+        if beside:
+            measured = instance.problem.data
+        found = choose(instance.problem, q, count, criterion, progress=say, measured=measured)
     columns = joint_cells(robot, q[found.chosen], found.chosen)
     text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap,

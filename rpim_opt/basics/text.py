@@ -60,3 +60,13 @@ def joined(parts: Sequence[str]) -> str:
     if not before:
         return last
     return f"{', '.join(before)} and {last}"
+
+
+def percent(share: float) -> str:
+    """Return a share as a text.
+
+    >>> from rpim_opt.basics.text import percent
+    >>> percent(0.95), percent(0.999)
+    ('95 %', '99.9 %')
+    """
+    return f"{100 * share:.4g} %"

@@ -1,4 +1,6 @@
 from . import baselines as baselines
+from .acceptance import Acceptance as Acceptance
+from .acceptance import accept as accept
 from .asking import calibrate as calibrate
 from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
@@ -6,6 +8,7 @@ from .leaving_out import Influence as Influence
 from .leaving_out import influence as influence
 from .outcome import Iteration as Iteration
 from .outcome import Prediction as Prediction
+from .refit import refit_all as refit_all
 from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo

@@ -88,7 +88,7 @@ class Spread:
         A position that an undecided direction moves is not known: its variances are infinite. One that none moves is,
         even where no parameter alone is.
         """
-        found = np.einsum("nij,jk,nlk->nil", J, self.noise + self.prior, J)
+        found = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
         slopes = J * self.linear.parameters.scale
         moved = np.linalg.norm(slopes @ self.form.undecided(self.weight), axis=2)
         size = np.linalg.norm(slopes, axis=(1, 2))

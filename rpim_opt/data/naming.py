@@ -104,10 +104,10 @@ def _read(name: str, head: Head | None, known: Sequence[str], joints: Sequence[s
         return Reading(stem, unit, "named so")
     if stem.lower() in TOUCHED and stem.lower() in known:  # elsewhere such a column holds labels
         return Reading(stem.lower(), unit, "what was touched")
-    found = _recognised(stem, joints)
+    found = recognised(stem, joints)
     if head is not None and head.group and not found.why and not found.kind:
         bare = split(head.name)[0]
-        found = Reading(bare, "", "named so") if bare in known else _recognised(bare, joints)
+        found = Reading(bare, "", "named so") if bare in known else recognised(bare, joints)
     return found._replace(unit=unit)
 
 
@@ -120,7 +120,7 @@ def _unit_of(head: Head) -> str:
     return ""
 
 
-def _recognised(stem: str, joints: Sequence[str]) -> Reading:
+def recognised(stem: str, joints: Sequence[str]) -> Reading:
     """Return what a name means, with why; without where it is not known."""
     path = [part for part in re.split(r"[/.]", stem.strip().strip("%")) if part]
     plain = re.sub(r"[\s.\-/:\[\]()]+", "_", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower())).strip("_% ")

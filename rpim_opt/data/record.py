@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.held_out import HeldOut
+from rpim_opt.data.requirement import Requirement
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 
@@ -33,6 +35,12 @@ class Record:
         When, UTC (ISO 8601).
     versions
         Of the packages that made it, by name.
+    details
+        Who measured, when, with which instrument, ... as somebody stated it, by name.
+    requirement
+        What the robot is accepted by; None where nobody demanded anything.
+    held_out
+        Rows that were kept apart and judged before they were used; None where validation data are still unused.
 
     Examples
     --------
@@ -50,6 +58,9 @@ class Record:
     simulated: bool = False
     made: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
+    details: Mapping[str, str] = field(default_factory=dict)
+    requirement: Requirement | None = None
+    held_out: HeldOut | None = None
 
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""

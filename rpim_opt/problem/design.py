@@ -133,6 +133,7 @@ def choose(
     criterion: str = "V",
     predicted: Array | None = None,
     progress: Callable[[str], None] = lambda text: None,
+    measured: Dataset | None = None,
 ) -> Design:
     """Choose the configurations that tell most about the identified parameters.
 
@@ -165,6 +166,8 @@ def choose(
         (K, dof) where positions are to be predicted (V); the candidates by default.
     progress
         Told what goes on.
+    measured
+        Rows that are there already, which M then counts, too; D, A and V alone.
 
     Raises
     ------
@@ -193,6 +196,8 @@ def choose(
         P = _rows(problem, candidates if predicted is None else np.atleast_2d(predicted), whitened=False)
         C = np.zeros((n, n))
         C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
+    if measured is not None:
+        A, C = _beside(A, C, problem.on(measured), criterion)
     progress(f"relaxing over {len(A)} candidates")
     if criterion == "E":  # directions that no candidate sees would be the least informed whatever is chosen
         _, s, Vt = np.linalg.svd(A.reshape(-1, n), full_matrices=False)
@@ -238,6 +243,21 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     rows = there.linearize(x).A if whitened else there.jacobian(x) * scale
     rows = rows.reshape(len(q), -1, len(scale))
     return rows if whitened else rows[:, [i for i, d in enumerate(kind.components.values()) if d == "length"]]
+
+
+def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tuple[Array, Array]:
+    """Return rows and criterion in coordinates in which what is measured already, with the prior, is the identity.
+
+    With L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
+    constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1).
+    """
+    if criterion == "E" or there.data.blocks[0].measurement.touching:
+        raise InputError("measured", f"criterion {criterion} of these measurements", "D, A or V, of a row at a time")
+    known = there.linearize(np.zeros(len(there.parameters.free))).A
+    L = np.linalg.cholesky(np.eye(A.shape[2]) + known.T @ known)
+    B = np.linalg.solve(L, A.reshape(-1, A.shape[2]).T).T.reshape(A.shape)
+    W = np.linalg.solve(L, np.linalg.solve(L, C).T)
+    return np.asarray(B, dtype=float), np.asarray(W, dtype=float)
 
 
 def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:

@@ -146,15 +146,10 @@ def _standing(machine: Machine, q: Array) -> Array:
 
 def _reaching(machine: Machine, lower: Array, upper: Array) -> Array:
     """Draw configurations until enough reach into a box."""
-    whole = machine.parameters
-    nominal = whole.nominal.copy()
-    nominal[[name.startswith("base_") for name in whole.names]] = 0.0
-    at_base = replace(machine, parameters=replace(whole, nominal=nominal), at=None, farthest=None)
-    still = np.zeros(len(whole.free))
     inside = [np.zeros((0, require_robot(machine).dof))]
     for seed in range(16):
         q = random_candidates(require_robot(machine), DRAWN, seed)
-        at = _there(at_base, q, None, None).modelled(still)[0]
+        at = in_base(machine, q)
         inside.append(q[((at >= lower) & (at <= upper)).all(axis=1)])
         if sum(map(len, inside)) >= ALL:
             break
@@ -162,3 +157,12 @@ def _reaching(machine: Machine, lower: Array, upper: Array) -> Array:
     if len(found) == 0:
         raise InputError("box", "no configuration of the joint ranges that reaches into it", "a box within reach")
     return found
+
+
+def in_base(machine: Machine, q: Array, marker: str | None = None) -> Array:
+    """Return where the nominal reflector is in the robot's base frame, (N, 3) [m]; arguments as for `predicted`."""
+    whole = machine.parameters
+    nominal = whole.nominal.copy()
+    nominal[[name.startswith("base_") for name in whole.names]] = 0.0
+    at_base = replace(machine, parameters=replace(whole, nominal=nominal), at=None, farthest=None)
+    return _there(at_base, q, marker, None).modelled(np.zeros(len(whole.free)))[0]

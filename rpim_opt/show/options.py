@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
+    from rpim_opt.data.requirement import Requirement
     from rpim_opt.data.understanding import Asked
 
 Writer = tuple[Path, Callable[[Path], Any]]
@@ -69,6 +71,45 @@ def carried(text: str | None) -> tuple[float | None, list[float] | None]:
     if mass < 0 or len(centre) not in (0, 3):
         raise InputError("--payload", f"'{text}'", "a mass [kg], or mass and centre: kg,x,y,z [mm]")
     return mass, [1e-3 * v for v in centre] or None
+
+
+def required(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
+    """Return what a robot is accepted by: options before what is stated, None where neither says anything.
+
+    Parameters
+    ----------
+    limit
+        Of the position that is reached [mm].
+    box
+        ``x0,x1,y0,y1,z0,z1`` [mm] in the robot's base frame.
+    stated
+        What the problem or the result states.
+    """
+    from rpim_opt.data.requirement import Requirement
+
+    require_positive("--limit", limit)
+    if limit is None and stated is None:
+        if box is not None:
+            raise InputError("--box", "no limit", "--limit with it [mm]")
+        return None
+    sides = None
+    if box is not None:
+        sides = _box(box)
+    if stated is None:
+        return Requirement(1e-3 * (limit or 0.0), sides)
+    if limit is not None:
+        stated = replace(stated, limit=1e-3 * limit)
+    return replace(stated, box=sides or stated.box)
+
+
+def _box(text: str) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    try:
+        numbers = [1e-3 * float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 6 or not all(abs(number) < LARGEST for number in numbers):
+        raise InputError("--box", f"'{text}'", "six numbers: x0,x1,y0,y1,z0,z1 [mm]")
+    return (numbers[0], numbers[1]), (numbers[2], numbers[3]), (numbers[4], numbers[5])
 
 
 def asked_of(units: str, *, columns: str, key: str, quaternion: str, rotation: str, **layout: str) -> Asked:

@@ -19,7 +19,7 @@ from rpim_opt.show.figure import (
     label_rows,
     legend_above,
 )
-from rpim_opt.show.scales import error_bins, magnification
+from rpim_opt.show.scales import below, error_bins, kept_tolerance, magnification
 
 FEW = 100
 """Rows up to which each has its line and its large dot."""
@@ -95,13 +95,13 @@ def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes =
     ('error [mm]', 'log')
     """
     ax = axes_of(ax)
-    sets = (1e3 * result.nominal_errors(data), 1e3 * result.errors(data))
-    edges = error_bins(*sets)
-    for errors, color, label in zip(sets, (BEFORE, AFTER), ("nominal", "identified"), strict=True):
+    sets = {"nominal": 1e3 * result.nominal_errors(data), "identified": 1e3 * result.errors(data)}
+    edges = error_bins(*sets.values())
+    for (label, errors), color in zip(sets.items(), (BEFORE, AFTER), strict=True):
         ax.hist(np.maximum(errors, edges[0]), edges, color=color, alpha=0.85, label=label)
     ax.set_xscale("log")
     in_millimetres(ax.xaxis)
-    ax.set_xlabel("error [mm]")
+    ax.set_xlabel("error [mm]" + below(edges[0], sets).replace(" The", "\nThe"))
     ax.set_ylabel("rows")
     return legend_above(ax)
 
@@ -214,7 +214,7 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     if result.linear_penalty:
         low, high = Uncertainty(result, confidence).intervals()[own].T / si
         half = (high - low) / 2
-    bound = free.tolerance[own] / si
+    bound = kept_tolerance(result)[own] / si
     ax.errorbar(
         x, place, xerr=half, fmt="o", color=AFTER, ms=4, capsize=3, label=f"deviation, {confidence:.0%} interval"
     )

@@ -11,13 +11,16 @@ from rpim_opt.basics.page import page as whole
 from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.show.section_acceptance import acceptance_section, verdict
 from rpim_opt.show.section_errors import errors_section
 from rpim_opt.show.section_evidence import convergence_section, distrusted_section, identifiability_section
 from rpim_opt.show.section_parameters import parameters_section
-from rpim_opt.show.section_provenance import provenance_section
+from rpim_opt.show.section_provenance import provenance_section, stated_details
+from rpim_opt.show.section_reach import reach_section
 from rpim_opt.show.section_space import space_section
 from rpim_opt.show.section_summary import summary_section
 from rpim_opt.show.section_weight import weight_section
+from rpim_opt.show.summary import acceptance
 
 HERE = Path(__file__).resolve().parent
 
@@ -25,9 +28,10 @@ HERE = Path(__file__).resolve().parent
 def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
     """Write a report of a calibration: one HTML file that needs no network.
 
-    For whoever has to believe the result: a summary in one sentence and three figures; then errors before and after,
-    in space too, how the weight was chosen, the parameters with intervals and tolerances, what the data cannot tell
-    apart, distrusted rows, convergence, and where the data come from. Every text of a user's file is shown as text.
+    For whoever has to believe the result: whether it is accepted where something is demanded, a summary in one sentence
+    and three figures, how far off the robot may be where; then errors before and after, in space too, how the weight
+    was chosen, the parameters with intervals and the tolerances that were kept, what the data cannot tell apart,
+    distrusted rows, convergence, and where the data come from. Every text of a user's file is shown as text.
 
     Parameters
     ----------
@@ -62,8 +66,13 @@ def page(result: Calibration) -> str:
     """Return the report as HTML; only its own style and script may run, and nothing can be loaded."""
     data: dict[str, Any] = {}
     title = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
+    accepted = acceptance(result)
     parts = [
+        *verdict(accepted),
         *summary_section(result),
+        *stated_details(result),
+        *acceptance_section(result, accepted),
+        *reach_section(result),
         *errors_section(result),
         *space_section(result, data),
         *weight_section(result, data),

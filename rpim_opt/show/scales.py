@@ -1,10 +1,15 @@
-"""How figures are scaled: bins of errors, and how far error vectors are enlarged."""
+"""What figures show and how it is scaled: bins of errors, tolerances, and how far error vectors are enlarged."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import joined
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.constraints import within_tolerance
 
 
 def error_bins(*errors: Array) -> Array:
@@ -13,6 +18,22 @@ def error_bins(*errors: Array) -> Array:
     high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
     low = max(float(every.min(initial=high)), 1e-4 * high)
     return np.geomspace(low, high, 25 if high > 1.01 * low else 2)
+
+
+def below(low: float, sets: Mapping[str, Array]) -> str:
+    """Say how many errors of each set lie below the first bin, which counts them, too; nothing where none does."""
+    said = [f"{int(np.sum(errors < low))} {when}" for when, errors in sets.items() if (errors < low).any()]
+    if not said:
+        return ""
+    return f" The first bar holds all rows below {low:.2g} mm, too: {joined(said)}."
+
+
+def kept_tolerance(result: Calibration) -> Array:
+    """Return the tolerances (n,) [SI] that the formulation keeps to; infinite where it keeps to none."""
+    stated = result.problem.parameters.free.tolerance
+    if any(each is within_tolerance for each in result.formulation.constraints):
+        return stated
+    return np.full(len(stated), np.inf)
 
 
 def magnification(points: Array, vectors: Array) -> float:

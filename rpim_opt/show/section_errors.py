@@ -13,7 +13,7 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.show.pieces import BEFORE_AFTER, figure, mm, sets
-from rpim_opt.show.scales import error_bins
+from rpim_opt.show.scales import below, error_bins
 from rpim_opt.show.svg import Axis, Chart
 
 FEW = 30
@@ -33,6 +33,7 @@ def errors_section(result: Calibration) -> list[Element]:
         angles += _angles(result, name, data)
         figures = [_bars(result, name, labels, lengths), _histogram(name, lengths), *_axes(result, name, data)]
         blocks += [tag("h3", f"{name.capitalize()} rows"), tag("div", *figures, class_="figures")]
+    rows += _held_out(result)
     tables = [data_table("Error [mm]", ["data", "rows", "mean", "RMS", "95 % below", "largest"], rows)]
     if angles:
         head = ["data", "rows", "mean", "RMS", "largest"]
@@ -45,8 +46,21 @@ def _note(result: Calibration) -> str:
     note = "Before: the robot of the drawing"
     if fitted.any():
         note += ", its base, reflectors and other frames fitted to the identification data"
-    used = "Identification rows were used to find the parameters; validation rows were not used for anything."
+    used = "Identification rows were used to find the parameters."
+    if result.record.validation is not None:
+        used = "Identification rows were used to find the parameters; validation rows were not used for anything."
+    if result.record.held_out is not None:
+        used += " Those kept apart were not, when they were judged; they are among the identification rows now."
     return f"{note}. {used}"
+
+
+def _held_out(result: Calibration) -> list[list[str]]:
+    held = result.record.held_out
+    if held is None:
+        return []
+    what = f"kept apart, from {held.used} rows"
+    both = (("before", held.nominal), ("after", held.error))
+    return [[f"{what}, {when}", *_figures(1e3 * errors[np.isfinite(errors)])] for when, errors in both]
 
 
 def _lengths(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list[str]]:
@@ -98,7 +112,11 @@ def _bars(result: Calibration, name: str, labels: Sequence[str], lengths: Mappin
     legend = [*BEFORE_AFTER]
     if wrong:
         legend.append(("mark", "distrusted"))
-    return figure(chart, "Every row, on a logarithmic scale.", *legend)
+    cut = sum(int(np.sum(errors < low)) for errors in lengths.values())
+    note = ""
+    if cut:
+        note = f" {cut} errors below {low:.2g} mm stand at the floor."
+    return figure(chart, f"Every row, on a logarithmic scale.{note}", *legend)
 
 
 def _distrusted(result: Calibration, name: str, labels: Sequence[str]) -> list[int]:
@@ -119,7 +137,7 @@ def _histogram(name: str, sets: Mapping[str, Array]) -> Element:
         bins = np.flatnonzero(count)
         hints = [f"{when}: {count[k]} rows from {mm(edges[k])} to {mm(edges[k + 1])} mm" for k in bins]
         chart.bars(edges[bins], edges[bins + 1], count[bins], when, hints)
-    return figure(chart, "How many rows have which error.", *BEFORE_AFTER)
+    return figure(chart, f"How many rows have which error.{below(edges[0], sets)}", *BEFORE_AFTER)
 
 
 def _axes(result: Calibration, name: str, data: Dataset) -> list[Element]:

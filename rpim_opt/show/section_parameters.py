@@ -12,6 +12,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.show.pieces import figure
+from rpim_opt.show.scales import kept_tolerance
 from rpim_opt.show.svg import Axis, Chart
 
 
@@ -21,7 +22,7 @@ def parameters_section(result: Calibration) -> list[Element]:
     free = result.problem.parameters.free
     head = ["parameter", "nominal", "identified", "deviation", "± (95 %)", "tolerance"]
     rows = _rows(result, half)
-    if not np.isfinite(free.tolerance).any():
+    if not np.isfinite(kept_tolerance(result)).any():
         head = head[:-1]
         rows = [row[:-1] for row in rows]
     own = np.array(free.dimensions)[~free.of_frames]
@@ -47,6 +48,7 @@ def _intervals(result: Calibration) -> tuple[Array, str]:
 
 def _rows(result: Calibration, half: Array) -> list[list[str]]:
     free = result.problem.parameters.free
+    tolerance = kept_tolerance(result)
     held = {each.name for each in result.held}
     rows = []
     for i, row in enumerate(result.parameter_rows()):
@@ -56,7 +58,7 @@ def _rows(result: Calibration, half: Array) -> list[list[str]]:
             name += ", at its bound"
         figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}"]
         spread = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
-        bound = f"±{free.tolerance[i] / si:.4g}" if np.isfinite(free.tolerance[i]) else ""
+        bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         rows.append([name, *figures, spread, bound])
     return rows
 
@@ -68,7 +70,7 @@ def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
     names = [free.names[i] for i in own]
     x = result.x[own] / si
     spread = np.nan_to_num(half[own] / si, posinf=0.0)
-    bound = free.tolerance[own] / si
+    bound = kept_tolerance(result)[own] / si
     stated = bound[np.isfinite(bound)]
     # an interval that ends far out would hide all others: it is cut at the chart's edge
     reach = 1.1 * max(

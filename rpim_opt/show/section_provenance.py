@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, section
+from rpim_opt.basics.page import data_table, facts, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.show.pieces import sets
 from rpim_opt.store.definition import definition
+from rpim_opt.store.stated_record import FIELDS
 
 
 def provenance_section(result: Calibration) -> list[Element]:
@@ -23,7 +24,7 @@ def provenance_section(result: Calibration) -> list[Element]:
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
             rows.append([f"{name}, {what}", str(len(block.row)), _noise(block)])
-    facts = {
+    said = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",
         "Robot": "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items()),
@@ -38,7 +39,7 @@ def provenance_section(result: Calibration) -> list[Element]:
         tables.append(data_table("Input files", ["file", "SHA-256"], files, prose=True))
     return section(
         "Where the data come from",
-        tag("dl", *(tag("div", tag("dt", key), tag("dd", value)) for key, value in facts.items()), class_="facts"),
+        facts(list(said.items())),
         *tables,
         tag(
             "p",
@@ -46,6 +47,14 @@ def provenance_section(result: Calibration) -> list[Element]:
             "the page was written.",
         ),
     )
+
+
+def stated_details(result: Calibration) -> list[Element]:
+    """Return who measured, when, with what, ..., as somebody stated it; nothing where nobody did."""
+    details = result.record.details
+    if not details:
+        return []
+    return [facts([(FIELDS.get(key, key), text) for key, text in details.items()])]
 
 
 def _robot(name: str, robot: Robot) -> str:

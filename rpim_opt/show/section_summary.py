@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import bullets
@@ -12,12 +13,14 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.show.pieces import mm, quantity, repeated, sets
 
+KEPT_APART = "kept apart"
+
 
 def summary_section(result: Calibration) -> list[Element]:
     """Return the summary, of validation data where there are some."""
-    name, data = next(iter(sets(result).items()))
-    before = statistics(result.nominal_errors(data))
-    after = statistics(result.errors(data))
+    name, nominal, identified = _shown(result)
+    before = statistics(nominal)
+    after = statistics(identified)
     if not after["count"]:
         raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
     figures = [
@@ -37,6 +40,15 @@ def summary_section(result: Calibration) -> list[Element]:
     ]
 
 
+def _shown(result: Calibration) -> tuple[str, Array, Array]:
+    """Return which rows are summed up, and their errors (N,) before and after [m]: unseen ones where there are some."""
+    held = result.record.held_out
+    if held is not None:
+        return KEPT_APART, held.nominal, held.error
+    name, data = next(iter(sets(result).items()))
+    return name, result.nominal_errors(data), result.errors(data)
+
+
 def _left(result: Calibration) -> list[Element]:
     """Return how the noise compares with the declared one, and what the errors that are left are made of."""
     sentences = result.noise_sentence()
@@ -51,7 +63,9 @@ def _left(result: Calibration) -> list[Element]:
 def _sentence(result: Calibration, name: str, before: dict[str, Any], after: dict[str, Any]) -> str:
     n = after["count"]
     where = f"On {n} measurements that the calibration did not see"
-    if name != "validation":
+    if name == KEPT_APART:
+        where = f"On {n} measurements that were kept apart"
+    elif name != "validation":
         where = f"On the {n} measurements that the calibration itself used (none were kept apart to check it)"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     moves = "rises"
@@ -63,7 +77,18 @@ def _sentence(result: Calibration, name: str, before: dict[str, Any], after: dic
     sentence = f"{where}, the mean {quantity(result)} {moves} {means}{times}."
     if not result.converged:
         return f"This calibration did not converge and should not be used. {sentence}"
-    return sentence
+    return sentence + _from_all(result)
+
+
+def _from_all(result: Calibration) -> str:
+    """Say what the delivered parameters come from, where the rows that validated were used in their turn."""
+    held = result.record.held_out
+    if held is None:
+        return ""
+    return (
+        f" That validates the procedure, with parameters from {held.used} rows; those delivered here come from all "
+        f"{len(result.problem.labels)}."
+    )
 
 
 def _notes(result: Calibration, name: str) -> list[str]:

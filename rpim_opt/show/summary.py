@@ -9,6 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import table
+from rpim_opt.calibration.acceptance import Acceptance, accept
 from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks
 from rpim_opt.calibration.lack_of_fit import judged
@@ -17,6 +18,7 @@ from rpim_opt.calibration.words import weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import known_distance, known_parallel, known_square
 from rpim_opt.store.content import figures, sets
+from rpim_opt.store.stated_record import FIELDS
 
 KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 
@@ -53,8 +55,10 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         stated = result.errors(data, "stated angle")
         if np.isfinite(stated).any():
             angles.append({"what": f"{name}, known angle", **statistics(stated, "mrad")})
+    errors += _held_out(result)
     whole = figures(result)
     lacking = judged(result)
+    accepted = acceptance(result)
     return {
         "title": record.title,
         "source": record.source,
@@ -64,7 +68,28 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "prices": [price._asdict() for price in result.prices],
         "remarks": _remarks(result),
         "lack_of_fit": lacking and lacking.content(),
+        "details": dict(record.details),
+        "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
     }
+
+
+def acceptance(result: Calibration) -> Acceptance | None:
+    """Return the verdict of what a result's record requires; None where nothing is required."""
+    if result.record.requirement is None:
+        return None
+    return accept(result)
+
+
+def _held_out(result: Calibration) -> list[dict[str, Any]]:
+    """Return the errors of rows that were kept apart before they were used."""
+    held = result.record.held_out
+    if held is None:
+        return []
+    what = f"kept apart, from {held.used} rows"
+    return [
+        {"what": f"{what}, {when}", **statistics(of)}
+        for when, of in (("nominal", held.nominal), ("identified", held.error))
+    ]
 
 
 def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any]]:
@@ -97,6 +122,8 @@ def _remarks(result: Calibration) -> list[str]:
         *result.noise_sentence(),
         *result.remarks(),
     ]
+    if result.record.held_out is not None:
+        remarks.append(result.record.held_out.sentence(len(result.problem.data)))
     remarks += likely_causes(result)
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     if fitted.any():
@@ -106,7 +133,9 @@ def _remarks(result: Calibration) -> list[str]:
 
 def describe(result: Calibration, found: Mapping[str, Any]) -> str:
     """Return the tables of a `summary`."""
-    lines = [f"{found['title']}\n{found['source']}\n", result.parameter_table(), ""]
+    stated = [f"{FIELDS[key]}: {text}" for key, text in found["details"].items()]
+    head = "\n".join([found["title"], found["source"], *stated])
+    lines = [f"{head}\n", result.parameter_table(), ""]
     lines.append(table(["error [mm]", "rows", "mean", "RMS", "max"], [_row(e, "mm") for e in found["errors"]]))
     if found["orientation"]:
         rows = [_row(e, "mrad") for e in found["orientation"]]
@@ -114,6 +143,8 @@ def describe(result: Calibration, found: Mapping[str, Any]) -> str:
     lines += ["", *found["remarks"]]
     if found["lack_of_fit"]:
         lines += ["", *found["lack_of_fit"]["text"]]
+    if found["acceptance"]:
+        lines += ["", *found["acceptance"]["text"]]
     return "\n".join(lines)
 
 

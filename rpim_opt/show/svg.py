@@ -13,6 +13,8 @@ from rpim_opt.basics.markup import Element, tag
 WIDTH = 420
 TOP = 12
 RIGHT = 14
+TALLEST = 400.0
+"""Of a chart whose axes have the same scale [px]."""
 
 
 class Axis:
@@ -55,9 +57,9 @@ class Axis:
         return [(float(v), f"{v:.6g}") for v in np.round(values / step) * step + 0.0]
 
     def _powers(self) -> list[tuple[float, str]]:
-        """Return decades, or where there are few of them 1, 2 and 5 times each."""
+        """Return decades, or where there are fewer than three of them 1, 2 and 5 times each."""
         span = self.high - self.low
-        if span >= 1.5:
+        if span >= 1.5 and np.floor(self.high) - np.ceil(self.low) >= 2:
             return self._decades(int(np.ceil(span / 6)))
         powers = range(int(np.floor(self.low)), int(np.ceil(self.high)))
         steps = [m * 10.0**k for k in powers for m in (1, 2, 5)]
@@ -131,6 +133,27 @@ class Chart:
         for i, (a, b, c) in enumerate(zip(self.x(left), self.x(right), self.y(top), strict=True)):
             size = {"x": f"{a:g}", "y": f"{c:g}", "width": f"{max(b - a, 0.5):g}", "height": f"{max(floor - c, 0):g}"}
             self.add("rect", hints[i] if hints else "", class_=f"bar {class_}", **size)
+
+    def cell(self, x: tuple[float, float], y: tuple[float, float], class_: str, hint: str = "") -> None:
+        """Draw a rectangle between two values of x and two of y."""
+        left, right = self.x(x)
+        bottom, top = self.y(y)
+        size = {"x": f"{left:g}", "y": f"{top:g}", "width": f"{right - left:g}", "height": f"{bottom - top:g}"}
+        self.add("rect", hint, class_=f"cell {class_}", **size)
+
+    def alike(self) -> None:
+        """Give both axes the same scale, and the chart the height that this takes, before anything is drawn."""
+        per = (self.x.end - self.x.start) / (self.x.high - self.x.low)
+        below = self.height - self.y.start
+        across = per * (self.y.high - self.y.low)
+        if across > TALLEST:
+            middle = (self.x.low + self.x.high) / 2
+            half = (self.x.high - self.x.low) / 2 * across / TALLEST
+            self.x.low = middle - half
+            self.x.high = middle + half
+            across = TALLEST
+        self.y.start = TOP + across
+        self.height = int(np.ceil(self.y.start + below))
 
     def element(self) -> Element:
         """Return the chart."""

@@ -11,13 +11,16 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.outcome import Kept
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.held_out import HeldOut
 from rpim_opt.data.record import Record
 from rpim_opt.store.definition import defined, definition, forms
 from rpim_opt.store.learned_parts import learned_part, scatter_part
 from rpim_opt.store.parts import data_part, finite, parameters_part, robots_part, selection_part
+from rpim_opt.store.record_part import record_part
 from rpim_opt.store.schema import FORMAT, VERSION
 
 
@@ -47,9 +50,17 @@ def content(result: Calibration) -> dict[str, Any]:
         "data": {name: data_part(part) for name, part in data.items()},
         "scatter": scatter_part(result.problem.scatter),
         "learned": learned_part(result.learned),
-        "record": _record(record),
+        "record": record_part(record),
+        "acceptance": acceptance_part(result),
     }
     return {**parts, "digest": digest(parts)}
+
+
+def acceptance_part(result: Calibration) -> dict[str, Any] | None:
+    """Return the verdict of what the record requires, or None where nothing is required."""
+    if result.record.requirement is None:
+        return None
+    return accept(result).content()
 
 
 def digest(parts: Mapping[str, Any]) -> str:
@@ -78,6 +89,7 @@ def figures(result: Calibration) -> dict[str, Any]:
     return {
         "identification": statistics(result.errors()),
         "validation": None if validation is None else statistics(result.errors(validation)),
+        "held_out": _held_out(result.record.held_out),
         "weight": result.weight,
         "selector": result.selector,
         "corner": None if result.selection is None else bool(result.selection.interior),
@@ -88,6 +100,13 @@ def figures(result: Calibration) -> dict[str, Any]:
         "flagged": result.doubted,
         "parameters": result.parameter_rows(),
     }
+
+
+def _held_out(held: HeldOut | None) -> dict[str, Any] | None:
+    """Return what rows showed that were kept apart before they were used, and how many were used till then."""
+    if held is None:
+        return None
+    return {"nominal": statistics(held.nominal), "identified": statistics(held.error), "used": held.used}
 
 
 def sets(identification: Dataset, record: Record) -> dict[str, Dataset]:
@@ -131,14 +150,3 @@ def _kept(kept: Kept) -> dict[str, Any] | None:
     if kept.linear is None:
         return None
     return {"factor": float(np.sqrt(kept.factor)), "left_out": list(kept.left_out)}
-
-
-def _record(record: Record) -> dict[str, Any]:
-    return {
-        "source": record.source,
-        "files": dict(record.files),
-        "excluded": dict(record.excluded),
-        "simulated": record.simulated,
-        "made": record.made,
-        "versions": dict(record.versions),
-    }

@@ -22,6 +22,7 @@ from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.record import Record
+from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.frames import starting_parameters
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
@@ -33,6 +34,7 @@ from rpim_opt.store.named import named_formulation, named_weight
 from rpim_opt.store.observations import Tables, read_tables
 from rpim_opt.store.prior_table import prior_files, stated_prior
 from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
+from rpim_opt.store.stated_record import stated_details, stated_requirement
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,6 +54,10 @@ class Instance(Tabled):
         evidence wants.
     noise
         What of the noise is learned, as `calibrate` has it.
+    details
+        Who measured, when, with which instrument, ... as the folder states it.
+    requirement
+        What the robot is accepted by; None where the folder demands nothing.
     prior
         What the folder believes of the deviations.
     published
@@ -89,6 +95,8 @@ class Instance(Tabled):
     excluded: Mapping[str, str] = field(default_factory=dict)
     model: str = "geometry"
     noise: str = "robot"
+    details: Mapping[str, str] = field(default_factory=dict)
+    requirement: Requirement | None = None
 
     def _short(self) -> str:
         return f"'{shortened(self.title)}' {self.problem._short()}"
@@ -122,7 +130,16 @@ class Instance(Tabled):
     @property
     def record(self) -> Record:
         """What a saved result and its report say of the data: title, source, validation data, files, excluded rows."""
-        return Record(self.title, self.source, self.validation, self.files, self.excluded, bool(self.simulation))
+        return Record(
+            self.title,
+            self.source,
+            self.validation,
+            self.files,
+            self.excluded,
+            bool(self.simulation),
+            details=self.details,
+            requirement=self.requirement,
+        )
 
 
 def load(
@@ -165,6 +182,8 @@ def load(
         problem = _problem(stated, tables)
         formulation = _formulation(stated, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
+        details = stated_details(table.record)
+        requirement = stated_requirement(table.acceptance, problem.robot)
     except InputError as error:
         raise error.within(path) from None
     return Instance(
@@ -182,6 +201,8 @@ def load(
         excluded=table.exclude,
         model=table.model,
         noise=table.scatter if isinstance(table.scatter, str) else "declared",
+        details=details,
+        requirement=requirement,
     )
 
 

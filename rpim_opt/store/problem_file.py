@@ -95,6 +95,8 @@ class ProblemTable(Table):
     published: dict[str, dict[str, float]] = Field(default_factory=dict)
     reference: dict[str, list[float]] = Field(default_factory=dict)
     simulation: dict[str, Any] = Field(default_factory=dict)
+    record: dict[str, Any] = Field(default_factory=dict)
+    acceptance: dict[str, Any] = Field(default_factory=dict)
     variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
 

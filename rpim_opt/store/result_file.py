@@ -36,6 +36,7 @@ from rpim_opt.store.content import content, derived, digest, sets
 from rpim_opt.store.definition import formulation_of, quadratic_of
 from rpim_opt.store.learned_parts import learned_of, scatter_of
 from rpim_opt.store.parts import data_of, parameters_of, robots_of, selection_of
+from rpim_opt.store.record_part import record_of
 from rpim_opt.store.schema import FORMAT, VERSION, File, RowPart
 
 Models = Model | Mapping[str, Model]
@@ -176,7 +177,7 @@ def _calibration(file: File, known: Mapping[str, Measurement], model: Models) ->
         program=program,
         certificate=_certificate(file),
         asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
-        record=_record(file, problem, known),
+        record=record_of(file.title, file.record, _validation(file, problem, known)),
         kept=None if formulation.solvable else _kept(file, program),
         learned=learned_of(file.learned),
     )
@@ -217,20 +218,6 @@ def _model(file: File) -> str:
 
 def _history(file: File) -> tuple[Iteration, ...]:
     return tuple(Iteration(each.objective, each.step, each.weight, each.damping) for each in file.history)
-
-
-def _record(file: File, problem: CalibrationProblem, known: Mapping[str, Measurement]) -> Record:
-    stated = file.record
-    return Record(
-        file.title,
-        stated.source,
-        _validation(file, problem, known),
-        stated.files,
-        stated.excluded,
-        stated.simulated,
-        stated.made,
-        stated.versions,
-    )
 
 
 def _validation(file: File, problem: CalibrationProblem, known: Mapping[str, Measurement]) -> Dataset | None:

@@ -181,6 +181,28 @@ class PricePart(Part):
     misfit: float
 
 
+class RequirementPart(Part):
+    """What the robot is accepted by."""
+
+    limit: float
+    box: Annotated[list[Annotated[Vector, Field(min_length=2, max_length=2)]], Field(min_length=3, max_length=3)] | None
+    joints: dict[str, Annotated[Vector, Field(min_length=2, max_length=2)]]
+    marker: str
+    confidence: float
+
+
+class HeldOutPart(Part):
+    """Rows that were kept apart and judged before they were used."""
+
+    label: list[str]
+    used: int
+    nominal: list[float | None]
+    error: list[float | None]
+    sigmas: list[float | None]
+    allowed: list[float | None]
+    coverage: float | None
+
+
 class RecordPart(Part):
     """Where the measurements come from."""
 
@@ -190,6 +212,9 @@ class RecordPart(Part):
     simulated: bool
     made: str
     versions: dict[str, str]
+    details: dict[str, str] = Field(default_factory=dict)
+    requirement: RequirementPart | None = None
+    held_out: HeldOutPart | None = None
 
 
 class RowPart(Part):

@@ -65,6 +65,12 @@ angle_mrad = 10.0
 # The reflector in the flange frame: {known}.
 {tools}
 {known_of}
+# How far the robot may miss where, for a verdict in result and report; who measured, when, with what:
+# [acceptance]
+# limit_mm = 0.1                # and a box x_mm = [300, 800], y_mm, z_mm of the base frame; else all that was measured
+# [record]
+# by = ""                       # when, where, instrument, instrument_serial, robot_serial, temperature, notes, ...
+
 # Rows to leave out, label = reason:
 # [exclude]
 # {label} = "the reflector was bumped"

@@ -1,9 +1,12 @@
+from .approaches import read_approaches as read_approaches
 from .compensated import Compensation as Compensation
 from .compensation import compensate as compensate
 from .compensation import compensate_file as compensate_file
 from .export import export_urdf as export_urdf
 from .geometry import geometry_alone as geometry_alone
 from .identified import identified as identified
+from .iso9283 import Performance as Performance
+from .iso9283 import iso9283 as iso9283
 from .targets import read_targets as read_targets
 from .validation import Validation as Validation
 from .validation import read_measurements as read_measurements

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
@@ -16,10 +15,9 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.calibration.intervals import coverage_factor, scattered
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.calibration.unseen import judged
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.naming import rename
@@ -27,11 +25,6 @@ from rpim_opt.data.reading import read_data
 from rpim_opt.data.spelling import parse_units
 from rpim_opt.data.understanding import Asked, understand
 from rpim_opt.robot.mdh import Robot
-
-RARE = 0.01
-"""Probability that data like those of the calibration have any row that is named."""
-CONFIDENCE = 0.95
-"""Of the intervals whose coverage is counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +44,7 @@ class Validation:
     sigmas, allowed
         (N,) |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the instrument's as the
         row states it, and the robot's scatter) and C the calibration's, and what of it Fisher's F allows so that one
-        of all N rows exceeds it with probability `RARE`. NaN where the calibration has no covariance, or none in a
+        of all N rows exceeds it with probability 0.01. NaN where the calibration has no covariance, or none in a
         direction that the row depends on.
     coverage
         Share of the lengths that lie in the interval of a new reading at a confidence of 0.95; None without covariance.
@@ -170,7 +163,7 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     """
     return Validation(
         data.label, result.nominal_errors(data), result.errors(data), result.error_vectors(data),
-        result.errors(data, "angle"), *_judged(result, data), result.outside(data),
+        result.errors(data, "angle"), *judged(result, data), result.outside(data),
     )  # fmt: skip
 
 
@@ -233,44 +226,3 @@ def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:
     si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in kind.components.values()}
     sigma = zip(kind.components.items(), np.sqrt(variance), strict=True)
     return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma}
-
-
-def _judged(result: Calibration, data: Dataset) -> tuple[Array, Array, float | None]:
-    """Return the rows' residuals in standard deviations of a reading, what of it is allowed, and the coverage."""
-    N = len(data)
-    sigmas = np.full(N, np.nan)
-    allowed = np.full(N, np.nan)
-    inside: list[np.ndarray] = []
-    C = known_covariance(result)
-    if C is None:
-        return sigmas, allowed, None
-    problem = result.problem.on(data)
-    residual = problem.residual(result.x)
-    J = problem.jacobian(result.x)
-    known = np.isfinite(np.diag(C))
-    C = np.where(np.outer(known, known), C, 0.0)
-    factor = coverage_factor(result.freedom, CONFIDENCE)
-    start = 0
-    for block, reading in zip(data.blocks, scattered(problem, result.noise_level).reading, strict=True):
-        k = len(block.measurement.components)
-        end = start + k * len(block.row)
-        r = residual[start:end].reshape(-1, k)
-        A = J[start:end].reshape(-1, k, len(C))
-        start = end
-        S = A @ C @ A.transpose(0, 2, 1) + reading
-        squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
-        seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
-        sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
-        allowed[block.row] = np.where(seen, _limit(k, result.freedom, N), np.nan)
-        lengths = np.array([d == "length" for d in block.measurement.components.values()])
-        within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
-        inside.append(within[seen][:, lengths].ravel())
-    covered = np.concatenate(inside)
-    if not len(covered):
-        return sigmas, allowed, None
-    return sigmas, allowed, float(covered.mean())
-
-
-def _limit(k: int, freedom: float, rows: int) -> float:
-    """Return above which norm one of so many rows with k components lies with probability `RARE`."""
-    return float(np.sqrt(k * fdtri(k, max(freedom, 1.0), 1 - RARE / rows)))

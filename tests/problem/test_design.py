@@ -67,3 +67,29 @@ def test_design_from_the_command_line(monkeypatch, capsys, tmp_path) -> None:
     assert run(monkeypatch, "design", "position", "--count", "35", "--table", str(again), "--criterion", "D") == 0
     assert run(monkeypatch, "design", "position", "--criterion", "Q") == 2
     assert "criterion: found 'Q', accepted: D, A, E, V" in capsys.readouterr().err
+
+
+def test_what_is_measured_already_counts() -> None:
+    """Value and choice are those of the information of all rows, computed here without the change of coordinates."""
+    problem = ro.load("position").problem
+    q = random_candidates(problem.robot, 60, 3)
+    still = np.zeros(len(problem.parameters.free))
+    there = problem.on(ro.Dataset.of(q, np.zeros((60, 3)), np.sqrt(problem.data.blocks[0].covariance[0, 0, 0])))
+    rows = there.linearize(still).A.reshape(60, 3, -1)
+    known = problem.linearize(still).A
+    already = np.eye(known.shape[1]) + known.T @ known
+
+    def information(chosen: np.ndarray) -> np.ndarray:
+        return already + np.einsum("kin,kim->nm", rows[chosen], rows[chosen])
+
+    found = choose(problem, q, 6, "D", measured=problem.data)
+    gained = np.linalg.slogdet(information(found.chosen))[1] - np.linalg.slogdet(already)[1]
+    assert found.value == pytest.approx(gained, rel=1e-8)
+    alone = choose(problem, q, 6, "D")
+    assert np.linalg.slogdet(information(alone.chosen))[1] < np.linalg.slogdet(information(found.chosen))[1]
+    slopes = there.jacobian(still).reshape(60, 3, -1) * problem.parameters.free.scale
+    C = np.einsum("kin,kim->nm", slopes, slopes) / 60
+    found = choose(problem, q, 6, "V", measured=problem.data)
+    assert found.value == pytest.approx(np.trace(np.linalg.solve(information(found.chosen), C)), rel=1e-8)
+    with pytest.raises(ro.InputError, match="criterion E"):
+        choose(problem, q, 6, "E", measured=problem.data)

@@ -17,6 +17,7 @@ import rpim_opt as ro
 from rpim_opt.convex.program import Program
 from rpim_opt.show import section_evidence, section_weight
 from rpim_opt.show.report import page
+from rpim_opt.show.scales import below
 from rpim_opt.show.svg import Axis
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
@@ -324,3 +325,57 @@ def test_many_distrusted_rows_are_not_all_named(monkeypatch) -> None:
     assert "and 3 more" in text
     named = [flag.label for flag in result.flagged]
     assert f">{named[1]}<" in text
+
+
+def required(result: ro.calibration.Calibration, limit: float) -> ro.calibration.Calibration:
+    record = replace(result.record, requirement=ro.data.Requirement(limit), details={"by": "A. <b>Person</b>"})
+    return replace(result, record=record)
+
+
+@pytest.mark.parametrize(("limit", "verdict"), [(1e-3, "Accepted"), (7e-5, "Cannot be decided")])
+def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) -> None:
+    read = Reader(page(required(result_of("position"), limit)))
+    words = " ".join(read.words.split())
+    assert 0 <= words.index(f"{verdict}: the robot may be off by up to") < words.index("mean before")
+    assert "A. <b>Person</b>" in words
+    assert not read.all("b")
+    assert "Largest bound" in words
+    levels = [str(each["class"]) for each in read.all("rect") if str(each.get("class", "")).startswith("cell")]
+    assert len(levels) > 100
+    assert any("over" in level for level in levels) == (verdict != "Accepted")
+
+
+def test_no_verdict_where_nothing_is_demanded(arm) -> None:
+    read = Reader(page(arm))
+    assert not any("verdict" in str(each.get("class")) for each in read.all("p"))
+    assert "How far off the robot may be" in read.words
+
+
+def test_both_figures_are_said_where_all_rows_were_used() -> None:
+    result = ro.calibration.refit_all(result_of("position"))
+    words = " ".join(Reader(page(result)).words.split())
+    assert "On 40 measurements that were kept apart, the mean position error falls from" in words
+    assert "with parameters from 40 rows; those delivered here come from all 80." in words
+    assert "kept apart, from 40 rows, after" in words
+
+
+def test_only_tolerances_that_were_kept_are_shown() -> None:
+    instance = ro.load("constrained", "wrong_tolerance")
+    assert np.isfinite(instance.problem.parameters.free.tolerance).any()
+    kept = ro.calibrate(instance.problem, ro.bounded, 1.0)
+    loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
+    assert "tolerance" in Reader(page(kept)).words
+    assert "tolerance" not in Reader(page(loose)).words
+
+
+def test_a_histogram_says_what_is_below_its_first_bar() -> None:
+    result = result_of("position")
+    errors = {"before": np.array([1.0, 2.0]), "after": np.array([1e-6, 0.1])}
+    assert below(1e-4, errors) == " The first bar holds all rows below 0.0001 mm, too: 1 after."
+    assert below(1e-7, errors) == ""
+    assert "The first bar" not in page(result)
+
+
+def test_a_scale_of_little_more_than_a_decade_has_more_than_one_tick() -> None:
+    for low, high in ((0.05, 2.0), (0.02, 0.9), (0.4, 30.0)):
+        assert len(Axis("", (low, high), log=True).ticks()) >= 3

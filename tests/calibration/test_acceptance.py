@@ -1,0 +1,316 @@
+"""A robot is accepted by the bound of what it may miss by, and calibrated from all rows once that is validated."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import fdtri
+from scipy.stats import chi
+
+import rpim_opt as ro
+from rpim_opt.basics.files import read_json
+from rpim_opt.calibration.reaching import distance_quantile, reaching
+from rpim_opt.calibration.region import region_of
+from rpim_opt.problem.predicting import in_base
+from rpim_opt.store.content import digest
+from tests.simulate import simulated
+from tests.test_cli import run
+
+Requirement = ro.data.Requirement
+accept = ro.calibration.accept
+
+
+@pytest.fixture(scope="module")
+def instance() -> ro.store.Instance:
+    return ro.load("position")
+
+
+@pytest.fixture(scope="module")
+def result(instance) -> ro.calibration.Calibration:
+    return instance.calibrate()
+
+
+@pytest.fixture(scope="module")
+def everything(result) -> ro.calibration.Calibration:
+    return ro.calibration.refit_all(result)
+
+
+# --- the bound ---------------------------------------------------------------------------------------------------
+
+
+def test_the_quantile_is_that_of_chi_and_of_fisher_where_it_is_exact() -> None:
+    same = np.eye(3)[None] * 4.0
+    assert distance_quantile(same, 1e9, 0.95)[0] == pytest.approx(2 * chi(3).ppf(0.95), rel=1e-6)
+    assert distance_quantile(same, 7.0, 0.95)[0] == pytest.approx(2 * np.sqrt(3 * fdtri(3, 7, 0.95)), rel=1e-12)
+    line = np.diag([0.0, 9.0, 0.0])[None]
+    assert distance_quantile(line, 1e9, 0.95)[0] == pytest.approx(3 * 1.959964, rel=1e-6)
+    assert distance_quantile(np.diag([1.0, np.inf, 1.0])[None], 10.0, 0.95)[0] == np.inf
+    assert distance_quantile(np.zeros((1, 3, 3)), 10.0, 0.95)[0] == 0.0
+
+
+@pytest.mark.parametrize("freedom", [6.0, 1e6])
+def test_elsewhere_it_is_within_five_percent_of_drawn_ones(freedom: float) -> None:
+    rng = np.random.default_rng(1)
+    for sides in ([1.0, 1.0, 0.2], [1.0, 0.3, 0.3], [1.0, 0.5, 0.1]):
+        z = rng.normal(size=(200_000, 3)) * sides
+        length = np.linalg.norm(z, axis=1) / np.sqrt(rng.chisquare(freedom, len(z)) / freedom)
+        stated = distance_quantile(np.diag(np.square(sides))[None], freedom, 0.95)[0]
+        assert stated == pytest.approx(np.quantile(length, 0.95), rel=0.05)
+
+
+def test_the_bound_holds_at_true_positions_as_often_as_it_says() -> None:
+    kept = []
+    for seed in range(4):
+        problem, truth = simulated(noise=5e-5, seed=seed)
+        found = ro.calibrate(problem)
+        region = region_of(found, Requirement(1e-3))
+        q = region.drawn()[:400]
+        there = problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), 1.0))
+        miss = np.linalg.norm(there.modelled(truth)[0] - found.forward(q)[:, :3, 3], axis=1)
+        kept.append(np.mean(miss <= reaching(found, region, q, 0.95).bound))
+    # the simulated robot does not scatter, and some scatter is always allowed for
+    assert np.mean(kept) > 0.95
+    assert min(kept) > 0.8
+
+
+# --- the region --------------------------------------------------------------------------------------------------
+
+
+def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result) -> None:
+    box = ((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9))
+    required = Requirement(1e-4, box=box, joints=((1, (-0.5, 0.5)),))
+    region = region_of(result, required)
+    q = region.drawn()
+    at = in_base(region.machine, q)
+    assert len(q) == 2048
+    assert (at >= np.array(box)[:, 0]).all()
+    assert (at <= np.array(box)[:, 1]).all()
+    assert np.abs(q[:, 0]).max() <= 0.5
+    measured = result.problem.data.q
+    assert (q[:, 1:] >= measured[:, 1:].min(axis=0)).all()
+    found = accept(result, required)
+    bound = reaching(result, region, q, 0.95).bound
+    assert found.bound >= bound.max()
+    assert region.inside(found.worst[None])[0]
+    assert found.typical == pytest.approx(np.median(bound))
+
+
+def test_what_no_region_can_be_is_refused(result) -> None:
+    with pytest.raises(ro.InputError, match="within reach"):
+        accept(result, Requirement(1e-4, box=((9.0, 9.1), (0.0, 1.0), (0.0, 1.0))))
+    with pytest.raises(ro.InputError, match="joint 9"):
+        accept(result, Requirement(1e-4, joints=((9, (0.0, 1.0)),)))
+    with pytest.raises(ro.InputError, match="reflector 'left'"):
+        accept(result, Requirement(1e-4, marker="left"))
+    with pytest.raises(ro.InputError, match="no limit"):
+        accept(result)
+    for wrong in ({"limit": 0.0}, {"limit": np.inf}, {"limit": 1e-4, "confidence": 1.0},
+                  {"limit": 1e-4, "joints": ((1, (1.0, 1.0)),)}):  # fmt: skip
+        with pytest.raises(ro.InputError):
+            Requirement(**wrong)
+
+
+# --- the verdict -------------------------------------------------------------------------------------------------
+
+
+def test_the_three_verdicts(result) -> None:
+    bound = accept(result, Requirement(1.0)).bound
+    assert accept(result, Requirement(1.001 * bound)).verdict == "accepted"
+    between = accept(result, Requirement(0.8 * bound))
+    assert between.verdict == "undecided"
+    assert "design PROBLEM --next" in between.reasons[0]
+    few = accept(result, Requirement(0.1 * bound))
+    assert few.verdict == "undecided"  # nothing shows that a better calibration would not do
+    assert "scatter" in few.reasons[0]
+
+
+def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
+    problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
+    found = accept(ro.calibrate(problem), Requirement(2e-4))
+    assert found.verdict == "rejected"
+    assert "own scatter alone" in found.reasons[0]
+    assert found.scatter > 2e-4
+
+
+def test_the_mean_of_the_errors_does_not_decide(result) -> None:
+    """A limit well above every error that was measured is not yet kept where nothing was."""
+    largest = result.errors(result.record.validation).max()
+    found = accept(result, Requirement(1.2 * largest))
+    assert found.bound > 1.2 * largest
+    assert found.verdict == "undecided"
+
+
+def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
+    y = data.blocks[0].y.copy()
+    y[rows] += by
+    return replace(data, blocks=(replace(data.blocks[0], y=y),))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda r: replace(r, record=ro.data.Record()), "rows that the calibration did not see"),
+        (lambda r: replace(r, converged=False), "a calibration that converged"),
+        (
+            lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
+            "at least 5 rows",
+        ),
+        (lambda r: replace(r, record=replace(r.record, validation=moved(r.record.validation, [7], 6e-4))), "intervals"),
+    ],
+)
+def test_what_is_lacking_is_said(result, change, said: str) -> None:
+    found = accept(change(result), Requirement(0.01))
+    assert found.verdict == "undecided"
+    assert any(said in reason for reason in found.reasons)
+
+
+def test_an_unmeasured_part_of_the_region_is_named(result) -> None:
+    found = accept(result, Requirement(0.01, joints=((2, (-3.0, 3.0)),)))
+    assert found.verdict == "undecided"
+    assert "joint 2 from -171.9 to 171.9 deg" in found.reasons[0]
+
+
+def test_rows_that_miss_reject_only_when_chance_does_not_make_so_many(result) -> None:
+    apart = result.record.validation
+    some = replace(result, record=replace(result.record, validation=moved(apart, list(range(12)), 5e-3)))
+    found = accept(some, Requirement(1e-3))
+    assert found.verdict == "rejected"
+    assert "12 of" in found.reasons[0]
+    one = replace(result, record=replace(result.record, validation=moved(apart, [0], 5e-3)))
+    assert accept(one, Requirement(1e-3)).verdict == "undecided"
+
+
+def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
+    found = accept(ro.calibrate(instance.problem, ro.lasso, 1.0), Requirement(1e-3), instance.validation)
+    assert found.verdict == "undecided"
+    assert found.bound is None
+    assert any("No bound" in reason for reason in found.reasons)
+
+
+# --- all rows ----------------------------------------------------------------------------------------------------
+
+
+def test_all_rows_are_calibrated_as_if_they_had_been_given_so(instance, result, everything) -> None:
+    whole = ro.Dataset.together([instance.problem.data, instance.validation], ["identification", "validation"])
+    directly = replace(instance, problem=instance.problem.on(whole)).calibrate()
+    scale = directly.problem.parameters.free.scale
+    assert np.abs((everything.x - directly.x) / scale).max() < 1e-6
+    held = everything.record.held_out
+    assert held.error == pytest.approx(result.errors(instance.validation), abs=1e-12)
+    assert held.used == len(instance.problem.data)
+    assert everything.record.validation is None
+    assert set(held.label) <= set(everything.problem.labels)
+
+
+def test_all_rows_know_more(result, everything) -> None:
+    assert accept(everything, Requirement(1.0)).bound < accept(result, Requirement(1.0)).bound
+
+
+def test_nothing_kept_apart_is_refused(instance) -> None:
+    with pytest.raises(ro.InputError, match="kept apart"):
+        ro.calibration.refit_all(ro.calibrate(instance.problem))
+
+
+def test_a_file_keeps_the_record(everything, tmp_path: Path) -> None:
+    required = Requirement(1e-4, box=((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9)), joints=((1, (-0.5, 0.5)),), confidence=0.9)
+    record = replace(everything.record, requirement=required, details={"by": "A. Person", "temperature": "21"})
+    ro.store.save_result(everything, tmp_path / "result.json", record)
+    again = ro.load_result(tmp_path)
+    assert again.record.requirement == required
+    assert again.record.details == record.details
+    held = again.record.held_out
+    for name in ("nominal", "error", "sigmas", "allowed"):
+        assert (getattr(held, name) == getattr(record.held_out, name)).all()
+    assert held.label == record.held_out.label
+    written = read_json(tmp_path / "result.json")
+    assert written["acceptance"]["verdict"] == accept(again).verdict
+    assert written["held_out"]["identified"]["count"] == len(held.label)
+    written["record"]["held_out"]["error"][0] = 0.0
+    written["digest"] = digest(written)
+    (tmp_path / "result.json").write_text(json.dumps(written))
+    with pytest.raises(ro.InputError, match="held_out"):  # the figures no longer follow from the rows
+        ro.load_result(tmp_path)
+
+
+# --- problem file and commands -----------------------------------------------------------------------------------
+
+STATED = """
+[record]
+by = "A. Person"
+when = 2026-05-12
+robot_serial = 4711
+
+[acceptance]
+limit_mm = 0.2
+q1_deg = [-30.0, 30.0]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    import shutil
+
+    from rpim_opt.store.named import find
+
+    return Path(shutil.copytree(find("position"), tmp_path / "position"))
+
+
+def stated(folder: Path, text: str) -> Path:
+    file = folder / "problem.toml"
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    return folder
+
+
+def test_a_problem_file_states_who_and_what_for(folder) -> None:
+    loaded = ro.load(stated(folder, STATED))
+    assert loaded.record.details == {"by": "A. Person", "when": "2026-05-12", "robot_serial": "4711"}
+    assert loaded.requirement == Requirement(2e-4, joints=((1, (np.radians(-30.0), np.radians(30.0))),))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[record]\nwho = "me"\n', "key record.who"),
+        ("[record]\nby = [1]\n", "key record.by"),
+        ("[acceptance]\nx_mm = [0, 1]\n", "no limit"),
+        ("[acceptance]\nlimit_mm = 0.1\nx_mm = [0, 1]\n", "x_mm, y_mm and z_mm"),
+        ("[acceptance]\nlimit_mm = 0.1\nq1_deg = [0, 1, 2]\n", "two numbers"),
+        ("[acceptance]\nlimit_mm = 0.1\nq9_deg = [0, 1]\n", "q9_deg"),
+        ("[acceptance]\nlimit_mm = -0.1\n", "greater than zero"),
+        ("[acceptance]\nlimit_mm = 0.1\nconfidence = 2\n", "probability"),
+        ("[acceptance]\nlimit_mm = 0.1\nmarker = 3\n", "reflector"),
+    ],
+)
+def test_a_wrong_statement_is_named(folder, text: str, said: str) -> None:
+    with pytest.raises(ro.InputError, match=said):
+        ro.load(stated(folder, "\n" + text))
+
+
+def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> None:
+    out = str(tmp_path / "out")
+    assert run(monkeypatch, "calibrate", str(stated(folder, STATED)), "--refit-all", "--out", out) == 0
+    text = capsys.readouterr().out
+    assert "Accepted: limit 0.2 mm" in text
+    assert "Measured by: A. Person" in text
+    assert "The parameters given here come from all 80" in text
+    head, *rows = (folder / "validation.csv").read_text(encoding="utf-8").splitlines()
+    column = head.split(",").index("x_mm")
+    cells = [row.split(",") for row in rows]
+    off = [[*row[:column], str(float(row[column]) + 5), *row[column + 1 :]] for row in cells]
+    (tmp_path / "off.csv").write_text("\n".join([head, *(",".join(row) for row in off)]), encoding="utf-8")
+    assert run(monkeypatch, "accept", out, "--limit", "1", "--data", str(tmp_path / "off.csv"), "--json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["verdict"] == "rejected"
+    assert document["limit_mm"] == pytest.approx(1.0)
+    assert run(monkeypatch, "accept", out, "--box", "0,800,-900,900,0,900") == 0
+    assert "the box x 0 to 800, y -900 to 900, z 0 to 900 mm" in capsys.readouterr().out
+    bound = document["bound_mm"]
+    assert run(monkeypatch, "accept", out, "--limit", f"{0.8 * bound:g}") == 4
+    assert run(monkeypatch, "accept", out, "--data", str(folder / "validation.csv")) == 0
+    for wrong in (["--limit", "0"], ["--box", "1,2"]):
+        assert run(monkeypatch, "accept", out, *wrong) == 2
+    assert run(monkeypatch, "calibrate", "position", "--box", "0,800,-900,900,0,900") == 2
