@@ -1,4 +1,4 @@
-"""Programs whose loss is a sum over rows or configurations, and whose penalty a square: solved by Newton's method."""
+"""Programs whose loss is a sum or the largest over rows or configurations, and whose penalty a square."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.convex.closed import shares
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
-from rpim_opt.convex.newton import Ended, Kinked, Newton
+from rpim_opt.convex.newton import Newton
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.whitened import Ended, Kinked
+from rpim_opt.convex.worst import Worst
 
 MOST = 100
 """Weights whose minima are kept."""
@@ -25,7 +27,7 @@ TINY = 1e-300
 class Near(NamedTuple):
     """A minimum of a program like the one that is asked for.
 
-    z (n,), the state of the loss's kinks, and the loss's slope (m,), equations in the order of their configurations.
+    z (n,), the state of the loss's kinks (of a largest one: the shares), and the loss's slope (m,), equations in the order of their configurations.
     """
 
     z: Array
@@ -69,34 +71,37 @@ def by_rows(
     near
         The minimum of a neighbour: another weight, or a linearization nearby.
     """
-    loss = objective.separated
-    if loss is None:
+    if objective.separated is None and objective.worst is None:
         return None
     at = objective.coordinates
     if damping is not None:
         at = _damped(objective, weight, damping)
         weight = 1.0
     box = objective.box if objective.constrained else None
-    newton = Newton(loss, at, weight, box)
-    if not at.rows.shape[1] or (box is not None and not newton.whole):
+    method: Newton | Worst
+    if objective.worst is not None:
+        method = Worst(objective.worst, at, weight, box)
+    else:
+        method = Newton(objective.separated, at, weight, box)
+    if not at.rows.shape[1] or (box is not None and not method.whole):
         return None
     with phase("solve"), np.errstate(all="ignore"):
-        ended = _ended(newton, near)
+        ended = _ended(method, near)
     if ended is None or not ended.good:
         return None
     duals = ()
     if box is not None:
-        duals = shares(objective, box, ended.z, newton.multipliers(ended))
+        duals = shares(objective, box, ended.z, method.multipliers(ended))
     return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
 
 
-def _ended(newton: Newton, near: Near | None) -> Ended | None:
+def _ended(method: Newton | Worst, near: Near | None) -> Ended | None:
     """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
     if near is not None:
-        ended = newton.minimum(near.z, near.kinked)
+        ended = method.minimum(near.z, near.kinked)
         if ended.good:
             return ended
-    return newton.minimum(newton.of_squares())
+    return method.minimum(method.of_squares())
 
 
 def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinates:

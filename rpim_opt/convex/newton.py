@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,12 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
-from rpim_opt.convex.coordinates import Coordinates
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.problem.linear import RANK_TOLERANCE
+from rpim_opt.convex.whitened import Ended, Kinked, Whitened
 
-SOUGHT, ACCEPTED = 1e-12, 1e-10
-"""Duality gap, relative to the objective, that the method goes on to while that falls, and that it must reach."""
+SOUGHT = 1e-12
+"""Duality gap, relative to the objective, that the method goes on to while that falls."""
 MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
@@ -26,10 +24,6 @@ SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
-FAR = 100.0
-"""No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
-UNSEEN = RANK_TOLERANCE**2
-"""Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 VAIN = 3
@@ -38,13 +32,6 @@ VAIN = 3
 _potrf: Any
 _potrs: Any
 _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
-
-
-class Kinked(NamedTuple):
-    """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
-
-    multipliers: list[Array]
-    sharpness: float
 
 
 class Point(NamedTuple):
@@ -57,28 +44,8 @@ class Point(NamedTuple):
     smooth: Smoothed
 
 
-class Ended(NamedTuple):
-    """Where the method ended.
-
-    z (n,), duality gap, objective, steps, the kinks' state, the slope by z (n,) in a box, and the loss's (m,).
-    """
-
-    z: Array
-    gap: float
-    objective: float
-    steps: int
-    kinked: Kinked
-    slope: Array | None
-    of_loss: Array
-
-    @property
-    def good(self) -> bool:
-        """Whether the gap says that this is a minimum."""
-        return self.gap <= ACCEPTED * max(1.0, abs(self.objective))
-
-
 @dataclass(frozen=True, eq=False)
-class Newton:
+class Newton(Whitened):
     """minimize  sum_i f_i(A_i z - b_i) + weight |L z - c|^2  in a box, by Newton's method.
 
     In unknowns that whiten data and penalty together the second derivative of a loss about the identity is well
@@ -86,13 +53,7 @@ class Newton:
     A loss with kinks is smoothed about multipliers (`Separated`), which then take a step themselves. In a box the step
     is the minimum of the quadratic there, by the active set.
 
-    With y the slope of the loss (the smoothed one's is a subgradient) at z, g = A'y + penalty'(z) and Fenchel's
-    inequality, no point has an objective lower by more than ::
-
-        gap = (what the kinks miss) + sum_k g_k^2 / (4 weight)
-
-    over penalized coordinates; those without penalty add |g_k| times `FAR` of their size. Of the components on a
-    bound only those slopes count that lead inwards.
+    The gap is that of `Whitened`, where the smoothed loss's slope at z is a subgradient.
 
     Parameters
     ----------
@@ -107,39 +68,6 @@ class Newton:
     """
 
     loss: Separated
-    at: Coordinates
-    weight: float
-    box: tuple[Array, Array] | None = None
-
-    @cached_property
-    def pull(self) -> Array:
-        """(p,) weight of every coordinate's square."""
-        return np.where(self.at.penalized, self.weight, 0.0)
-
-    @cached_property
-    def unit(self) -> Array:
-        """(p,) size of a coordinate of which data and penalty together make one; zero where they do not see it."""
-        size = self.at.lengths + self.pull
-        seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
-        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
-
-    @property
-    def whole(self) -> bool:
-        """Whether the coordinates say all of z, as a box asks for."""
-        return len(self.unit) == len(self.at.offset) and bool((self.unit > 0).all())
-
-    def of_squares(self) -> Array:
-        """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
-        z = self.at.offset + self.at.B @ (self.unit**2 * (self.at.rows.T @ self.at.b))
-        if self.box is None:
-            return z
-        return np.clip(z, *self.box)
-
-    def multipliers(self, ended: Ended) -> Array:
-        """Return by how much the objective would fall per unit by which a bound were loosened, (n,)."""
-        if ended.slope is None:
-            return np.zeros_like(ended.z)
-        return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
 
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
@@ -173,11 +101,7 @@ class Newton:
 
     def _placed(self, z: Array, kinked: Kinked | None) -> Point:
         """Return the point at z (n,), or the one beside it that the coordinates can say."""
-        if self.box is not None:
-            z = np.clip(z, *self.box)
-        a = np.where(self.unit > 0, self.at.inverse @ (z - self.at.offset), 0.0)
-        if self.box is None:
-            z = self.at.offset + self.at.B @ a
+        z, a = self.placed(z)
         r = self.at.rows @ a - self.at.b
         kinked = kinked or self._begun(r)
         return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked))
@@ -210,46 +134,13 @@ class Newton:
 
     def _slope(self, point: Point) -> Array:
         """Return the slope of the smoothed objective by the coordinates in their units, (p,)."""
-        return self.unit * (self.at.rows.T @ point.smooth.slope + 2 * self.pull * point.a)
-
-    def _bound(self, point: Point, slope: Array) -> tuple[float, Array | None]:
-        """Return by how much the smoothed objective may fall at most, and its slope by z (n,) in a box."""
-        by_z = None
-        if self.box is not None:
-            by_z = self.back.T @ slope
-            slope = (self.at.B * self.unit).T @ np.where(self.held(point.z, by_z), 0.0, by_z)
-        gap = float(slope**2 @ self._price)
-        free = self._free
-        if len(free):
-            gap += FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free])))
-        return gap, by_z
-
-    @cached_property
-    def _price(self) -> Array:
-        """(p,) by what squared slopes of penalized coordinates are multiplied in the gap."""
-        held = (self.pull > 0) & (self.unit > 0)
-        return np.divide(0.25, self.pull * self.unit**2, out=np.zeros_like(self.unit), where=held)
-
-    @cached_property
-    def _free(self) -> np.ndarray:
-        """Which coordinates data alone decide."""
-        return np.flatnonzero((self.pull == 0) & (self.unit > 0))
-
-    def held(self, z: Array, slope: Array) -> np.ndarray:
-        """Return which components of z (n,) a bound holds, for a slope (n,)."""
-        lower, upper = self.box or (-np.inf, np.inf)
-        return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
+        return self.slope(point.a, point.smooth.slope)
 
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
-        gap, by_z = self._bound(point, slope)
+        gap, by_z = self.bound(point.z, point.a, slope)
         objective = point.smooth.loss + float(self.pull @ point.a**2)
         state = point.kinked._replace(multipliers=point.smooth.multipliers)
         return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
-
-    @cached_property
-    def back(self) -> Array:
-        """(p, n) inverse of the coordinates in their units."""
-        return self.at.inverse / self.unit[:, None]
 
     def _stepped(self, point: Point, slope: Array) -> Point:
         """Return the point after a step of Newton's."""

@@ -148,8 +148,9 @@ class Program(Objective):
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
         have a formula, in a box an active set; a loss that is a sum over rows or configurations (robust, sum of norms,
-        quantiles) with a squared penalty, in a box or without, has Newton's method, begun where the last minimum was
-        and ended by a duality gap; everything else is Clarabel's, on data that are dimensionless.
+        quantiles) with a squared penalty, in a box or without, has Newton's method, one that is the largest of them
+        (minimax) has quadratic programs, both begun where the last minimum was and ended by a duality gap; everything
+        else is Clarabel's, on data that are dimensionless.
 
         Parameters
         ----------
@@ -202,7 +203,7 @@ class Program(Objective):
         estimate = self.solve(weight)
         if estimate.weight > 0 and self.faces is not None:
             return self._lower_by_interior_point(estimate)
-        if self.separated is None:
+        if self.separated is None and self.worst is None:
             return estimate
         near = self._met.nearest(weight)
         proposed = None
