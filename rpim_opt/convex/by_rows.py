@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +48,16 @@ class Met:
             return self._at.get(weight)
         return self._at[min(self._at, key=lambda other: abs(np.log((other + TINY) / (weight + TINY))))]
 
+    def near(self, weight: float) -> list[Near]:
+        """Return the minimum at the nearest weight, and the last one, which may be of a program more like this one."""
+        nearest = self.nearest(weight)
+        if nearest is None:
+            return []
+        last = self._at[next(reversed(self._at))]
+        if last is nearest:
+            return [nearest]
+        return [nearest, last]
+
     def keep(self, weight: float, near: Near) -> None:
         """Keep a minimum; of too many weights the one that was met first goes."""
         self._at.pop(weight, None)
@@ -56,7 +67,7 @@ class Met:
 
 
 def by_rows(
-    objective: Objective, weight: float, damping: Damping | None, near: Near | None
+    objective: Objective, weight: float, damping: Damping | None, near: Sequence[Near]
 ) -> tuple[Found, Near] | None:
     """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
 
@@ -69,7 +80,7 @@ def by_rows(
     damping
         A term that keeps the solution near a point.
     near
-        The minimum of a neighbour: another weight, or a linearization nearby.
+        Minima of neighbours: another weight, or a linearization nearby. The lowest one here is where it begins.
     """
     if objective.separated is None and objective.worst is None:
         return None
@@ -95,10 +106,13 @@ def by_rows(
     return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
 
 
-def _ended(method: Newton | Worst, near: Near | None) -> Ended | None:
+def _ended(method: Newton | Worst, near: Sequence[Near]) -> Ended | None:
     """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
-    if near is not None:
-        ended = method.minimum(near.z, near.kinked)
+    if near:
+        lowest = near[0]
+        if len(near) > 1:
+            lowest = min(near, key=lambda each: method.objective(each.z))
+        ended = method.minimum(lowest.z, lowest.kinked)
         if ended.good:
             return ended
     return method.minimum(method.of_squares())

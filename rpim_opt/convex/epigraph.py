@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
-
-_gesv: Any
-(_gesv,) = get_lapack_funcs(("gesv",), (np.empty(1),))
 
 SLACK = 1e-13
 """By how much a function may exceed the largest, relative to the largest value."""
 NEGATIVE = 1e-12
 """Multipliers above minus this are no reason to let go of a function with which a search begins."""
+TINY = 1e-300
+"""Stands for values that are all zero."""
+MANY = 10**9
+"""Changes that no search makes."""
 PARALLEL = 1e-12
 """Falls below this part of what lengths would allow are rounding."""
 
 
 class Least(NamedTuple):
-    """A minimum: the step d (p,), the largest value t there, multipliers (N,), and how many systems were solved."""
+    """A minimum: the step d (p,), the largest value t there, multipliers (N,), and how many functions came or went.
+
+    Where the functions that are equal to t are larger by e (k,) than they were taken for, it is ``bend e`` elsewhere.
+    """
 
     d: Array
     t: float
     shares: Array
-    solved: int
+    changes: int
+    active: np.ndarray
+    bend: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,116 +58,204 @@ class Epigraph:
     s: Array
 
     def minimum(self, start: np.ndarray, most: int) -> Least | None:
-        """Return the minimum, begun with some functions; None where so many systems do not lead there.
+        """Return the minimum, begun with some functions; None where so many changes do not lead there.
 
         Parameters
         ----------
         start
             Numbers of the functions.
         most
-            Systems of equations that may be solved.
+            Changes of the set.
         """
         search = _Search(self)
-        if not search.begun(list(start)):
+        if not search.begun(start):
             return None
-        scale = max(float(np.max(np.abs(self.v))), 1e-300)
-        while search.solved < most:
-            slack = self.v + self.G @ search.d - self.s * search.t
-            slack[search.active] = -np.inf
+        enough = SLACK * max(float(np.max(np.abs(self.v))), TINY)
+        while search.changes < most:
+            slack = search.slack()
             worst = int(np.argmax(slack))
-            if slack[worst] <= SLACK * scale:
-                return search.ended()
-            if not search.entered(worst, float(slack[worst]), most):
+            if slack[worst] <= enough:
+                if search.exact():
+                    return search.least()
+            elif not search.entered(worst, float(slack[worst])):
                 return None
         return None
 
 
 class _Search:
-    """The active functions with the point and the multipliers that belong to them."""
+    """The active functions, with the step, the largest value and the multipliers x that belong to them.
+
+    ::
+
+        K x = y      K = (H 0 G'; 0 0 -s'; G -s 0)      x = (d, t, multipliers)      y = (-g, -1, -v)
+
+    over the active ones, and the inverse B of K, to which a row and a column are added or taken away.
+    """
 
     def __init__(self, of: Epigraph):
         self.of = of
-        self.p = len(of.g)
+        self.rows = np.column_stack([of.G, -of.s])
+        self.many = self.rows.shape[1]
         self.active: list[int] = []
-        self.mu = np.empty(0)
-        self.d = np.zeros(self.p)
-        self.t = 0.0
-        self.solved = 0
+        self.changes = 0
+        self.fresh = True
+        self._room(self.many + 1)
 
-    def _solution(self, top: Array, beside: float, below: Array) -> Array | None:
-        """Solve for (d, t, multipliers) of the active functions."""
-        p, k = self.p, len(self.active)
-        K = np.zeros((p + 1 + k, p + 1 + k), order="F")
-        K[:p, :p] = self.of.H
-        G, s = self.of.G[self.active], self.of.s[self.active]
-        K[p + 1 :, :p] = G
-        K[:p, p + 1 :] = G.T
-        K[p, p + 1 :] = K[p + 1 :, p] = -s
-        self.solved += 1
-        found, failed = _gesv(K, np.concatenate([top, [beside], below]), overwrite_a=1)[2:]
-        if failed or not np.isfinite(found).all():
-            return None
-        return found
+    def _room(self, most: int) -> None:
+        full = self.many + most
+        self.B = np.zeros((full, full))
+        self.x = np.zeros(full)
 
-    def _settled(self) -> bool:
-        """Put point and multipliers where the active functions have them."""
-        found = self._solution(-self.of.g, -1.0, -self.of.v[self.active])
-        if found is None:
-            return False
-        self.d, self.t, self.mu = found[: self.p], float(found[self.p]), found[self.p + 1 :]
-        return True
+    @property
+    def _size(self) -> int:
+        return self.many + len(self.active)
 
-    def begun(self, start: list[int]) -> bool:
+    def begun(self, start: np.ndarray) -> bool:
         """Begin with those of a set whose multipliers are positive, or with the largest function alone."""
-        self.active = start
-        if len(start) > self.p + 1 or not np.any(self.of.s[start]) or not self._settled():
+        self.active = [int(k) for k in start]
+        if not (0 < len(start) <= self.many and self.of.s[start].any() and self._anew()):
             self.active = [int(np.argmax(np.where(self.of.s > 0, self.of.v, -np.inf)))]
-            return self._settled()
-        while np.min(self.mu) < -NEGATIVE:
-            self.active = [k for k, mu in zip(self.active, self.mu, strict=True) if mu > 0]
-            if not self._settled():
+            if not self._anew():
                 return False
+        while True:
+            mu = self.x[self.many : self._size]
+            least = int(np.argmin(mu))
+            if mu[least] >= -NEGATIVE:
+                return True
+            if len(self.active) == 1:
+                return False
+            self._let_go(least)
+
+    def _matrix(self) -> tuple[Array, Array]:
+        """Return K and y."""
+        size, p = self._size, self.many - 1
+        K = np.zeros((size, size))
+        rows = self.rows[self.active]
+        K[:p, :p] = self.of.H
+        K[self.many :, : self.many] = rows
+        K[: self.many, self.many :] = rows.T
+        return K, np.concatenate([-self.of.g, [-1.0], -self.of.v[self.active]])
+
+    def _anew(self) -> bool:
+        """Invert K; whether it could be."""
+        K, y = self._matrix()
+        try:
+            B = np.linalg.inv(K)
+        except np.linalg.LinAlgError:
+            return False
+        if not np.isfinite(B).all():
+            return False
+        size = self._size
+        x = B @ y
+        x += B @ (y - K @ x)
+        self.B[:size, :size] = B
+        self.x[:size] = x
+        self.fresh = True
         return True
 
-    def entered(self, j: int, slack: float, most: int) -> bool:
+    def exact(self) -> bool:
+        """Free the point from what rounding has left on the way; whether nothing else has to change then."""
+        if self.fresh:
+            return True
+        if not self._anew():
+            self.changes = MANY
+            return False
+        while len(self.active) > 1:
+            mu = self.x[self.many : self._size]
+            least = int(np.argmin(mu))
+            if mu[least] >= -NEGATIVE:
+                break
+            self._let_go(least)
+        return self.fresh
+
+    def _let_go(self, i: int) -> None:
+        """Take an active function away, the others' equations kept."""
+        place = self.many + i
+        size = self._size
+        b = self.B[:size, place].copy()
+        pivot = b[place]
+        self.x[:size] -= b * (self.x[place] / pivot)
+        self._removed(i, b, pivot)
+
+    def _removed(self, i: int, b: Array, pivot: float) -> None:
+        """Take its row and column from the inverse, and the last ones to where they were."""
+        place, size = self.many + i, self._size
+        last = size - 1
+        B = self.B[:size, :size]
+        B -= np.multiply.outer(b, b / pivot)
+        B[place] = B[last]
+        B[:, place] = B[:, last]
+        self.x[place] = self.x[last]
+        self.active[i] = self.active[-1]
+        self.active.pop()
+        self.changes += 1
+        self.fresh = False
+
+    def slack(self) -> Array:
+        """Return by how much functions (N,) exceed the largest value."""
+        slack = self.of.v + self.rows @ self.x[: self.many]
+        slack[self.active] = -np.inf
+        return slack
+
+    def entered(self, j: int, slack: float) -> bool:
         """Let a function that exceeds the largest enter; whether it could."""
-        of = self.of
+        row = self.rows[j]
         mu_j = 0.0
-        while self.solved < most:
-            change = self._solution(-of.G[j], float(of.s[j]), np.zeros(len(self.active)))
-            if change is None:
-                return False
-            d, t, mu = change[: self.p], float(change[self.p]), change[self.p + 1 :]
-            fall = float(of.s[j] * t - of.G[j] @ d)
-            if len(self.active) > self.p or fall <= PARALLEL * float(np.linalg.norm(of.G[j]) * np.linalg.norm(d)):
+        while True:
+            size = self._size
+            change = -(self.B[:size, : self.many] @ row)
+            fall = -float(row @ change[: self.many])
+            length = float(np.sqrt((row @ row) * (change[: self.many] @ change[: self.many])))
+            if len(self.active) == self.many or fall <= PARALLEL * length:
                 fall = 0.0
-            whole = slack / fall if fall > 0 else np.inf
-            falling = mu < 0
-            ratios = np.full(len(mu), np.inf)
-            ratios[falling] = np.maximum(self.mu[falling], 0.0) / -mu[falling]
-            last = int(np.argmin(ratios))
-            step = min(whole, float(ratios[last]))
+            whole, (share, last) = np.inf, self._first(change[self.many :])
+            if fall > 0:
+                whole = slack / fall
+            step = min(whole, share)
             if not np.isfinite(step):
                 return False
-            self.d = self.d + step * d
-            self.t += step * t
-            self.mu = self.mu + step * mu
+            self.x[:size] += step * change
             mu_j += step
             slack -= step * fall
-            if whole <= ratios[last]:
-                break
-            del self.active[last]
-            self.mu = np.delete(self.mu, last)
-            if not np.any(of.s[self.active]):  # it is the largest alone
-                self.t += slack
-                break
-        self.active.append(j)
-        self.mu = np.append(self.mu, mu_j)
-        return True
+            if whole <= share:
+                self._added(j, mu_j, change, fall)
+                return True
+            if not self.of.s[self.active].sum() - self.of.s[self.active[last]] and self.of.s[j]:
+                return self._alone(j, last)
+            self._removed(last, self.B[:size, self.many + last].copy(), float(self.B[self.many + last, self.many + last]))
 
-    def ended(self) -> Least:
-        """Return point and multipliers, free of what rounding has left on the way."""
-        self._settled()
+    def _first(self, change: Array) -> tuple[float, int]:
+        """Return how far a change goes until the first multiplier vanishes, and which."""
+        mu = self.x[self.many : self._size]
+        falling = np.flatnonzero(change < 0)
+        if not len(falling):
+            return np.inf, -1
+        ratios = np.maximum(mu[falling], 0.0) / -change[falling]
+        first = int(np.argmin(ratios))
+        return float(ratios[first]), int(falling[first])
+
+    def _added(self, j: int, mu_j: float, change: Array, fall: float) -> None:
+        size = self._size
+        if size == len(self.x):
+            raise IndexError  # cannot be: as many rows as unknowns let none enter
+        self.B[:size, :size] -= np.multiply.outer(change, change / fall)
+        self.B[:size, size] = self.B[size, :size] = -change / fall
+        self.B[size, size] = -1 / fall
+        self.x[size] = mu_j
+        self.active.append(j)
+        self.changes += 1
+        self.fresh = False
+
+    def _alone(self, j: int, last: int) -> bool:
+        """Put a function in the place of the only one that was equal to the largest value."""
+        self.active[last] = j
+        self.changes += 1
+        return self._anew()
+
+    def least(self) -> Least:
+        """Return point and multipliers."""
         shares = np.zeros(len(self.of.v))
-        shares[self.active] = np.maximum(self.mu, 0.0)
-        return Least(self.d, self.t, shares, self.solved)
+        shares[self.active] = np.maximum(self.x[self.many : self._size], 0.0)
+        p = self.many - 1
+        bend = -self.B[:p, self.many : self._size]
+        return Least(self.x[:p].copy(), float(self.x[p]), shares, self.changes, np.array(self.active), bend)

@@ -254,7 +254,8 @@ class Program(Objective):
         if self.faces is not None:
             return self._path_on_faces(checked, near)
         if not self.quadratic or box is None:
-            return [self.solve(weight) for weight in checked]
+            found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
+            return [found[weight] for weight in checked.tolist()]
         Z, multipliers = path_between(self, box, checked)
         rows = zip(Z, checked, *values(self, Z), multipliers, strict=True)
         return [
@@ -278,7 +279,7 @@ class Program(Objective):
 
     def _by_rows(self, weight: float, damping: Damping | None) -> Estimate | None:
         """Return the minimum of a loss that is a sum over rows, by Newton's method from the last one."""
-        ended = by_rows(self, weight, damping, self._met.nearest(weight))
+        ended = by_rows(self, weight, damping, self._met.near(weight))
         if ended is None:
             return None
         found, near = ended

@@ -115,6 +115,11 @@ class Whitened:
             z = self.at.offset + self.at.B @ a
         return z, a
 
+    def objective(self, z: Array) -> float:
+        """Return the objective at z (n,), or at the point beside it."""
+        a = self.placed(z)[1]
+        return self.loss.at(self.at.rows @ a - self.at.b) + float(self.pull @ a**2)
+
     def slope(self, a: Array, of_loss: Array) -> Array:
         """Return the objective's slope by the coordinates in their units, (p,), from the loss's (m,)."""
         return self.unit * (self.at.rows.T @ of_loss + 2 * self.pull * a)

@@ -15,12 +15,16 @@ from rpim_opt.convex.whitened import Ended, Kinked, Whitened
 
 SOUGHT = 1e-12
 """Duality gap, relative to the objective, at which the method ends."""
-MOST, SYSTEMS = 40, 400
-"""Quadratic programs, and systems of equations in each, after which another method is asked."""
+MOST, CHANGES = 40, 1000
+"""Quadratic programs, and changes of the set in each, after which another method is asked."""
 FLAT = 1e-10
 """Curvature that unknowns without penalty have at least, where the data have about one."""
 HALVES = 12
 """How often a step is halved at most."""
+SOON = 10
+"""Quadratic programs after which a neighbour was too far to begin with."""
+NEAR = 1e-2
+"""Gaps below this part of the objective tell whether a step was good; larger ones do not."""
 VAIN = 3
 """Programs that lower the gap no more, after which a good one is taken."""
 FALL = 0.1
@@ -74,7 +78,8 @@ class Worst(Whitened):
         point = self._point(z, a, r, shares, 0)
         best = point.ended
         vain = 0
-        for steps in range(1, MOST + 1):
+        most = MOST if kinked is None else SOON
+        for steps in range(1, most + 1):
             if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
                 break
             ahead = self._next(point, steps)
@@ -102,16 +107,29 @@ class Worst(Whitened):
             return None
         whole = self._moved(point, least, 1.0, steps)
         promised = point.ended.objective - least.t - float(self.pull @ (point.a + self.unit * least.d) ** 2)
-        if whole.ended.gap <= (1 - FALL) * point.ended.gap:
+        near = NEAR * abs(point.ended.objective)
+        if whole.ended.gap <= (1 - FALL) * point.ended.gap and whole.ended.gap <= near:
             return whole
         t = 1.0
         ahead = whole
+        if point.ended.objective - ahead.ended.objective < FALL * promised:
+            bent = self._moved(point, self._bent(least, whole), 1.0, steps)
+            if point.ended.objective - bent.ended.objective >= FALL * promised:
+                return bent
         for _ in range(HALVES):
             if point.ended.objective - ahead.ended.objective >= FALL * t * promised:
                 return ahead
             t /= 2
             ahead = self._moved(point, least, t, steps)
         return None
+
+    def _bent(self, least: Least, whole: Point) -> Least:
+        """Return the step that makes equal, after the curved norms, what the straight ones made equal."""
+        values = self.loss.values(whole.r)
+        groups = least.active < len(values)
+        excess = np.zeros(len(groups))
+        excess[groups] = values[least.active[groups]] - least.t
+        return least._replace(d=least.d + least.bend @ excess)
 
     def _moved(self, point: Point, least: Least, t: float, steps: int) -> Point:
         """Return the point after part of a step, with the shares that belong to all of it."""
@@ -140,7 +158,7 @@ class Worst(Whitened):
             start = np.append(start, len(s) + np.flatnonzero(room == 0))
             values, s = np.append(values, -room), np.append(s, np.zeros(len(room)))
             G = np.vstack([G, self._bounds.rows])
-        return Epigraph(H, g, values, G, s).minimum(start, SYSTEMS)
+        return Epigraph(H, g, values, G, s).minimum(start, CHANGES)
 
     @cached_property
     def _bounds(self) -> Bounds:
@@ -155,10 +173,11 @@ class Worst(Whitened):
         heard, factor = self.loss.curvature(point.r, point.shares)
         H = np.zeros((len(self.unit), len(self.unit)))
         if len(heard):
-            places = np.flatnonzero(np.isin(self.loss.which, heard))
+            places = np.flatnonzero(point.shares[self.loss.which])
             rows = self.at.rows[places] * self.unit
-            which = np.searchsorted(heard, self.loss.which[places])
-            first = np.searchsorted(which, np.arange(len(heard)))
+            sizes = self.loss.sizes[heard]
+            first = np.cumsum(sizes) - sizes
+            which = np.repeat(np.arange(len(heard)), sizes)
             along = directions[places] / self.loss.a[self.loss.which[places]]
             across = np.add.reduceat(along[:, None] * rows, first)
             H = rows.T @ (factor[which][:, None] * rows) - across.T @ (factor[:, None] * across)
