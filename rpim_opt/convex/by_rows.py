@@ -12,7 +12,7 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.convex.closed import shares
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
-from rpim_opt.convex.newton import Newton
+from rpim_opt.convex.newton import DEAR, Newton
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
@@ -28,12 +28,14 @@ TINY = 1e-300
 class Near(NamedTuple):
     """A minimum of a program like the one that is asked for.
 
-    z (n,), the state of the loss's kinks (of a largest one: the shares), and the loss's slope (m,), equations in the order of their configurations.
+    z (n,), what a neighbour may begin with, the loss's slope (m,), equations in the order of their configurations, and
+    the loss.
     """
 
     z: Array
     kinked: Kinked
     slope: Array
+    loss: float
 
 
 class Met:
@@ -103,14 +105,14 @@ def by_rows(
     duals = ()
     if box is not None:
         duals = shares(objective, box, ended.z, method.multipliers(ended))
-    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss, ended.loss)
 
 
 def _ended(method: Newton | Worst, near: Sequence[Near]) -> Ended | None:
     """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
     if near:
         lowest = near[0]
-        if len(near) > 1:
+        if len(near) > 1 and method.at.rows.size < DEAR:
             lowest = min(near, key=lambda each: method.objective(each.z))
         ended = method.minimum(lowest.z, lowest.kinked)
         if ended.good:

@@ -26,6 +26,14 @@ FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
+DEAR = 200_000
+"""Entries of the rows from which a second derivative is dear."""
+ENOUGH = 5e-11
+"""Duality gap, relative to the objective, that ends steps with such ones."""
+SLOW = 0.1
+"""Part of the gap that a step with an old second derivative may leave."""
+ROUND = 1e-12
+"""Changes of slope below this part of what lengths allow tell nothing."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good one is taken."""
 
@@ -74,6 +82,8 @@ class Newton(Whitened):
 
         Where the neighbour was too far for kinks as sharp as there, they begin blunter.
         """
+        if self._dear:
+            return self._by_secants(self._placed(z, kinked))
         if kinked is None or not self.loss.kinks:
             return self._descent(self._placed(z, kinked), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
@@ -99,26 +109,78 @@ class Newton(Whitened):
             point = self._next(point, slope, ended.gap)
         return best
 
+    @property
+    def _dear(self) -> bool:
+        """Whether a second derivative costs far more than a slope, and there is one that lasts."""
+        return self.at.rows.size >= DEAR and not self.loss.kinks
+
+    def _by_secants(self, point: Point) -> Ended:
+        """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
+
+        Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
+        it is computed anew.
+        """
+        slope = self._slope(point)
+        ended = self._judged(point, slope, 0)
+        best = ended
+        bent = None
+        if point.kinked.curved is not None:
+            bent = self.at.B.T @ point.kinked.curved @ self.at.B
+        vain = 0
+        for steps in range(1, MOST):
+            if best.gap <= ENOUGH * abs(best.objective) or (vain >= VAIN and best.good):
+                break
+            fresh = bent is None
+            if bent is None:
+                bent = self._hessian(point)
+            ahead = self._stepped(point, slope, bent)
+            slope_ahead = self._slope(ahead)
+            after = self._judged(ahead, slope_ahead, steps)
+            if after.gap > SLOW * ended.gap and not fresh:
+                bent = None
+            else:
+                bent = self._updated(bent, point, ahead, slope_ahead - slope)
+            point, slope, ended = ahead, slope_ahead, after
+            vain += 1
+            if ended.gap < best.gap:
+                best = ended
+                vain = 0
+        if bent is None:
+            return best
+        curved = self.at.inverse.T @ bent @ self.at.inverse
+        return best._replace(kinked=best.kinked._replace(curved=curved))
+
+    def _updated(self, bent: Array, before: Point, after: Point, change: Array) -> Array:
+        """Return the loss's second derivative so that it explains by how much the objective's slope has changed."""
+        step = after.a - before.a
+        seen = self.unit > 0
+        of_loss = np.divide(change, self.unit, out=np.zeros_like(change), where=seen) - 2 * self.pull * step
+        along = bent @ step
+        steep, flat = float(step @ of_loss), float(step @ along)
+        if not (steep > ROUND * float(np.linalg.norm(step) * np.linalg.norm(of_loss)) and flat > 0):
+            return bent
+        return bent + np.outer(of_loss, of_loss / steep) - np.outer(along, along / flat)
+
     def _placed(self, z: Array, kinked: Kinked | None) -> Point:
         """Return the point at z (n,), or the one beside it that the coordinates can say."""
         z, a = self.placed(z)
         r = self.at.rows @ a - self.at.b
         kinked = kinked or self._begun(r)
-        return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked))
+        return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked[:2]))
 
     def _about(self, point: Point, kinked: Kinked) -> Point:
         """Return the same point with kinks in another state."""
-        return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked))
+        return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked[:2]))
 
     def _next(self, point: Point, slope: Array, gap: float) -> Point:
         """Return the point after a step of Newton's, or of the multipliers where little else is left of the gap."""
         if not self.loss.kinks:
-            return self._stepped(point, slope)
+            return self._stepped(point, slope, self._hessian(point))
         missing = point.smooth.missing
         sharpness = point.kinked.sharpness
         if gap - missing <= SETTLED * missing:
             return self._about(point, Kinked(point.smooth.multipliers, min(SHARPER * sharpness, SHARPEST)))
-        ahead = self._stepped(point, slope)
+        ahead = self._stepped(point, slope, self._hessian(point))
         if ahead is point:  # no step is short enough for kinks so sharp
             return self._about(point, point.kinked._replace(sharpness=sharpness / SHARPER))
         return ahead
@@ -140,11 +202,11 @@ class Newton(Whitened):
         gap, by_z = self.bound(point.z, point.a, slope)
         objective = point.smooth.loss + float(self.pull @ point.a**2)
         state = point.kinked._replace(multipliers=point.smooth.multipliers)
-        return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
+        return Ended(point.z, gap + point.smooth.missing, objective, point.smooth.loss, steps, state, by_z, point.smooth.slope)
 
-    def _stepped(self, point: Point, slope: Array) -> Point:
-        """Return the point after a step of Newton's."""
-        H = self._hessian(self.loss.curvature(point.r, *point.kinked))
+    def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
+        """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""
+        H = self._whole(bent)
         factor, failed = _potrf(H)
         if failed:
             factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
@@ -158,8 +220,15 @@ class Newton(Whitened):
         step = self.unit * (self.back @ (z - point.z))
         return self._searched(point, z, step)
 
-    def _hessian(self, curvatures: list[Curvature]) -> Array:
+    def _whole(self, bent: Array) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
+        H = self.unit[:, None] * bent * self.unit
+        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
+        return H
+
+    def _hessian(self, point: Point) -> Array:
+        """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
+        curvatures = self.loss.curvature(point.r, *point.kinked[:2])
         rows = self.at.rows
         across = sum(c.across for c in curvatures) + np.zeros(len(rows))
         usual = np.partition(across, len(across) // 2)[len(across) // 2]
@@ -173,8 +242,6 @@ class Newton(Whitened):
         for curvature in curvatures:
             if len(curvature.along):
                 H += self._along(curvature)
-        H = self.unit[:, None] * H * self.unit
-        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
         return H
 
     def _along(self, curvature: Curvature) -> Array:
@@ -194,7 +261,7 @@ class Newton(Whitened):
             place = self.at.offset + self.at.B @ a
             if self.box is not None:
                 place = np.clip(point.z + t * (z - point.z), *self.box)
-            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked))
+            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked[:2]))
 
         def rise(p: Point) -> float:
             slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)

@@ -284,7 +284,8 @@ class Program(Objective):
             return None
         found, near = ended
         self._met.keep(weight, near)
-        return Estimate(near.z, weight, *self.value(near.z, weight), found.duals, iterations=found.iterations)
+        loss, penalty = near.loss + self.model.offset, self._posed.penalty_of(near.z)
+        return Estimate(near.z, weight, loss, penalty, found.duals, iterations=found.iterations)
 
     def _on_faces(self, weight: float, damping: Damping | None, start: Array | None = None) -> Estimate:
         """Return the minimum of a penalty with kinks, or where it is not certain the interior point's, if lower."""

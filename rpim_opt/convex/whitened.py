@@ -21,21 +21,28 @@ UNSEEN = RANK_TOLERANCE**2
 
 
 class Kinked(NamedTuple):
-    """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
+    """What a neighbour may begin with.
+
+    About which multipliers (m,) each the kinks are smoothed, and how sharply; of a smooth loss its second derivative by
+    z (n, n) at a point nearby, where that was dear.
+    """
 
     multipliers: list[Array]
     sharpness: float
+    curved: Array | None = None
 
 
 class Ended(NamedTuple):
     """Where a method ended.
 
-    z (n,), duality gap, objective, steps, the kinks' state, the slope by z (n,) in a box, and the loss's (m,).
+    z (n,), duality gap, objective and loss, steps, what a neighbour may begin with, the slope by z (n,) in a box, and
+    the loss's (m,).
     """
 
     z: Array
     gap: float
     objective: float
+    loss: float
     steps: int
     kinked: Kinked
     slope: Array | None

@@ -98,7 +98,7 @@ class Worst(Whitened):
         gap, by_z = self.bound(z, a, self.slope(a, of_loss))
         gap += max(loss - self.loss.minorant(r, shares, of_loss), 0.0)
         objective = loss + float(self.pull @ a**2)
-        return Point(z, a, r, shares, Ended(z, gap, objective, steps, Kinked([shares], 1.0), by_z, of_loss))
+        return Point(z, a, r, shares, Ended(z, gap, objective, loss, steps, Kinked([shares], 1.0), by_z, of_loss))
 
     def _next(self, point: Point, steps: int) -> Point | None:
         """Return the point after a quadratic program; None where that leads nowhere."""
