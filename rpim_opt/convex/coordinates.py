@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,15 @@ class Coordinates:
     b: Array
     penalized: np.ndarray
     gram: Array
+
+    def of(self, kept: np.ndarray) -> Coordinates:
+        """Return the same coordinates where some rows are zero; ``kept`` (m,) says which are not.
+
+        Data and penalty are then diagonal together no more, but nearly where few rows are left out.
+        """
+        left_out = self.rows[~kept]
+        gram = self.gram - left_out.T @ left_out
+        return replace(self, rows=self.rows * kept[:, None], b=self.b * kept, gram=gram)
 
     @cached_property
     def inverse(self) -> Array:

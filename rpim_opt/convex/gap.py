@@ -54,7 +54,9 @@ def duality_gap(objective: Objective, z: Array, weight: float, proposed: Array |
     if not known or model.stands_for is not None or objective.violation(z) > 0:
         return float("inf")
     r = model.A @ z - model.b
-    if objective.worst is not None and proposed is not None:
+    if objective.worst is not None:
+        if proposed is None:
+            return float("inf")
         return _of_largest(objective, objective.worst, z, weight, proposed)
     y = posed.loss_slope(r)
     if y is None or len(y) != len(r) or not np.isfinite(y).all():

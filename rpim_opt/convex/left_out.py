@@ -215,7 +215,7 @@ def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
     n = model.A.shape[1]
     if not program.on_triangles or len(parts) < 2:
         for part in parts:
-            yield program.on(model.scaled(np.where(np.isin(model.group, part), 0.0, 1.0)))
+            yield program.without(np.isin(model.group, part))
         return
     rows = np.column_stack([model.A, model.b])
     place = np.full(int(model.group.max()) + 1, -1)

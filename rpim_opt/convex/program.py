@@ -119,6 +119,13 @@ class Program(Objective):
         """Return the program for another model of the same shape, without asking the functions anew."""
         return replace(self, model=model)
 
+    def without(self, out: np.ndarray) -> Program:
+        """Return the program without some equations, ``out`` (m,), which become rows of zeros."""
+        left = self.on(self.model.scaled(np.where(out, 0.0, 1.0)))
+        if self.separated is not None or self.worst is not None:  # unknowns that whiten all whiten most
+            vars(left)["coordinates"] = self.coordinates.of(~out[self.order])
+        return left
+
     def problem(self, weight: float) -> cp.Problem:
         """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
 
