@@ -69,7 +69,7 @@ class Met:
 
 
 def by_rows(
-    objective: Objective, weight: float, damping: Damping | None, near: Sequence[Near]
+    objective: Objective, weight: float, damping: Damping | None, near: Sequence[Near], rough: bool = False
 ) -> tuple[Found, Near] | None:
     """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
 
@@ -83,6 +83,8 @@ def by_rows(
         A term that keeps the solution near a point.
     near
         Minima of neighbours: another weight, or a linearization nearby. The lowest one here is where it begins.
+    rough
+        Whether a point that a rule compares with others will do.
     """
     if objective.separated is None and objective.worst is None:
         return None
@@ -95,12 +97,12 @@ def by_rows(
     if objective.worst is not None:
         method = Worst(objective.worst, at, weight, box)
     else:
-        method = Newton(objective.separated, at, weight, box)
+        method = Newton(objective.separated, at, weight, box, rough)
     if not at.rows.shape[1] or (box is not None and not method.whole):
         return None
     with phase("solve"), np.errstate(all="ignore"):
         ended = _ended(method, near)
-    if ended is None or not ended.good:
+    if ended is None or not (ended.good or ended.close):
         return None
     duals = ()
     if box is not None:
@@ -115,7 +117,7 @@ def _ended(method: Newton | Worst, near: Sequence[Near]) -> Ended | None:
         if len(near) > 1 and method.at.rows.size < DEAR:
             lowest = min(near, key=lambda each: method.objective(each.z))
         ended = method.minimum(lowest.z, lowest.kinked)
-        if ended.good:
+        if ended.good or ended.close:
             return ended
     return method.minimum(method.of_squares())
 

@@ -138,7 +138,7 @@ class Folds:
         near = None
         if met:
             near = met[min(met, key=lambda weight: abs(np.log(weight / np.max(weights))))]
-        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near)])
+        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near, rough=True)])
         if (weights > 0).all():
             met |= dict(zip(weights, Z, strict=True))
         squares = (Z @ model.A[out].T - model.b[out]) ** 2

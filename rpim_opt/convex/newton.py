@@ -30,6 +30,8 @@ DEAR = 200_000
 """Entries of the rows from which a second derivative is dear."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
+PROMISED = 1e-10
+"""Part of the objective by which it may be lower elsewhere, where points are compared."""
 SLOW = 0.1
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12
@@ -73,9 +75,14 @@ class Newton(Whitened):
         Of the penalty.
     box
         Lower and upper (n,), or None.
+    rough
+        Whether, where second derivatives are dear, it will do that a quadratic promises to lower the objective by no
+        more than `PROMISED` of it: a point that a rule compares with others. (Of small weights, a gap asks for far
+        more: it knows of the penalty's curvature alone.)
     """
 
     loss: Separated
+    rough: bool = False
 
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
@@ -133,6 +140,9 @@ class Newton(Whitened):
             fresh = bent is None
             if bent is None:
                 bent = self._hessian(point)
+            if self.rough and self._promised(slope, bent) <= PROMISED * abs(ended.objective):
+                best = ended._replace(close=True)
+                break
             ahead = self._stepped(point, slope, bent)
             slope_ahead = self._slope(ahead)
             after = self._judged(ahead, slope_ahead, steps)
@@ -149,6 +159,15 @@ class Newton(Whitened):
             return best
         curved = self.at.inverse.T @ bent @ self.at.inverse
         return best._replace(kinked=best.kinked._replace(curved=curved))
+
+    def _promised(self, slope: Array, bent: Array) -> float:
+        """Return by how much the objective would fall, were it quadratic; infinite in a box."""
+        if self.box is not None:
+            return np.inf
+        factor, failed = _potrf(self._whole(bent))
+        if failed:
+            return np.inf
+        return 0.5 * float(slope @ _potrs(factor, slope)[0])
 
     def _updated(self, bent: Array, before: Point, after: Point, change: Array) -> Array:
         """Return the loss's second derivative so that it explains by how much the objective's slope has changed."""

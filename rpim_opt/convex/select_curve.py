@@ -63,7 +63,7 @@ def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
     while True:
         some = sorted(places)
         new = [k for k in some if k not in met]
-        met |= dict(zip(new, _points(program.path(weights[new])), strict=True))
+        met |= dict(zip(new, _points(program.path(weights[new], rough=True)), strict=True))
         score = menger(np.array([met[k] for k in some]))
         around = {near for k in _peaks(score) for near in _between(some, k, last)}
         if around <= places:

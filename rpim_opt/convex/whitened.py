@@ -35,8 +35,8 @@ class Kinked(NamedTuple):
 class Ended(NamedTuple):
     """Where a method ended.
 
-    z (n,), duality gap, objective and loss, steps, what a neighbour may begin with, the slope by z (n,) in a box, and
-    the loss's (m,).
+    z (n,), duality gap, objective and loss, steps, what a neighbour may begin with, the slope by z (n,) in a box, the
+    loss's (m,), and whether it is close enough for a rule.
     """
 
     z: Array
@@ -47,6 +47,7 @@ class Ended(NamedTuple):
     kinked: Kinked
     slope: Array | None
     of_loss: Array
+    close: bool = False
 
     @property
     def good(self) -> bool:
