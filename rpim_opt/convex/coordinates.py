@@ -41,7 +41,10 @@ class Coordinates:
         """
         left_out = self.rows[~kept]
         gram = self.gram - left_out.T @ left_out
-        return replace(self, rows=self.rows * kept[:, None], b=self.b * kept, gram=gram)
+        rows, b = self.rows.copy(), self.b.copy()
+        rows[~kept] = 0.0
+        b[~kept] = 0.0
+        return replace(self, rows=rows, b=b, gram=gram)
 
     @cached_property
     def inverse(self) -> Array:
