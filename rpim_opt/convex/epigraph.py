@@ -222,7 +222,9 @@ class _Search:
                 return True
             if not self.of.s[self.active].sum() - self.of.s[self.active[last]] and self.of.s[j]:
                 return self._alone(j, last)
-            self._removed(last, self.B[:size, self.many + last].copy(), float(self.B[self.many + last, self.many + last]))
+            self._removed(
+                last, self.B[:size, self.many + last].copy(), float(self.B[self.many + last, self.many + last])
+            )
 
     def _first(self, change: Array) -> tuple[float, int]:
         """Return how far a change goes until the first multiplier vanishes, and which."""

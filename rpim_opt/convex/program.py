@@ -233,9 +233,7 @@ class Program(Objective):
         return estimate
 
     @one_blas_thread
-    def path(
-        self, weights: Sequence[float] | Array, near: Array | None = None, rough: bool = False
-    ) -> list[Estimate]:
+    def path(self, weights: Sequence[float] | Array, near: Array | None = None, rough: bool = False) -> list[Estimate]:
         """Return the solutions at many weights (K,): all at once by formula, or each from its neighbour.
 
         Parameters

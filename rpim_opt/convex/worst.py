@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.epigraph import Epigraph, Least
 from rpim_opt.convex.largest import Largest
-from rpim_opt.convex.epigraph import Least, Epigraph
 from rpim_opt.convex.whitened import Ended, Kinked, Whitened
 
 SOUGHT = 1e-12

@@ -185,7 +185,12 @@ def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) ->
     assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
 
 
-SMOOTH = [("huber", "equation"), ("log cosh", "equation"), ("huber", "configuration"), ("pseudo-Huber", "configuration")]
+SMOOTH = [
+    ("huber", "equation"),
+    ("log cosh", "equation"),
+    ("huber", "configuration"),
+    ("pseudo-Huber", "configuration"),
+]
 
 
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
