@@ -208,7 +208,8 @@ class _Search:
             length = float(np.sqrt((row @ row) * (change[: self.many] @ change[: self.many])))
             if len(self.active) == self.many or fall <= PARALLEL * length:
                 fall = 0.0
-            whole, (share, last) = np.inf, self._first(change[self.many :])
+            whole = np.inf
+            share, last = self._first(change[self.many :])
             if fall > 0:
                 whole = slack / fall
             step = min(whole, share)
@@ -220,11 +221,11 @@ class _Search:
             if whole <= share:
                 self._added(j, mu_j, change, fall)
                 return True
-            if not self.of.s[self.active].sum() - self.of.s[self.active[last]] and self.of.s[j]:
+            others = self.of.s[self.active].sum() - self.of.s[self.active[last]]
+            if not others and self.of.s[j]:
                 return self._alone(j, last)
-            self._removed(
-                last, self.B[:size, self.many + last].copy(), float(self.B[self.many + last, self.many + last])
-            )
+            b = self.B[:size, self.many + last].copy()
+            self._removed(last, b, float(b[self.many + last]))
 
     def _first(self, change: Array) -> tuple[float, int]:
         """Return how far a change goes until the first multiplier vanishes, and which."""

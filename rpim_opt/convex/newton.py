@@ -221,9 +221,8 @@ class Newton(Whitened):
         gap, by_z = self.bound(point.z, point.a, slope)
         objective = point.smooth.loss + float(self.pull @ point.a**2)
         state = point.kinked._replace(multipliers=point.smooth.multipliers)
-        return Ended(
-            point.z, gap + point.smooth.missing, objective, point.smooth.loss, steps, state, by_z, point.smooth.slope
-        )
+        smooth = point.smooth
+        return Ended(point.z, gap + smooth.missing, objective, smooth.loss, steps, state, by_z, smooth.slope)
 
     def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
         """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""

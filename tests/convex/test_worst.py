@@ -1,4 +1,4 @@
-"""Losses that are the largest of many: the same minimum as an interior point's, with a gap that bounds what is missing."""
+"""Losses that are the largest of many: the minimum of an interior point, with a gap that bounds what is missing."""
 
 from __future__ import annotations
 
