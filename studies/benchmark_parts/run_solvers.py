@@ -14,7 +14,7 @@ from sklearn.linear_model import lasso_path
 TOLERANCE = 1e-10
 """Of every solver; what it leaves is seen in the objectives."""
 RUNS = 2
-HOW = {"tol": TOLERANCE, "max_iter": 50, "max_epochs": 2_000, "fit_intercept": False, "warm_start": True}
+HOW = {"tol": TOLERANCE, "max_iter": 20, "max_epochs": 500, "fit_intercept": False, "warm_start": True}
 
 
 def main():
