@@ -12,6 +12,7 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.convex.closed import shares
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
+from rpim_opt.convex.largest import Largest
 from rpim_opt.convex.newton import DEAR, Newton
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
@@ -86,7 +87,8 @@ def by_rows(
     rough
         Whether a point that a rule compares with others will do.
     """
-    if objective.separated is None and objective.worst is None:
+    loss = objective.separated or objective.worst
+    if loss is None:
         return None
     at = objective.coordinates
     if damping is not None:
@@ -94,10 +96,10 @@ def by_rows(
         weight = 1.0
     box = objective.box if objective.constrained else None
     method: Newton | Worst
-    if objective.worst is not None:
-        method = Worst(objective.worst, at, weight, box)
+    if isinstance(loss, Largest):
+        method = Worst(loss, at, weight, box)
     else:
-        method = Newton(objective.separated, at, weight, box, rough)
+        method = Newton(loss, at, weight, box, rough)
     if not at.rows.shape[1] or (box is not None and not method.whole):
         return None
     with phase("solve"), np.errstate(all="ignore"):

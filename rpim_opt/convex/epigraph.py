@@ -173,7 +173,7 @@ class _Search:
         place = self.many + i
         size = self._size
         b = self.B[:size, place].copy()
-        pivot = b[place]
+        pivot = float(b[place])
         self.x[:size] -= b * (self.x[place] / pivot)
         self._removed(i, b, pivot)
 
