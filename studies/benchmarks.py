@@ -40,6 +40,7 @@ QUESTION = "How fast is a calibration with any formulation and rule, and what do
 PART = 50_000
 HERE = Path(__file__).resolve().parent
 GRID = load_study(HERE / "benchmark_parts" / "grid.py", ("cells", "cell", "figure"))
+SOLVERS = load_study(HERE / "benchmark_parts" / "solvers.py", ("compared",))
 OTHERS = load_study(HERE / "benchmark_parts" / "others.py", ("processes", "bootstrap"))
 PEERS = ("pybotics", "robotkinecal", "figaroh")
 METRICS = {
@@ -59,8 +60,11 @@ METRICS = {
 
 
 def prepare(quick: bool) -> None:
-    """Install the peers, as the study `peers` does."""
-    load_study(find_study("peers")).prepare(quick)
+    """Install the peers, as the study `peers` does, and in the long version solvers of lasso."""
+    peers = load_study(find_study("peers"))
+    peers.prepare(quick)
+    if not quick:  # a minute of it is compiling
+        peers.install("solvers", SOLVERS.REQUIREMENTS, (3, 14))
 
 
 def cases(quick: bool) -> list[dict[str, Any]]:
@@ -76,6 +80,7 @@ def cases(quick: bool) -> list[dict[str, Any]]:
     if quick:
         return one
     one += [{"part": "report", "count": n, "tool": "robust"} for n in (2_208, 20_000)]
+    one += [{"part": "solvers", "count": n} for n in (40, 1_000)]
     return [*one, {"part": "report", "count": 20_000, "tool": "tikhonov"}, {"part": "cluster", "count": 10_000_000}]
 
 
@@ -98,8 +103,17 @@ def run(part: str, count: int = 0, tool: str = "", method: str = "") -> dict[str
         "report": lambda: OTHERS.report(GRID.arm(count), FORMULATIONS[tool]),
         "model": lambda: OTHERS.large_model(count),
         "cell": lambda: GRID.cell(tool, method, count),
+        "solvers": lambda: {"solvers": _solvers(count)},
     }
     return works[part]()
+
+
+def _solvers(count: int) -> dict[str, Any]:
+    """Return how long paths take by us and by others, and how exact they are."""
+    problem = GRID.arm(count)
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    program = find_study("peers").parent / ".environments" / "solvers" / "bin" / "python"
+    return SOLVERS.compared(str(program), model)
 
 
 def _arm(bounds: bool) -> CalibrationProblem:
@@ -364,7 +378,22 @@ def _waiting(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
             lines.append([f"report, {row['tool']}, {row['count']:,} rows", f"{row['seconds']:.2f}", said])
             if (row["tool"], row["count"]) == ("robust", 400):
                 metrics["report of a robust result [s]"] = row["seconds"]
-    return markdown(["waiting for", "seconds", "beside it"], lines)
+    return markdown(["waiting for", "seconds", "beside it"], lines) + _against(rows)
+
+
+def _against(rows: list[dict[str, Any]]) -> str:
+    """Return a table of paths by us and by others on the same A and b; nothing in the quick version."""
+    lines = []
+    for row in rows:
+        if row["part"] == "solvers":
+            for key, each in sorted(row["solvers"].items()):
+                ours = row["solvers"][f"{key.partition(', ')[0]}, rpim_opt"]["seconds"]
+                cells = [f"{1e3 * each['seconds']:.1f}", f"{each['seconds'] / ours:.2g}", f"{each['excess']:.0e}"]
+                lines.append([f"{key}, {row['count']:,} configurations", *cells])
+    if not lines:
+        return ""
+    head = ["path", "ms", "over ours", "largest excess of an objective over the least found"]
+    return "\n\n" + markdown(head, lines) + "\n\n" + ALIKE
 
 
 def _models(rows: list[dict[str, Any]], metrics: dict[str, float]) -> str:
@@ -407,6 +436,8 @@ def _of_cell(row: dict[str, Any] | None) -> str:
     return f"{row['seconds']:.3f} ({row['seconds'] / row['tikhonov']:.2g})"
 
 
+ALIKE = """\
+The same A and b, their columns scaled to one length, as coordinate descent asks for: without that it does not end."""
 TEXT = """\
 {times}
 

@@ -22,6 +22,7 @@ import sys
 import tempfile
 import venv
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,20 +114,26 @@ METRICS |= {f"{situation} over best peer": Metric("lower", 0.05) for situation i
 def prepare(quick: bool) -> None:
     """Install the peers, each into its own environment; one that is there already is left alone."""
     for peer, (requirement, below) in PACKAGES.items():
-        folder = HERE / ".environments" / peer
-        if (folder / "complete").is_file() and (folder / "complete").read_text() == requirement:
-            continue
-        interpreter = _interpreter(below)
-        if interpreter is None:
-            raise RpimError(f"{requirement} needs a Python below {below[0]}.{below[1]}, and none was found.")
-        print(f"Installing {requirement} ...", file=sys.stderr, flush=True)
-        if interpreter == sys.executable:
-            venv.create(folder, with_pip=True, clear=True)
-        else:
-            subprocess.run([interpreter, "-m", "venv", "--clear", folder], check=True)
-        pip = [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
-        subprocess.run([*pip, requirement], check=True)
-        write_text(folder / "complete", requirement)
+        install(peer, [requirement], below)
+
+
+def install(name: str, requirements: Sequence[str], below: tuple[int, int]) -> None:
+    """Install packages into an environment of their own, unless they are there."""
+    folder = HERE / ".environments" / name
+    stated = " ".join(requirements)
+    if (folder / "complete").is_file() and (folder / "complete").read_text() == stated:
+        return
+    interpreter = _interpreter(below)
+    if interpreter is None:
+        raise RpimError(f"{stated} needs a Python below {below[0]}.{below[1]}, and none was found.")
+    print(f"Installing {stated} ...", file=sys.stderr, flush=True)
+    if interpreter == sys.executable:
+        venv.create(folder, with_pip=True, clear=True)
+    else:
+        subprocess.run([interpreter, "-m", "venv", "--clear", folder], check=True)
+    pip = [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+    subprocess.run([*pip, *requirements], check=True)
+    write_text(folder / "complete", stated)
 
 
 def _interpreter(below: tuple[int, int]) -> str | None:

@@ -64,6 +64,8 @@ class Choosing:
             raise InputError(f"selector {selection.name}", f"weight {selection.weight}", "a number, zero or more")
         answers = (*self.answers, float(selection.weight))
         chosen = replace(self, weight=float(selection.weight), selection=selection, answers=answers)
+        if not program.closed_form:  # whose paths are dear: the next answer is asked for where this one leads
+            chosen = replace(chosen, settled=True)
         return chosen._checked()
 
     def after(self, step: float) -> Choosing:

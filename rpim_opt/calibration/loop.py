@@ -210,7 +210,7 @@ class Loop:
 
     def _stalled(self, state: State) -> bool:
         """Whether many passes together have changed the objective by no more than one may for nothing."""
-        if len(state.history) <= LONG:
+        if len(state.history) <= LONG or state.history[-LONG].weight != state.choice.weight:
             return False
         accuracy, best = self._accuracy(state)
         fall = state.history[-LONG].objective - state.merit

@@ -1,7 +1,8 @@
-"""Programs whose loss is a sum over rows or configurations, and whose penalty a square: solved by Newton's method."""
+"""Programs whose loss is a sum or the largest over rows or configurations, and whose penalty a square."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,10 +12,13 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.convex.closed import shares
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
-from rpim_opt.convex.newton import Ended, Kinked, Newton
+from rpim_opt.convex.largest import Largest
+from rpim_opt.convex.newton import DEAR, Newton
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.whitened import Ended, Kinked
+from rpim_opt.convex.worst import Worst
 
 MOST = 100
 """Weights whose minima are kept."""
@@ -25,12 +29,14 @@ TINY = 1e-300
 class Near(NamedTuple):
     """A minimum of a program like the one that is asked for.
 
-    z (n,), the state of the loss's kinks, and the loss's slope (m,), equations in the order of their configurations.
+    z (n,), what a neighbour may begin with, the loss's slope (m,), equations in the order of their configurations, and
+    the loss.
     """
 
     z: Array
     kinked: Kinked
     slope: Array
+    loss: float
 
 
 class Met:
@@ -45,6 +51,16 @@ class Met:
             return self._at.get(weight)
         return self._at[min(self._at, key=lambda other: abs(np.log((other + TINY) / (weight + TINY))))]
 
+    def near(self, weight: float) -> list[Near]:
+        """Return the minimum at the nearest weight, and the last one, which may be of a program more like this one."""
+        nearest = self.nearest(weight)
+        if nearest is None:
+            return []
+        last = self._at[next(reversed(self._at))]
+        if last is nearest:
+            return [nearest]
+        return [nearest, last]
+
     def keep(self, weight: float, near: Near) -> None:
         """Keep a minimum; of too many weights the one that was met first goes."""
         self._at.pop(weight, None)
@@ -54,7 +70,7 @@ class Met:
 
 
 def by_rows(
-    objective: Objective, weight: float, damping: Damping | None, near: Near | None
+    objective: Objective, weight: float, damping: Damping | None, near: Sequence[Near], rough: bool = False
 ) -> tuple[Found, Near] | None:
     """Return the minimum, and what a neighbour may begin with; None where this is no such program, or no end in sight.
 
@@ -67,9 +83,11 @@ def by_rows(
     damping
         A term that keeps the solution near a point.
     near
-        The minimum of a neighbour: another weight, or a linearization nearby.
+        Minima of neighbours: another weight, or a linearization nearby. The lowest one here is where it begins.
+    rough
+        Whether a point that a rule compares with others will do.
     """
-    loss = objective.separated
+    loss = objective.separated or objective.worst
     if loss is None:
         return None
     at = objective.coordinates
@@ -77,26 +95,33 @@ def by_rows(
         at = _damped(objective, weight, damping)
         weight = 1.0
     box = objective.box if objective.constrained else None
-    newton = Newton(loss, at, weight, box)
-    if not at.rows.shape[1] or (box is not None and not newton.whole):
+    method: Newton | Worst
+    if isinstance(loss, Largest):
+        method = Worst(loss, at, weight, box)
+    else:
+        method = Newton(loss, at, weight, box, rough)
+    if not at.rows.shape[1] or (box is not None and not method.whole):
         return None
     with phase("solve"), np.errstate(all="ignore"):
-        ended = _ended(newton, near)
-    if ended is None or not ended.good:
+        ended = _ended(method, near)
+    if ended is None or not (ended.good or ended.close):
         return None
     duals = ()
     if box is not None:
-        duals = shares(objective, box, ended.z, newton.multipliers(ended))
-    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss)
+        duals = shares(objective, box, ended.z, method.multipliers(ended))
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss, ended.loss)
 
 
-def _ended(newton: Newton, near: Near | None) -> Ended | None:
+def _ended(method: Newton | Worst, near: Sequence[Near]) -> Ended | None:
     """Return the minimum begun next to a neighbour, or where that leads nowhere at that of squares."""
-    if near is not None:
-        ended = newton.minimum(near.z, near.kinked)
-        if ended.good:
+    if near:
+        lowest = near[0]
+        if len(near) > 1 and method.at.rows.size < DEAR:
+            lowest = min(near, key=lambda each: method.objective(each.z))
+        ended = method.minimum(lowest.z, lowest.kinked)
+        if ended.good or ended.close:
             return ended
-    return newton.minimum(newton.of_squares())
+    return method.minimum(method.of_squares())
 
 
 def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinates:

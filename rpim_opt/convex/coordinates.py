@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,18 @@ class Coordinates:
     b: Array
     penalized: np.ndarray
     gram: Array
+
+    def of(self, kept: np.ndarray) -> Coordinates:
+        """Return the same coordinates where some rows are zero; ``kept`` (m,) says which are not.
+
+        Data and penalty are then diagonal together no more, but nearly where few rows are left out.
+        """
+        left_out = self.rows[~kept]
+        gram = self.gram - left_out.T @ left_out
+        rows, b = self.rows.copy(), self.b.copy()
+        rows[~kept] = 0.0
+        b[~kept] = 0.0
+        return replace(self, rows=rows, b=b, gram=gram)
 
     @cached_property
     def inverse(self) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.largest import Largest
 from rpim_opt.convex.objective import Objective
 
 BESIDE, ROUNDING = 1e-12, 1e-9
@@ -34,7 +35,7 @@ def duality_gap(objective: Objective, z: Array, weight: float, proposed: Array |
     z, weight
         The point (n,), and the weight.
     proposed
-        (m,) slopes of a loss that has kinks at zero.
+        (m,) slopes of a loss that has kinks at zero, or is the largest of many.
 
     Examples
     --------
@@ -53,6 +54,10 @@ def duality_gap(objective: Objective, z: Array, weight: float, proposed: Array |
     if not known or model.stands_for is not None or objective.violation(z) > 0:
         return float("inf")
     r = model.A @ z - model.b
+    if objective.worst is not None:
+        if proposed is None:
+            return float("inf")
+        return _of_largest(objective, objective.worst, z, weight, proposed)
     y = posed.loss_slope(r)
     if y is None or len(y) != len(r) or not np.isfinite(y).all():
         return float("inf")
@@ -60,6 +65,21 @@ def duality_gap(objective: Objective, z: Array, weight: float, proposed: Array |
     if proposed is not None:
         nearby, y = _at_kinks(objective, r, y, proposed)
     missing = posed.loss_of(r) - posed.loss_of(nearby) - float(y @ (r - nearby))
+    return max(missing, 0.0) + _fall(objective, z, weight, model.A.T @ y)
+
+
+def _of_largest(objective: Objective, worst: Largest, z: Array, weight: float, proposed: Array) -> float:
+    """Return the gap of a largest loss: by the mean of its groups with those shares that slopes (m,) tell of."""
+    model = objective.model
+    r = model.A @ z - model.b
+    ordered = r[objective.order]
+    shares = worst.shares(proposed[objective.order])
+    slope = worst.slope(ordered, shares)
+    y = np.empty(len(r))
+    y[objective.order] = slope
+    missing = objective._posed.loss_of(r) - worst.minorant(ordered, shares, slope)
+    if not shares.any() or not np.isfinite(missing):
+        return float("inf")
     return max(missing, 0.0) + _fall(objective, z, weight, model.A.T @ y)
 
 

@@ -138,7 +138,7 @@ class Folds:
         near = None
         if met:
             near = met[min(met, key=lambda weight: abs(np.log(weight / np.max(weights))))]
-        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near)])
+        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near, rough=True)])
         if (weights > 0).all():
             met |= dict(zip(weights, Z, strict=True))
         squares = (Z @ model.A[out].T - model.b[out]) ** 2
@@ -215,7 +215,7 @@ def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
     n = model.A.shape[1]
     if not program.on_triangles or len(parts) < 2:
         for part in parts:
-            yield program.on(model.scaled(np.where(np.isin(model.group, part), 0.0, 1.0)))
+            yield program.without(np.isin(model.group, part))
         return
     rows = np.column_stack([model.A, model.b])
     place = np.full(int(model.group.max()) + 1, -1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,12 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
-from rpim_opt.convex.coordinates import Coordinates
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.problem.linear import RANK_TOLERANCE
+from rpim_opt.convex.whitened import Ended, Kinked, Whitened
 
-SOUGHT, ACCEPTED = 1e-12, 1e-10
-"""Duality gap, relative to the objective, that the method goes on to while that falls, and that it must reach."""
+SOUGHT = 1e-12
+"""Duality gap, relative to the objective, that the method goes on to while that falls."""
 MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
@@ -26,25 +24,24 @@ SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 FLAT = 1e-10
 """Curvature that unknowns have at least, where the data have about one."""
-FAR = 100.0
-"""No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
-UNSEEN = RANK_TOLERANCE**2
-"""Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
+DEAR = 200_000
+"""Entries of the rows from which a second derivative is dear."""
+ENOUGH = 5e-11
+"""Duality gap, relative to the objective, that ends steps with such ones."""
+PROMISED = 1e-10
+"""Part of the objective by which it may be lower elsewhere, where points are compared."""
+SLOW = 0.1
+"""Part of the gap that a step with an old second derivative may leave."""
+ROUND = 1e-12
+"""Changes of slope below this part of what lengths allow tell nothing."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good one is taken."""
 
 _potrf: Any
 _potrs: Any
 _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
-
-
-class Kinked(NamedTuple):
-    """About which multipliers (m,) each the kinks are smoothed, and how sharply."""
-
-    multipliers: list[Array]
-    sharpness: float
 
 
 class Point(NamedTuple):
@@ -57,28 +54,8 @@ class Point(NamedTuple):
     smooth: Smoothed
 
 
-class Ended(NamedTuple):
-    """Where the method ended.
-
-    z (n,), duality gap, objective, steps, the kinks' state, the slope by z (n,) in a box, and the loss's (m,).
-    """
-
-    z: Array
-    gap: float
-    objective: float
-    steps: int
-    kinked: Kinked
-    slope: Array | None
-    of_loss: Array
-
-    @property
-    def good(self) -> bool:
-        """Whether the gap says that this is a minimum."""
-        return self.gap <= ACCEPTED * max(1.0, abs(self.objective))
-
-
 @dataclass(frozen=True, eq=False)
-class Newton:
+class Newton(Whitened):
     """minimize  sum_i f_i(A_i z - b_i) + weight |L z - c|^2  in a box, by Newton's method.
 
     In unknowns that whiten data and penalty together the second derivative of a loss about the identity is well
@@ -86,13 +63,7 @@ class Newton:
     A loss with kinks is smoothed about multipliers (`Separated`), which then take a step themselves. In a box the step
     is the minimum of the quadratic there, by the active set.
 
-    With y the slope of the loss (the smoothed one's is a subgradient) at z, g = A'y + penalty'(z) and Fenchel's
-    inequality, no point has an objective lower by more than ::
-
-        gap = (what the kinks miss) + sum_k g_k^2 / (4 weight)
-
-    over penalized coordinates; those without penalty add |g_k| times `FAR` of their size. Of the components on a
-    bound only those slopes count that lead inwards.
+    The gap is that of `Whitened`, where the smoothed loss's slope at z is a subgradient.
 
     Parameters
     ----------
@@ -104,48 +75,22 @@ class Newton:
         Of the penalty.
     box
         Lower and upper (n,), or None.
+    rough
+        Whether, where second derivatives are dear, it will do that a quadratic promises to lower the objective by no
+        more than `PROMISED` of it: a point that a rule compares with others. (Of small weights, a gap asks for far
+        more: it knows of the penalty's curvature alone.)
     """
 
     loss: Separated
-    at: Coordinates
-    weight: float
-    box: tuple[Array, Array] | None = None
-
-    @cached_property
-    def pull(self) -> Array:
-        """(p,) weight of every coordinate's square."""
-        return np.where(self.at.penalized, self.weight, 0.0)
-
-    @cached_property
-    def unit(self) -> Array:
-        """(p,) size of a coordinate of which data and penalty together make one; zero where they do not see it."""
-        size = self.at.lengths + self.pull
-        seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
-        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
-
-    @property
-    def whole(self) -> bool:
-        """Whether the coordinates say all of z, as a box asks for."""
-        return len(self.unit) == len(self.at.offset) and bool((self.unit > 0).all())
-
-    def of_squares(self) -> Array:
-        """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
-        z = self.at.offset + self.at.B @ (self.unit**2 * (self.at.rows.T @ self.at.b))
-        if self.box is None:
-            return z
-        return np.clip(z, *self.box)
-
-    def multipliers(self, ended: Ended) -> Array:
-        """Return by how much the objective would fall per unit by which a bound were loosened, (n,)."""
-        if ended.slope is None:
-            return np.zeros_like(ended.z)
-        return np.where(self.held(ended.z, ended.slope), np.abs(ended.slope), 0.0)
+    rough: bool = False
 
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
 
         Where the neighbour was too far for kinks as sharp as there, they begin blunter.
         """
+        if self._dear:
+            return self._by_secants(self._placed(z, kinked))
         if kinked is None or not self.loss.kinks:
             return self._descent(self._placed(z, kinked), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
@@ -171,30 +116,90 @@ class Newton:
             point = self._next(point, slope, ended.gap)
         return best
 
+    @property
+    def _dear(self) -> bool:
+        """Whether a second derivative costs far more than a slope, and there is one that lasts."""
+        return self.at.rows.size >= DEAR and not self.loss.kinks
+
+    def _by_secants(self, point: Point) -> Ended:
+        """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
+
+        Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
+        it is computed anew.
+        """
+        slope = self._slope(point)
+        ended = self._judged(point, slope, 0)
+        best = ended
+        bent = None
+        if point.kinked.curved is not None:
+            bent = self.at.B.T @ point.kinked.curved @ self.at.B
+        vain = 0
+        for steps in range(1, MOST):
+            if best.gap <= ENOUGH * abs(best.objective) or (vain >= VAIN and best.good):
+                break
+            fresh = bent is None
+            if bent is None:
+                bent = self._hessian(point)
+            if self.rough and self._promised(slope, bent) <= PROMISED * abs(ended.objective):
+                best = ended._replace(close=True)
+                break
+            ahead = self._stepped(point, slope, bent)
+            slope_ahead = self._slope(ahead)
+            after = self._judged(ahead, slope_ahead, steps)
+            if after.gap > SLOW * ended.gap and not fresh:
+                bent = None
+            else:
+                bent = self._updated(bent, point, ahead, slope_ahead - slope)
+            point, slope, ended = ahead, slope_ahead, after
+            vain += 1
+            if ended.gap < best.gap:
+                best = ended
+                vain = 0
+        if bent is None:
+            return best
+        curved = self.at.inverse.T @ bent @ self.at.inverse
+        return best._replace(kinked=best.kinked._replace(curved=curved))
+
+    def _promised(self, slope: Array, bent: Array) -> float:
+        """Return by how much the objective would fall, were it quadratic; infinite in a box."""
+        if self.box is not None:
+            return np.inf
+        factor, failed = _potrf(self._whole(bent))
+        if failed:
+            return np.inf
+        return 0.5 * float(slope @ _potrs(factor, slope)[0])
+
+    def _updated(self, bent: Array, before: Point, after: Point, change: Array) -> Array:
+        """Return the loss's second derivative so that it explains by how much the objective's slope has changed."""
+        step = after.a - before.a
+        seen = self.unit > 0
+        of_loss = np.divide(change, self.unit, out=np.zeros_like(change), where=seen) - 2 * self.pull * step
+        along = bent @ step
+        steep, flat = float(step @ of_loss), float(step @ along)
+        if not (steep > ROUND * float(np.linalg.norm(step) * np.linalg.norm(of_loss)) and flat > 0):
+            return bent
+        return bent + np.outer(of_loss, of_loss / steep) - np.outer(along, along / flat)
+
     def _placed(self, z: Array, kinked: Kinked | None) -> Point:
         """Return the point at z (n,), or the one beside it that the coordinates can say."""
-        if self.box is not None:
-            z = np.clip(z, *self.box)
-        a = np.where(self.unit > 0, self.at.inverse @ (z - self.at.offset), 0.0)
-        if self.box is None:
-            z = self.at.offset + self.at.B @ a
+        z, a = self.placed(z)
         r = self.at.rows @ a - self.at.b
         kinked = kinked or self._begun(r)
-        return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked))
+        return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked[:2]))
 
     def _about(self, point: Point, kinked: Kinked) -> Point:
         """Return the same point with kinks in another state."""
-        return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked))
+        return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked[:2]))
 
     def _next(self, point: Point, slope: Array, gap: float) -> Point:
         """Return the point after a step of Newton's, or of the multipliers where little else is left of the gap."""
         if not self.loss.kinks:
-            return self._stepped(point, slope)
+            return self._stepped(point, slope, self._hessian(point))
         missing = point.smooth.missing
         sharpness = point.kinked.sharpness
         if gap - missing <= SETTLED * missing:
             return self._about(point, Kinked(point.smooth.multipliers, min(SHARPER * sharpness, SHARPEST)))
-        ahead = self._stepped(point, slope)
+        ahead = self._stepped(point, slope, self._hessian(point))
         if ahead is point:  # no step is short enough for kinks so sharp
             return self._about(point, point.kinked._replace(sharpness=sharpness / SHARPER))
         return ahead
@@ -210,50 +215,18 @@ class Newton:
 
     def _slope(self, point: Point) -> Array:
         """Return the slope of the smoothed objective by the coordinates in their units, (p,)."""
-        return self.unit * (self.at.rows.T @ point.smooth.slope + 2 * self.pull * point.a)
-
-    def _bound(self, point: Point, slope: Array) -> tuple[float, Array | None]:
-        """Return by how much the smoothed objective may fall at most, and its slope by z (n,) in a box."""
-        by_z = None
-        if self.box is not None:
-            by_z = self.back.T @ slope
-            slope = (self.at.B * self.unit).T @ np.where(self.held(point.z, by_z), 0.0, by_z)
-        gap = float(slope**2 @ self._price)
-        free = self._free
-        if len(free):
-            gap += FAR * float(np.abs(slope[free]) @ (1 + np.abs(point.a[free] / self.unit[free])))
-        return gap, by_z
-
-    @cached_property
-    def _price(self) -> Array:
-        """(p,) by what squared slopes of penalized coordinates are multiplied in the gap."""
-        held = (self.pull > 0) & (self.unit > 0)
-        return np.divide(0.25, self.pull * self.unit**2, out=np.zeros_like(self.unit), where=held)
-
-    @cached_property
-    def _free(self) -> np.ndarray:
-        """Which coordinates data alone decide."""
-        return np.flatnonzero((self.pull == 0) & (self.unit > 0))
-
-    def held(self, z: Array, slope: Array) -> np.ndarray:
-        """Return which components of z (n,) a bound holds, for a slope (n,)."""
-        lower, upper = self.box or (-np.inf, np.inf)
-        return ((z <= lower) & (slope > 0)) | ((z >= upper) & (slope < 0))
+        return self.slope(point.a, point.smooth.slope)
 
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
-        gap, by_z = self._bound(point, slope)
+        gap, by_z = self.bound(point.z, point.a, slope)
         objective = point.smooth.loss + float(self.pull @ point.a**2)
         state = point.kinked._replace(multipliers=point.smooth.multipliers)
-        return Ended(point.z, gap + point.smooth.missing, objective, steps, state, by_z, point.smooth.slope)
+        smooth = point.smooth
+        return Ended(point.z, gap + smooth.missing, objective, smooth.loss, steps, state, by_z, smooth.slope)
 
-    @cached_property
-    def back(self) -> Array:
-        """(p, n) inverse of the coordinates in their units."""
-        return self.at.inverse / self.unit[:, None]
-
-    def _stepped(self, point: Point, slope: Array) -> Point:
-        """Return the point after a step of Newton's."""
-        H = self._hessian(self.loss.curvature(point.r, *point.kinked))
+    def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
+        """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""
+        H = self._whole(bent)
         factor, failed = _potrf(H)
         if failed:
             factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
@@ -267,8 +240,15 @@ class Newton:
         step = self.unit * (self.back @ (z - point.z))
         return self._searched(point, z, step)
 
-    def _hessian(self, curvatures: list[Curvature]) -> Array:
+    def _whole(self, bent: Array) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
+        H = self.unit[:, None] * bent * self.unit
+        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
+        return H
+
+    def _hessian(self, point: Point) -> Array:
+        """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
+        curvatures = self.loss.curvature(point.r, *point.kinked[:2])
         rows = self.at.rows
         across = sum(c.across for c in curvatures) + np.zeros(len(rows))
         usual = np.partition(across, len(across) // 2)[len(across) // 2]
@@ -282,8 +262,6 @@ class Newton:
         for curvature in curvatures:
             if len(curvature.along):
                 H += self._along(curvature)
-        H = self.unit[:, None] * H * self.unit
-        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
         return H
 
     def _along(self, curvature: Curvature) -> Array:
@@ -303,7 +281,7 @@ class Newton:
             place = self.at.offset + self.at.B @ a
             if self.box is not None:
                 place = np.clip(point.z + t * (z - point.z), *self.box)
-            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked))
+            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked[:2]))
 
         def rise(p: Point) -> float:
             slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)

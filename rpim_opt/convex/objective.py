@@ -16,6 +16,7 @@ from rpim_opt.convex.asked import configuration_norms
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.faces import Faces
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.largest import Largest
 from rpim_opt.convex.posed import Posed
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.separated import Separated
@@ -241,6 +242,23 @@ class Objective(Brief):
         if not self.linear_penalty or (self.constrained and self.box is None):
             return None
         return self._posed.separated
+
+    @cached_property
+    def worst(self) -> Largest | None:
+        """The loss as the largest of rows or configurations, where penalty and constraints let that be solved.
+
+        >>> import cvxpy as cp
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+        >>> mine = ro.Formulation("largest residual", loss=cp.norm_inf, penalty=cp.sum_squares)
+        >>> [ro.convex.pose(f, model).worst is not None for f in (ro.minimax, mine, ro.robust)]
+        [True, True, False]
+        """
+        if not self.linear_penalty or (self.constrained and self.box is None):
+            return None
+        return self._posed.worst
 
     @property
     def order(self) -> np.ndarray:

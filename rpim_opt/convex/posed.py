@@ -17,6 +17,7 @@ from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.kinks import kinks
+from rpim_opt.convex.largest import Largest, of_equations, of_norms
 from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.split import Split, split
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
@@ -168,6 +169,23 @@ class Posed:
         if made.count == self.r.size and made.holds:
             return made
         return None
+
+    @cached_property
+    def worst(self) -> Largest | None:
+        """The largest of equations or configurations, in their `order`, that the loss is; None for other losses."""
+        if self.limited or self.inner or self.loss_form is not None:
+            return None
+        if len(self.groups) != self.r.size:
+            return None
+        from rpim_opt.convex.tree import largest_of  # as above
+
+        term = self.asked.loss_term
+        found = largest_of(term.expression, term.variable)
+        if found is None:
+            return None
+        if self.formulation.loss_over == "equation":
+            return of_equations(found, self.order)
+        return of_norms(found, np.flatnonzero(np.diff(self.groups[self.order], prepend=-1)), len(self.groups))
 
     @cached_property
     def order(self) -> np.ndarray:

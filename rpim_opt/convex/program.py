@@ -119,6 +119,22 @@ class Program(Objective):
         """Return the program for another model of the same shape, without asking the functions anew."""
         return replace(self, model=model)
 
+    def without(self, out: np.ndarray) -> Program:
+        """Return the program without some equations, ``out`` (m,), which become rows of zeros.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("blunders").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> some = program.without(program.model.group == 7)  # the worst configuration
+        >>> some.solve(1.0).loss < program.solve(1.0).loss
+        True
+        """
+        left = self.on(self.model.scaled(np.where(out, 0.0, 1.0)))
+        if self.separated is not None or self.worst is not None:  # unknowns that whiten all whiten most
+            vars(left)["coordinates"] = self.coordinates.of(~out[self.order])
+        return left
+
     def problem(self, weight: float) -> cp.Problem:
         """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
 
@@ -148,8 +164,9 @@ class Program(Objective):
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
         have a formula, in a box an active set; a loss that is a sum over rows or configurations (robust, sum of norms,
-        quantiles) with a squared penalty, in a box or without, has Newton's method, begun where the last minimum was
-        and ended by a duality gap; everything else is Clarabel's, on data that are dimensionless.
+        quantiles) with a squared penalty, in a box or without, has Newton's method, one that is the largest of them
+        (minimax) has quadratic programs, both begun where the last minimum was and ended by a duality gap; everything
+        else is Clarabel's, on data that are dimensionless.
 
         Parameters
         ----------
@@ -202,7 +219,7 @@ class Program(Objective):
         estimate = self.solve(weight)
         if estimate.weight > 0 and self.faces is not None:
             return self._lower_by_interior_point(estimate)
-        if self.separated is None:
+        if self.separated is None and self.worst is None:
             return estimate
         near = self._met.nearest(weight)
         proposed = None
@@ -225,7 +242,7 @@ class Program(Objective):
         return estimate
 
     @one_blas_thread
-    def path(self, weights: Sequence[float] | Array, near: Array | None = None) -> list[Estimate]:
+    def path(self, weights: Sequence[float] | Array, near: Array | None = None, rough: bool = False) -> list[Estimate]:
         """Return the solutions at many weights (K,): all at once by formula, or each from its neighbour.
 
         Parameters
@@ -234,6 +251,9 @@ class Program(Objective):
             (K,), zero or more.
         near
             A point (n,) near the solution at the largest weight, if one is known.
+        rough
+            Whether of many equations points will do whose objective Newton's method expects to be within 1e-10 of the
+            minimum, without a gap that says so: for a rule that compares them.
 
         Examples
         --------
@@ -253,7 +273,8 @@ class Program(Objective):
         if self.faces is not None:
             return self._path_on_faces(checked, near)
         if not self.quadratic or box is None:
-            return [self.solve(weight) for weight in checked]
+            found = {weight: self._one(weight, rough) for weight in sorted(set(checked.tolist()), reverse=True)}
+            return [found[weight] for weight in checked.tolist()]
         Z, multipliers = path_between(self, box, checked)
         rows = zip(Z, checked, *values(self, Z), multipliers, strict=True)
         return [
@@ -275,14 +296,20 @@ class Program(Objective):
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
 
-    def _by_rows(self, weight: float, damping: Damping | None) -> Estimate | None:
-        """Return the minimum of a loss that is a sum over rows, by Newton's method from the last one."""
-        ended = by_rows(self, weight, damping, self._met.nearest(weight))
+    def _one(self, weight: float, rough: bool) -> Estimate:
+        """Return one of many solutions."""
+        estimate = self._by_rows(weight, None, rough) if rough else None
+        return estimate or self.solve(weight)
+
+    def _by_rows(self, weight: float, damping: Damping | None, rough: bool = False) -> Estimate | None:
+        """Return the minimum of a loss that is a sum or the largest over rows, from the last one."""
+        ended = by_rows(self, weight, damping, self._met.near(weight), rough)
         if ended is None:
             return None
         found, near = ended
         self._met.keep(weight, near)
-        return Estimate(near.z, weight, *self.value(near.z, weight), found.duals, iterations=found.iterations)
+        loss, penalty = near.loss + self.model.offset, self._posed.penalty_of(near.z)
+        return Estimate(near.z, weight, loss, penalty, found.duals, iterations=found.iterations)
 
     def _on_faces(self, weight: float, damping: Damping | None, start: Array | None = None) -> Estimate:
         """Return the minimum of a penalty with kinks, or where it is not certain the interior point's, if lower."""

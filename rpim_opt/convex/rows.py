@@ -43,6 +43,15 @@ class Kink(NamedTuple):
     of: Affine
 
 
+class Topmost(NamedTuple):
+    """factor max_i (a v_i + c) + constant, or of the absolute values."""
+
+    factor: float
+    of: Affine
+    absolute: bool
+    constant: float
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """sum_i f_i(v_i): smooth pieces, kinks, and a constant.

@@ -12,6 +12,8 @@ TINY = np.finfo(float).tiny
 """Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
 SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
+GRID, STRIDE = 60, 4
+"""Weights among which a corner is sought where each takes solving, and every which of them where the path is smooth."""
 GOLDEN = (1 + 5**0.5) / 2
 
 
@@ -33,8 +35,7 @@ def l_curve(program: Program) -> Selection:
         weights = weight_grid(program)
         score = _curvature(program, weights)
     else:
-        weights = weight_grid(program, 60)
-        score = menger(_points(program.path(weights)))
+        weights, score = _on_grid(program, weight_grid(program, GRID))
     best = int(np.argmax(score))
     if program.faces is not None:
         best = _first_corner(score)
@@ -46,6 +47,40 @@ def l_curve(program: Program) -> Selection:
     if program.closed_form:
         weight = _refined(program, weights, score, best)
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
+
+
+def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
+    """Return weights and the curvatures there: all of a grid, or of a smooth loss those about the sharpest corners.
+
+    A smooth path is looked at in large steps first, and then at every weight of the grid about its corners, until the
+    sharpest one and both its neighbours have theirs: they are then as sharp as on all of the grid.
+    """
+    if program.separated is None or program.separated.kinks:
+        return weights, menger(_points(program.path(weights)))
+    last = len(weights) - 1
+    places = {*range(0, last, STRIDE), last}
+    met: dict[int, Array] = {}
+    while True:
+        some = sorted(places)
+        new = [k for k in some if k not in met]
+        met |= dict(zip(new, _points(program.path(weights[new], rough=True)), strict=True))
+        score = menger(np.array([met[k] for k in some]))
+        around = {near for k in _peaks(score) for near in _between(some, k, last)}
+        if around <= places:
+            return weights[some], score
+        places |= around
+
+
+def _peaks(score: Array) -> np.ndarray:
+    """Return the corners that are about as sharp as the sharpest."""
+    inner = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])) + 1
+    return inner[score[inner] >= max(SHARP * np.max(score), TINY)]
+
+
+def _between(some: list[int], k: int, last: int) -> range:
+    """Return the places from one neighbour of a place to the other, and two of the grid on both sides at least."""
+    first = min(some[k - 1], max(some[k] - 2, 0))
+    return range(first, max(some[k + 1], min(some[k] + 2, last)) + 1)
 
 
 def _first_corner(score: Array) -> int:

@@ -163,6 +163,11 @@ class Separated:
             value -= float(self._tilt @ v)
         return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
 
+    def at(self, r: Array) -> float:
+        """Return the loss of a residual (m,)."""
+        bent = [float((factor * self._norms(a * r + c)).sum()) for factor, (a, c) in self.kinks]
+        return self._smooth(r)[0] + sum(bent)
+
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
         value, slope = self._smooth(r)

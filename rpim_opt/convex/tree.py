@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.late import Late
 from rpim_opt.convex.atoms import cp
-from rpim_opt.convex.rows import LINE, SQUARE, Affine, Curve, Kink, Piece, Rows, huber, power, root
+from rpim_opt.convex.rows import LINE, SQUARE, Affine, Curve, Kink, Piece, Rows, Topmost, huber, power, root
 from rpim_opt.convex.terms import Term, apart
 
 elementwise: Any = Late("cvxpy.atoms.elementwise.elementwise")
@@ -40,6 +40,58 @@ def rows_of(expression: Any, variable: cp.Variable) -> Rows | None:
         else:
             constant += part
     return Rows(tuple(pieces), tuple(kinks), constant)
+
+
+def largest_of(expression: Any, variable: cp.Variable) -> Topmost | None:
+    """Return the largest over the components of a variable (m,) that a convex expression is; None where it is none.
+
+    CVXPY's tree has to be a ``max`` of lines of every component or of their absolute values (`cp.norm_inf`), times
+    numbers and plus numbers.
+
+    >>> import cvxpy as cp
+    >>> from rpim_opt.convex.tree import largest_of
+    >>> r = cp.Variable(3)
+    >>> largest_of(2 * cp.norm(r, "inf") + 1, r)
+    Topmost(factor=2.0, of=Affine(a=1.0, c=0.0), absolute=True, constant=1.0)
+    >>> largest_of(cp.max(r) + cp.sum(cp.huber(r)), r) is None
+    True
+    """
+    reading = _Reading(variable)
+    constant, factor = 0.0, 1.0
+    e = expression
+    while type(e).__name__ not in ("max", "norm_inf"):
+        inner = _unwrapped(e)
+        if inner is None:
+            return None
+        times, plus, e = inner
+        constant += factor * plus
+        factor *= times
+    of = e.args[0]
+    absolute = type(e).__name__ == "norm_inf"
+    if type(of).__name__ == "abs":
+        absolute = True
+        of = of.args[0]
+    line = reading.affine(of)
+    if line is None or e.shape != () or factor <= 0:
+        return None
+    return Topmost(factor, line, absolute, constant)
+
+
+def _unwrapped(e: Any) -> tuple[float, float, Any] | None:
+    """Return times, plus and the expression inside of: times (expression) + plus; None for other ones."""
+    kind = type(e).__name__
+    if kind == "reshape":
+        return 1.0, 0.0, e.args[0]
+    if kind == "AddExpression":
+        inner = [arg for arg in e.args if not arg.is_constant()]
+        plus = sum(float(arg.value) for arg in e.args if arg.is_constant())
+        if len(inner) == 1:
+            return 1.0, plus, inner[0]
+        return None
+    multiple = _multiple(e)
+    if multiple is None or np.size(multiple[0]) != 1:
+        return None
+    return float(multiple[0]), 0.0, multiple[1]
 
 
 Parts = list[Any]

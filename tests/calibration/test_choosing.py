@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.choosing import PATIENCE, SETTLED, Choosing, choosing
 
-PROGRAM: Any = None
-"""The rules below look at no program."""
+PROGRAM: Any = SimpleNamespace(closed_form=True)
+DEAR: Any = SimpleNamespace(closed_form=False)
+"""The rules below look at no program; one without a formula they are asked about where their last answer leads."""
 
 
 def rule(*answers: float) -> Callable[[Any], ro.select.Selection]:
@@ -51,6 +53,16 @@ def test_a_rule_is_asked_until_it_settles() -> None:
     settled = second.after(0.0)
     assert settled.settled
     assert settled.asked(PROGRAM) is settled
+
+
+def test_of_a_program_without_formula_every_answer_is_followed_to_its_end() -> None:
+    first = choosing(rule(2.0, 5.0, 5.0), True).asked(DEAR)
+    assert (first.weight, first.settled, first.final) == (2.0, True, False)
+    assert first.asked(DEAR) is first
+    second = first.confirmed(DEAR)
+    assert (second.weight, second.settled, second.final) == (5.0, True, False)
+    third = second.confirmed(DEAR)
+    assert (third.weight, third.settled, third.final) == (5.0, True, True)
 
 
 def test_without_a_penalty_a_rule_is_not_asked() -> None:

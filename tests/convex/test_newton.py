@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex import by_rows, newton
 from rpim_opt.convex.gap import duality_gap
 from rpim_opt.convex.interior import interior
 from rpim_opt.convex.objective import Damping
@@ -182,3 +183,72 @@ def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) ->
     h = 1e-5
     bend = (rows.both(v + h)[1] - rows.both(v - h)[1]) / (2 * h)
     assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
+
+
+SMOOTH = [
+    ("huber", "equation"),
+    ("log cosh", "equation"),
+    ("huber", "configuration"),
+    ("pseudo-Huber", "configuration"),
+]
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_with_few_second_derivatives_the_minimum_is_the_same(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of many equations: second derivatives are a neighbour's, and updated by slopes; with a box, too."""
+    signs = (ro.convex.constraints.signed(1, "*"),)
+    for formulation in (stated(name, over), replace(stated(name, over), constraints=signs)):
+        weights = np.geomspace(1e3, 1e-4, 8)
+        expected = ro.convex.pose(formulation, MODEL).path(weights)
+        with monkeypatch.context() as patched:
+            patched.setattr(newton, "DEAR", 0)
+            patched.setattr(by_rows, "DEAR", 0)
+            counted = Counted(newton.Newton._hessian)
+            patched.setattr(newton.Newton, "_hessian", counted.method())
+            program = ro.convex.pose(formulation, MODEL)
+            found = program.path(weights)
+            assert 1 <= counted.count <= 3 * len(weights)
+        for one, other in zip(found, expected, strict=True):
+            assert one.iterations > 0
+            assert one.objective == pytest.approx(other.objective, rel=1e-9)
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_points_for_a_rule_are_within_what_newton_promises(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(newton, "DEAR", 0)
+    weights = np.geomspace(1e2, 1e-3, 6)
+    program = ro.convex.pose(stated(name, over), MODEL)
+    rough = program.path(weights, rough=True)
+    for one, other in zip(rough, ro.convex.pose(stated(name, over), MODEL).path(weights), strict=True):
+        assert other.objective * (1 - 1e-10) <= one.objective <= other.objective * (1 + 1e-8)
+        assert program.solve(one.weight).objective == pytest.approx(other.objective, rel=1e-9)
+
+
+class Counted:
+    """How often a method is called."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+        self.count = 0
+
+    def method(self) -> Any:
+        def called(*arguments: Any) -> Any:
+            self.count += 1
+            return self.function(*arguments)
+
+        return called
+
+
+def test_a_program_without_some_configurations_is_that_of_the_others() -> None:
+    """Whatever unknowns it is solved in."""
+    out = MODEL.group % 4 == 1
+    for name, over in [("huber", "configuration"), ("norms", "configuration"), ("quantile", "equation")]:
+        program = ro.convex.pose(stated(name, over), MODEL)
+        without = program.without(out)
+        alone = program.on(MODEL.scaled(np.where(out, 0.0, 1.0)))
+        for weight in (1e-3, 1.0):
+            assert without.solve(weight).objective == pytest.approx(alone.solve(weight).objective, rel=1e-9)

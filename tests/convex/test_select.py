@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.select import SELECTORS, disagreement
-from rpim_opt.convex.select_curve import menger
+from rpim_opt.convex.select_curve import _points, menger
 from rpim_opt.convex.select_held_out import _held_out, held_out_error
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.problem.linear import LinearModel
@@ -156,6 +156,19 @@ def test_a_corner_at_an_edge_is_none(best: int, said: str, monkeypatch: pytest.M
     )
     none = ro.l_curve(PROGRAM)
     assert (none.weight, none.interior) == (grid[0], False)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corner_sought_in_large_steps_is_that_of_the_whole_grid(seed: int) -> None:
+    """Of a smooth loss some of the weights are solved at, all of them about the corner."""
+    program = ro.convex.pose(ro.robust, simulated(configurations=30, noise=1e-4, seed=seed)[0].linearize(np.zeros(34)))
+    weights = weight_grid(program, 60)
+    score = menger(_points(program.path(weights)))
+    found = ro.l_curve(program)
+    assert found.weight == weights[np.argmax(score)]
+    assert found.score.max() == pytest.approx(score.max(), rel=1e-3)
+    assert len(found.weights) < 40
+    assert set(found.weights) <= set(weights)
 
 
 def test_curvature_of_a_small_circle_and_of_a_point() -> None:

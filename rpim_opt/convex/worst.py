@@ -1,0 +1,187 @@
+"""Minima of the largest of many norms with a squared penalty: sequential quadratic programs, ended by a duality gap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.epigraph import Epigraph, Least
+from rpim_opt.convex.largest import Largest
+from rpim_opt.convex.whitened import Ended, Kinked, Whitened
+
+SOUGHT = 1e-12
+"""Duality gap, relative to the objective, at which the method ends."""
+MOST, CHANGES = 40, 1000
+"""Quadratic programs, and changes of the set in each, after which another method is asked."""
+FLAT = 1e-10
+"""Curvature that unknowns without penalty have at least, where the data have about one."""
+HALVES = 12
+"""How often a step is halved at most."""
+SOON = 10
+"""Quadratic programs after which a neighbour was too far to begin with."""
+NEAR = 1e-2
+"""Gaps below this part of the objective tell whether a step was good; larger ones do not."""
+VAIN = 3
+"""Programs that lower the gap no more, after which a good one is taken."""
+FALL = 0.1
+"""Part of what the quadratic program promises that a step has to keep, or its gap is this much smaller."""
+
+
+class Point(NamedTuple):
+    """Where the method is: z (n,), coordinates a (p,), residual (m,), shares (N,), the gap and what belongs to it."""
+
+    z: Array
+    a: Array
+    r: Array
+    shares: Array
+    ended: Ended
+
+
+class Bounds(NamedTuple):
+    """Finite bounds: of which components (j,), at what (j,), and rows by steps (j, p) that point outwards."""
+
+    of: np.ndarray
+    at: Array
+    rows: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Worst(Whitened):
+    """minimize  max_k (a_k |r_k| + c_k) + weight |L z - c|^2  in a box, of residuals r = A z - b in groups.
+
+    The groups' numbers are linearized, with the second derivatives of those that have a share (a multiplier: the
+    shares of all add up to one), and `Epigraph` solves that. Few groups have one: at most one more than unknowns. The
+    shares are the subgradient whose gap ends the method, and that of a neighbour is where it begins.
+
+    Parameters
+    ----------
+    loss
+        Whose groups.
+    at, weight, box
+        As for `Whitened`.
+    """
+
+    loss: Largest
+
+    def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
+        """Return the minimum, or the best point that was met, begun at z (n,) with the shares of a neighbour."""
+        z, a = self.placed(z)
+        r = self.at.rows @ a - self.at.b
+        count = len(self.loss.a)
+        shares = np.full(count, 1.0 / count)
+        if kinked is not None and kinked.multipliers:
+            shares = kinked.multipliers[0]
+        point = self._point(z, a, r, shares, 0)
+        best = point.ended
+        vain = 0
+        most = MOST if kinked is None else SOON
+        for steps in range(1, most + 1):
+            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+                break
+            ahead = self._next(point, steps)
+            if ahead is None:
+                break
+            point = ahead
+            vain += 1
+            if point.ended.gap < best.gap:
+                best = point.ended
+                vain = 0
+        return best
+
+    def _point(self, z: Array, a: Array, r: Array, shares: Array, steps: int) -> Point:
+        of_loss = self.loss.slope(r, shares)
+        loss = self.loss.at(r)
+        gap, by_z = self.bound(z, a, self.slope(a, of_loss))
+        gap += max(loss - self.loss.minorant(r, shares, of_loss), 0.0)
+        objective = loss + float(self.pull @ a**2)
+        return Point(z, a, r, shares, Ended(z, gap, objective, loss, steps, Kinked([shares], 1.0), by_z, of_loss))
+
+    def _next(self, point: Point, steps: int) -> Point | None:
+        """Return the point after a quadratic program; None where that leads nowhere."""
+        least = self._step(point)
+        if least is None:
+            return None
+        whole = self._moved(point, least, 1.0, steps)
+        promised = point.ended.objective - least.t - float(self.pull @ (point.a + self.unit * least.d) ** 2)
+        near = NEAR * abs(point.ended.objective)
+        if whole.ended.gap <= (1 - FALL) * point.ended.gap and whole.ended.gap <= near:
+            return whole
+        t = 1.0
+        ahead = whole
+        if point.ended.objective - ahead.ended.objective < FALL * promised:
+            bent = self._moved(point, self._bent(least, whole), 1.0, steps)
+            if point.ended.objective - bent.ended.objective >= FALL * promised:
+                return bent
+        for _ in range(HALVES):
+            if point.ended.objective - ahead.ended.objective >= FALL * t * promised:
+                return ahead
+            t /= 2
+            ahead = self._moved(point, least, t, steps)
+        return None
+
+    def _bent(self, least: Least, whole: Point) -> Least:
+        """Return the step that makes equal, after the curved norms, what the straight ones made equal."""
+        values = self.loss.values(whole.r)
+        groups = least.active < len(values)
+        excess = np.zeros(len(groups))
+        excess[groups] = values[least.active[groups]] - least.t
+        return least._replace(d=least.d + least.bend @ excess)
+
+    def _moved(self, point: Point, least: Least, t: float, steps: int) -> Point:
+        """Return the point after part of a step, with the shares that belong to all of it."""
+        count = len(self.loss.a)
+        a = point.a + t * self.unit * least.d
+        r = self.at.rows @ a - self.at.b
+        z = self.at.offset + self.at.B @ a
+        if self.box is not None:
+            z = np.clip(z, *self.box)
+            held = np.flatnonzero(least.shares[count:])
+            if t == 1.0:  # free of rounding
+                z[self._bounds.of[held]] = self._bounds.at[held]
+        return self._point(z, a, r, least.shares[:count], steps)
+
+    def _step(self, point: Point) -> Least | None:
+        loss = self.loss
+        directions = loss.directions(point.r)
+        G = np.add.reduceat(directions[:, None] * self.at.rows, loss.begin) * self.unit
+        values = loss.values(point.r)
+        H = self._hessian(point, directions)
+        g = 2 * self.unit * self.pull * point.a
+        start = np.flatnonzero(point.shares)
+        s = np.ones(len(values))
+        if self.box is not None:
+            room = np.abs(self._bounds.at - point.z[self._bounds.of])
+            start = np.append(start, len(s) + np.flatnonzero(room == 0))
+            values, s = np.append(values, -room), np.append(s, np.zeros(len(room)))
+            G = np.vstack([G, self._bounds.rows])
+        return Epigraph(H, g, values, G, s).minimum(start, CHANGES)
+
+    @cached_property
+    def _bounds(self) -> Bounds:
+        lower, upper = self.box or (np.empty(0), np.empty(0))
+        low, high = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
+        by_step = self.at.B * self.unit
+        rows = np.vstack([-by_step[low], by_step[high]])
+        return Bounds(np.append(low, high), np.append(lower[low], upper[high]), rows)
+
+    def _hessian(self, point: Point, directions: Array) -> Array:
+        """Return the second derivative (p, p) of the shares' mean and the penalty, by coordinates in their units."""
+        heard, factor = self.loss.curvature(point.r, point.shares)
+        H = np.zeros((len(self.unit), len(self.unit)))
+        if len(heard):
+            places = np.flatnonzero(point.shares[self.loss.which])
+            rows = self.at.rows[places] * self.unit
+            sizes = self.loss.sizes[heard]
+            first = np.cumsum(sizes) - sizes
+            which = np.repeat(np.arange(len(heard)), sizes)
+            along = directions[places] / self.loss.a[self.loss.which[places]]
+            across = np.add.reduceat(along[:, None] * rows, first)
+            H = rows.T @ (factor[which][:, None] * rows) - across.T @ (factor[:, None] * across)
+        flat = np.zeros(len(H))
+        flat[self.pull == 0] = FLAT
+        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + flat
+        return H
