@@ -25,7 +25,7 @@ from rpim_opt.store.named import problems_folder
 from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF
 from tests.fuzz.trial import Failure, failure, limited
 
-LONGEST = 30.0
+LONGEST = 120.0
 """Seconds that a command may take that was given a problem it can solve, on a machine that does other things, too."""
 CODES = (0, 1, 2, 3)
 STUDY = """QUESTION = "Does it run?"
