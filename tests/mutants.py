@@ -1,4 +1,4 @@
-"""Mutation score of the numerical core: ``python3 dev.py mutants [COUNT] [FOLDER]``.
+"""Mutation score of the numerical core: ``python3 dev.py mutants [COUNT] [FOLDER] [FILE...]``.
 
 First the tests run once, and what functions each calls is written down (``FOLDER/calls.json``; a file that is there is
 used). Then mutants are drawn at random, one change each in the code of the core; the tests that call the changed
@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, NamedTuple
@@ -152,9 +152,9 @@ def _with(tree: ast.Module, node: ast.AST, other: ast.AST) -> str:
     return ast.unparse(ast.fix_missing_locations(Put().visit(twin)))
 
 
-def drawn(count: int, seed: int = 19) -> list[Mutant]:
-    """Draw mutants at random, each place of the core as likely."""
-    known = [(file, i) for file in CORE for i, _ in enumerate(list(places(_tree(file))))]
+def drawn(count: int, files: Sequence[str] = CORE, seed: int = 19) -> list[Mutant]:
+    """Draw mutants at random, each place of the files as likely."""
+    known = [(file, i) for file in files for i, _ in enumerate(list(places(_tree(file))))]
     taken = random.Random(seed).sample(known, count)
     by_file: dict[str, list[Mutant]] = {file: mutants(file) for file in dict.fromkeys(file for file, _ in taken)}
     return [by_file[file][i] for file, i in taken]
@@ -232,6 +232,8 @@ def survives(mutant: Mutant, tests: list[str]) -> str:
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
+        if done and os.WIFSIGNALED(status):
+            return "timeout"
         if done:
             return "survives" if status == 0 else "killed"
         time.sleep(0.05)
@@ -290,7 +292,7 @@ def main(arguments: list[str]) -> int:
         __import__(name)
     results: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
-    for mutant in drawn(count):
+    for mutant in drawn(count, arguments[2:] or CORE):
         tests = chosen(mutant, calls)
         answer = survives(mutant, tests) if tests else "untested"
         counts[answer] += 1

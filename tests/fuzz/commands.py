@@ -29,6 +29,7 @@ LONGEST = 120.0
 """Seconds that a command may take that was given a problem it can solve, on a machine that does other things, too."""
 CODES = (0, 1, 2, 3)
 STUDY = """QUESTION = "Does it run?"
+METRICS = {}
 def cases(quick): return [{"seed": 1}, {"seed": 2}]
 def run(seed): return {"twice": 2.0 * seed}
 def report(rows):
