@@ -68,9 +68,9 @@ def notebooks(folder: str = "notebooks", *pages: str) -> int:
 def main(arguments: list[str]) -> int:
     """Carry out one command line."""
     what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check", "docs", "pictures", "notebooks"):
+    if what not in ("run", "test", "check", "docs", "pictures", "notebooks", "mutants"):
         print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
-        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures")
+        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures | mutants [COUNT] [FOLDER]")
         return 2
     if what == "notebooks":
         return notebooks(*rest)
@@ -84,6 +84,8 @@ def main(arguments: list[str]) -> int:
         return docs(*rest)
     if what == "pictures":
         return run("python", GALLERY / "pages.py")
+    if what == "mutants":
+        return run("python", "-m", "tests.mutants", *rest)
     failed = [name for name, command in CHECKS.items() if run(*command)]
     print(f"checks failed: {', '.join(failed)}" if failed else "all checks passed")
     return len(failed)

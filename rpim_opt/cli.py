@@ -43,6 +43,7 @@ class Commands(TyperGroup):
 app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+INTERRUPTED = 130
 ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 
@@ -668,14 +669,17 @@ def main() -> None:
 
 def _run() -> None:
     try:
-        sys.exit(app(standalone_mode=False))
+        code = app(standalone_mode=False)
+        if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
+            fail("Interrupted.", INTERRUPTED)
+        sys.exit(code)
     except USAGE as error:
         if "--json" not in sys.argv:
             error.show()
             sys.exit(error.exit_code)
         fail(error.format_message(), error.exit_code)
     except ABORT:
-        fail("Interrupted.", 130)
+        fail("Interrupted.", INTERRUPTED)
     except NoSolutionFound as error:
         fail(str(error), 3)
     except RpimError as error:

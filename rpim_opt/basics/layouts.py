@@ -357,7 +357,7 @@ def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
     >>> missing_rows({"x": ["1", "-"], "y": ["2", ""]}, ["x", "y"])
     [1]
     """
-    count = len(next(iter(columns.values())))
-    if not names:
+    if not names:  # nor columns, perhaps
         return []
+    count = len(columns[names[0]])
     return [i for i in range(count) if all(is_missing(str(columns[name][i])) for name in names)]

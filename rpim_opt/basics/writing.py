@@ -43,24 +43,74 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write several files as `write_bytes` does: none is touched before the bytes of all are on the disk."""
-    with ExitStack() as stack:
+    """Write several files as `write_bytes` does: all of them, or none.
+
+    None is touched before the bytes of all are on the disk; when one cannot be put in its place those before it, and
+    folders that were made for them, are taken back.
+    """
+    streams = {path: data for path, data in contents.items() if _is_stream(path)}
+    with undoing() as folders, ExitStack() as stack, undoing() as renames:
         made: dict[Path, Path] = {}
         for path, data in contents.items():
-            if _is_stream(path):
-                path.write_bytes(data)
+            if path in streams:
                 continue
             place = Path(os.path.realpath(path))
             if place.is_dir():
                 raise IsADirectoryError(21, "a folder is there", str(place))
-            place.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(place.parent, folders)
             folder = stack.enter_context(scratch_folder(place))
             made[place] = folder / "file"
             _write_through(made[place], data, place)
         for place, file in made.items():
+            if len(contents) > 1:
+                _keep_old(place, file, renames)
             file.replace(place)
+        for path, data in streams.items():
+            path.write_bytes(data)
         for folder in {place.parent for place in made}:
             _settle(folder)
+
+
+@contextmanager
+def undoing() -> Iterator[ExitStack]:
+    """Collect what takes steps back; it is carried out, the last first, only when what follows fails."""
+    with ExitStack() as steps:
+        yield steps
+        steps.pop_all()
+
+
+def make_folder(folder: Path, steps: ExitStack) -> None:
+    """Make a folder and those above it; the steps take them back while nothing is in them."""
+    if folder.is_dir():
+        return
+    make_folder(folder.parent, steps)
+    with suppress(FileExistsError):  # somebody else just made it
+        folder.mkdir()
+        steps.callback(_remove_empty, folder)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _keep_old(place: Path, file: Path, steps: ExitStack) -> None:
+    """Keep what is at a place beside the file that replaces it, for the case that a later one cannot be replaced."""
+    old = file.with_name("old")
+    try:
+        os.link(place, old)
+    except FileNotFoundError:
+        steps.callback(_take_away, place, file)
+        return
+    except OSError:  # a file system without links
+        shutil.copy2(place, old)
+    steps.callback(old.replace, place)
+
+
+def _take_away(place: Path, file: Path) -> None:
+    """Remove a file that was put where none was."""
+    if not file.exists():
+        place.unlink(missing_ok=True)
 
 
 def _is_stream(path: Path) -> bool:

@@ -8,6 +8,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.selection import Selection, least_between, weight_grid
 
+SLOWEST = 1e-200
+"""Squared speed below which a curve stands still."""
 TINY = np.finfo(float).tiny
 """Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
 SHARP = 0.5
@@ -142,8 +144,9 @@ def _curvature(program: Program, weights: Array) -> Array:
     v1 = eta1 / eta / 2
     u2 = rho2 / rho / 2 - 2 * u1**2
     v2 = eta2 / eta / 2 - 2 * v1**2
-    speed = np.maximum(u1**2 + v1**2, TINY)
-    return (u1 * v2 - v1 * u2) / speed**1.5
+    speed = u1**2 + v1**2
+    # a curve that stands still, of data that the nominal robot fits exactly, has none
+    return np.divide(u1 * v2 - v1 * u2, speed**1.5, out=np.zeros_like(speed), where=speed > SLOWEST)
 
 
 def menger(points: Array) -> Array:

@@ -99,6 +99,8 @@ def by_solver(
                 installed = ", ".join(cp.installed_solvers())
                 raise InputError("solver", f"'{solver}'", f"one that is installed: {installed}") from None
             return Found(f"an error of {solver}: {error}")
+        except (ValueError, ArithmeticError, RuntimeError) as error:  # solvers have errors of their own
+            return Found(f"an error of {solver}: {error}")
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
         return Found(problem.status)
     point = np.array(z.value)

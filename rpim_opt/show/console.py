@@ -31,13 +31,15 @@ def _say(text: str, stream: TextIO) -> None:
 
 @contextmanager
 def arriving() -> Iterator[None]:
-    """End quietly when nobody reads any more, and with a sentence when what is printed cannot be written."""
+    """End quietly when nobody reads any more, and with a sentence for what the system refuses."""
     try:
         yield
     except BrokenPipeError:
         _close(sys.stdout)
         sys.exit(1)
     except OSError as error:
+        if error.filename is not None:  # a name that is too long, a folder that nobody may look into
+            fail(f"{error.filename}: {error.strerror}.", 2)
         _close(sys.stdout)
         fail(f"The output cannot be written: {error}.", 2)
 

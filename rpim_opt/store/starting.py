@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import read_text
 from rpim_opt.basics.tables import Columns, csv_text
-from rpim_opt.basics.writing import scratch_folder, write_text
+from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.naming import TOUCHED
@@ -161,8 +162,9 @@ def _require_new(folder: Path, validation: str | Path | None, hold_out: float | 
 
 def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Source, arm: Described) -> None:
     """Make the folder beside its place, and move it there when it is whole."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with scratch_folder(folder) as scratch:
+    with undoing() as parents, ExitStack() as stack:
+        make_folder(folder.parent, parents)
+        scratch = stack.enter_context(scratch_folder(folder))
         made = scratch / folder.name
         write_text(made / "problem.toml", text)
         for name, each in tables.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import ExitStack
 from typing import Any
 
@@ -60,7 +60,7 @@ def _done(key: str, work: Callable[[], dict[str, Any]]) -> tuple[str, dict[str, 
 
 def _on_cluster(tasks: Sequence[Task], scheduler: Any) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
-        from distributed import Client, as_completed
+        from distributed import Client, KilledWorker, as_completed
     except ImportError:
         raise InputError("scheduler", "no package distributed", "pip install 'rpim-opt[studies]'") from None
     with ExitStack() as stack:
@@ -73,8 +73,15 @@ def _on_cluster(tasks: Sequence[Task], scheduler: Any) -> Iterator[tuple[str, di
         if not isinstance(client, Client):
             raise InputError("scheduler", f"a {type(client).__name__}", "the address of a Dask scheduler, or a client")
         futures = [client.submit(_done, *task, pure=False) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except (KilledWorker, CancelledError) as error:  # whoever computes it dies, or the scheduler has
+            raise RpimError(f"Dask gave a replicate up: {_first_line(error)} What was finished is kept.") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _in_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:

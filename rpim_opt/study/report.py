@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import json_text
+from rpim_opt.basics.files import json_text, read_json
 from rpim_opt.basics.writing import refused, write_files
 from rpim_opt.study.grid import find_study, load_study, name_of
 
@@ -92,7 +91,7 @@ def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> 
     path = file.parent / "baselines.json"
     known: dict[str, dict[str, float]] = {}
     if path.is_file():
-        known = json.loads(path.read_text(encoding="utf-8"))
+        known = read_json(path)
     label = f"{name_of(file)}-quick" if quick else name_of(file)
     if label not in known:
         raise InputError("baseline", f"none for '{label}'", choices(label, known), path)

@@ -21,6 +21,8 @@ from rpim_opt.use.cell import Cell
 from rpim_opt.use.compensated import Compensation
 from rpim_opt.use.targets import Targets, checked, read_targets
 
+SMALLEST = 1e-12
+"""Correction [rad or m] below which nothing is corrected."""
 BLOCK = 8192
 """Rows that are worked on together, so that what they need stays in the processor's cache."""
 
@@ -118,8 +120,8 @@ def compensate(
         raise InputError("robot", f"'{robot}'", choices(robot, arms))
     arm = arms[robot]
     targets = checked(arm, Targets(tuple(label), q, poses, torque), orientation)
-    if not largest > 0:
-        raise InputError("largest", f"{largest}", "a correction greater than zero")
+    if not largest >= SMALLEST:
+        raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
     turned = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
     kind = pose if turned else position
     gravity = arm.gravity

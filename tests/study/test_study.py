@@ -14,7 +14,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import RpimError
 from rpim_opt.study import grid, provenance, report
+from rpim_opt.study.computing import computed
 from rpim_opt.study.runner import run_study
 from tests.test_cli import run
 
@@ -245,6 +247,44 @@ def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeyp
     assert values(tmp_path / "there") == values(tmp_path / "here")
     assert len(values(tmp_path / "there")) == 1000
     assert there.metrics == here.metrics
+
+
+def dies() -> dict[str, float]:
+    os._exit(3)
+
+
+def gives_up(*_: object) -> None:
+    from distributed.client import FutureCancelledError
+
+    raise FutureCancelledError("replicate", "scheduler-connection-lost")
+
+
+@pytest.fixture
+def cluster():
+    """Yield a cluster of one process that is given up when it dies."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports, event loops and the worker that dies
+        import dask
+        from distributed import LocalCluster
+
+        strict = dask.config.set({"distributed.scheduler.allowed-failures": 0})
+        with strict, LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as made:
+            yield made
+
+
+@pytest.mark.slow
+def test_what_ends_every_worker_of_a_cluster_is_a_sentence(cluster) -> None:
+    with pytest.raises(RpimError, match=r"Dask gave a replicate up: .* What was finished is kept"):
+        list(computed([("a", dies)], 1, cluster.scheduler_address))
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_is_a_sentence(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    from distributed import Future
+
+    monkeypatch.setattr(Future, "result", gives_up)
+    with pytest.raises(RpimError, match=r"Dask gave a replicate up: .*connection-lost"):
+        list(computed([("a", dict)], 1, cluster.scheduler_address))
 
 
 def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:

@@ -1,0 +1,315 @@
+"""Mutation score of the numerical core: ``python3 dev.py mutants [COUNT] [FOLDER] [FILE...]``.
+
+First the tests run once, and what functions each calls is written down (``FOLDER/calls.json``; a file that is there is
+used). Then mutants are drawn at random, one change each in the code of the core; the tests that call the changed
+function run, the quickest first, until one fails. Those that no test fails for are listed: ``FOLDER/mutants.json``.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import importlib.abc
+import importlib.machinery
+import json
+import os
+import random
+import resource
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+CORE = [
+    "convex/active_set.py", "convex/asked.py", "convex/atoms.py", "convex/by_rows.py", "convex/closed.py",
+    "convex/conic.py", "convex/constraints.py", "convex/coordinates.py", "convex/evidence.py", "convex/faces.py",
+    "convex/feasible.py", "convex/gap.py", "convex/groups.py", "convex/interior.py", "convex/kinks.py",
+    "convex/left_out.py", "convex/line_search.py", "convex/majorize.py", "convex/newton.py", "convex/newton_step.py",
+    "convex/objective.py", "convex/posterior.py", "convex/program.py", "convex/quadratic.py", "convex/rows.py",
+    "convex/select_curve.py", "convex/select_linear.py", "convex/select_scores.py", "convex/separated.py",
+    "convex/structure.py", "convex/tree.py", "convex/trust.py", "problem/linear.py", "problem/misfit.py",
+    "problem/moments.py", "problem/rotations.py", "problem/frames.py", "problem/loads.py", "robot/mdh.py",
+    "robot/kinematics.py", "robot/chain.py", "robot/deflection.py", "robot/gravity.py", "robot/parameters.py",
+    "calibration/intervals.py", "calibration/uncertainty.py", "calibration/spread.py", "calibration/loop.py",
+]  # fmt: skip
+TESTS = ["tests/convex", "tests/robot", "tests/problem", "tests/calibration", "tests/use", "tests/test_hostile.py"]
+SECONDS = 40.0
+"""Of tests (as long as they took once) that are run for a mutant."""
+PATIENCE = 10 * SECONDS
+THIRD = ("numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.linalg", "scipy.stats", "cvxpy", "clarabel", "casadi",
+         "pydantic", "pytest", "_pytest.assertion.rewrite", "threadpoolctl")  # fmt: skip
+"""What every test imports: once, before the mutants part."""
+COMPARED = {
+    ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.GtE), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.LtE),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,),
+}  # fmt: skip
+COMPUTED = {
+    ast.Add: (ast.Sub,), ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.Pow: (ast.Mult,),
+    ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,),
+}  # fmt: skip
+NAMES = {"minimum": "maximum", "maximum": "minimum", "min": "max", "max": "min", "argmin": "argmax", "argmax": "argmin",
+         "any": "all", "all": "any", "zeros": "ones", "ones": "zeros"}  # fmt: skip
+PROSE = {"__str__", "__repr__", "_repr_html_", "_short", "content"}
+"""Functions whose words are no numerics."""
+
+
+class Mutant(NamedTuple):
+    """One change of one file."""
+
+    file: str
+    line: int
+    function: str
+    before: str
+    after: str
+    source: str
+
+
+def places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, ast.AST]]:
+    """Yield nodes that can be changed, with the functions they stand in and what may replace them."""
+    yield from _within(tree, "")
+
+
+def _within(node: ast.AST, function: str) -> Iterator[tuple[ast.AST, str, ast.AST]]:
+    if isinstance(node, ast.FunctionDef):
+        if node.name in PROSE:
+            return
+        function = node.name
+        parts: list[ast.AST] = [*node.body, *node.args.defaults, *(d for d in node.args.kw_defaults if d)]
+    elif isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr):
+        return
+    elif isinstance(node, ast.AnnAssign):
+        parts = [node.value] if node.value else []
+    elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return
+    else:
+        parts = list(ast.iter_child_nodes(node))
+    for other in _others(node):
+        yield node, function, other
+    for part in parts:
+        yield from _within(part, function)
+
+
+def _others(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield what could stand in the place of a node."""
+    changed = copy.deepcopy(node)
+    if isinstance(changed, ast.Compare) and len(changed.ops) == 1:
+        for kind in COMPARED.get(type(changed.ops[0]), ()):
+            yield ast.Compare(changed.left, [kind()], changed.comparators)
+    elif isinstance(changed, ast.BinOp):
+        for kind in COMPUTED.get(type(changed.op), ()):
+            yield ast.BinOp(changed.left, kind(), changed.right)
+    elif isinstance(changed, ast.BoolOp):
+        other = ast.And() if isinstance(changed.op, ast.Or) else ast.Or()
+        yield ast.BoolOp(other, changed.values)
+    elif isinstance(changed, ast.UnaryOp) and isinstance(changed.op, ast.USub | ast.Not | ast.Invert):
+        yield changed.operand
+    elif isinstance(changed, ast.If | ast.While):
+        changed.test = ast.UnaryOp(ast.Not(), changed.test)
+        yield changed
+    elif isinstance(changed, ast.AugAssign):
+        yield ast.Pass()
+    elif isinstance(changed, ast.Constant) and type(changed.value) in (int, float):
+        yield ast.Constant(
+            changed.value + 1 if type(changed.value) is int else 2 * changed.value + (changed.value == 0)
+        )
+    elif isinstance(changed, ast.Attribute) and changed.attr in NAMES:
+        changed.attr = NAMES[changed.attr]
+        yield changed
+    elif isinstance(changed, ast.Name) and changed.id in NAMES:
+        changed.id = NAMES[changed.id]
+        yield changed
+
+
+def mutants(file: str) -> list[Mutant]:
+    """Return every mutant of a file of the core."""
+    text = (ROOT / "rpim_opt" / file).read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    made = []
+    for node, function, other in places(tree):
+        line = getattr(node, "lineno", 0)
+        before = text.splitlines()[line - 1].strip()
+        ast.copy_location(other, node)
+        source = _with(tree, node, other)
+        after = ast.unparse(ast.fix_missing_locations(other)).split("\n")[0]
+        made.append(Mutant(file, line, function, before, after, source))
+    return made
+
+
+def _with(tree: ast.Module, node: ast.AST, other: ast.AST) -> str:
+    class Put(ast.NodeTransformer):
+        def visit(self, each: ast.AST) -> Any:
+            return other if each is node else self.generic_visit(each)
+
+    number = next(i for i, each in enumerate(ast.walk(tree)) if each is node)
+    twin = copy.deepcopy(tree)
+    node = list(ast.walk(twin))[number]
+    return ast.unparse(ast.fix_missing_locations(Put().visit(twin)))
+
+
+def drawn(count: int, files: Sequence[str] = CORE, seed: int = 19) -> list[Mutant]:
+    """Draw mutants at random, each place of the files as likely."""
+    known = [(file, i) for file in files for i, _ in enumerate(list(places(_tree(file))))]
+    taken = random.Random(seed).sample(known, count)
+    by_file: dict[str, list[Mutant]] = {file: mutants(file) for file in dict.fromkeys(file for file, _ in taken)}
+    return [by_file[file][i] for file, i in taken]
+
+
+def _tree(file: str) -> ast.Module:
+    return ast.parse((ROOT / "rpim_opt" / file).read_text(encoding="utf-8"))
+
+
+class Calls:
+    """A plugin of pytest that writes down what functions of the package each test calls."""
+
+    def __init__(self, target: Path):
+        self.target = target
+        self.found: dict[str, dict[str, Any]] = {}
+        self.codes: set[CodeType] = set()
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        entry = self.found.setdefault(report.nodeid, {"seconds": 0.0, "calls": []})
+        entry["seconds"] += report.duration
+
+    def pytest_runtest_protocol(self, item: Any) -> None:
+        self.codes = set()
+        self.item = item.nodeid
+        sys.settrace(self._call)
+        threading.settrace(self._call)
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        sys.settrace(None)
+        calls = {f"{code.co_filename.split('rpim_opt/')[-1]}:{code.co_name}" for code in self.codes}
+        self.found[nodeid]["calls"] = sorted(calls)
+
+    def pytest_sessionfinish(self) -> None:
+        known = json.loads(self.target.read_text()) if self.target.exists() else {}
+        self.target.write_text(json.dumps(known | self.found))
+
+    def _call(self, frame: FrameType, event: str, argument: Any) -> None:
+        if "/rpim_opt/" in frame.f_code.co_filename:
+            self.codes.add(frame.f_code)
+
+
+def pytest_configure(config: Any) -> None:
+    """Take part where a place for the calls is named."""
+    target = os.environ.get("MUTANTS_CALLS")
+    if target:
+        config.pluginmanager.register(Calls(Path(target)))
+
+
+class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports one module from another source."""
+
+    def __init__(self, mutant: Mutant):
+        self.name = "rpim_opt." + mutant.file.removesuffix(".py").replace("/", ".")
+        self.file = str(ROOT / "rpim_opt" / mutant.file)
+        self.source = mutant.source
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
+        if fullname != self.name:
+            return None
+        return importlib.machinery.ModuleSpec(fullname, self, origin=self.file)
+
+    def create_module(self, spec: Any) -> None:
+        return None
+
+    def exec_module(self, module: Any) -> None:
+        module.__file__ = self.file
+        exec(compile(self.source, self.file, "exec"), module.__dict__)
+
+
+def survives(mutant: Mutant, tests: list[str]) -> str:
+    """Return ``survives``, ``killed``, or ``timeout``: tests of a mutant in a process of its own."""
+    child = os.fork()
+    if not child:
+        _test(mutant, tests)
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done and os.WIFSIGNALED(status):
+            return "timeout"
+        if done:
+            return "survives" if os.WEXITSTATUS(status) == 0 else "killed"
+        time.sleep(0.05)
+    os.kill(child, 9)
+    os.waitpid(child, 0)
+    return "timeout"
+
+
+def _test(mutant: Mutant, tests: list[str]) -> None:
+    import pytest
+
+    resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nothing, stream)
+    sys.meta_path.insert(0, Loader(mutant))
+    code = 1
+    try:
+        code = int(pytest.main(["-x", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]))
+    finally:
+        os._exit(code)
+
+
+def chosen(mutant: Mutant, calls: dict[str, Any]) -> list[str]:
+    """Return the tests that call the changed function, or for what is in none any of its module's; quickest first."""
+    place = f"{mutant.file}:{mutant.function}" if mutant.function else f"{mutant.file}:"
+    fitting = [
+        (entry["seconds"], test)
+        for test, entry in calls.items()
+        if any(call == place or (not mutant.function and call.startswith(place)) for call in entry["calls"])
+    ]
+    taken = []
+    total = 0.0
+    for seconds, test in sorted(fitting):
+        total += seconds
+        if taken and total > SECONDS:
+            break
+        taken.append(test)
+    return taken
+
+
+def main(arguments: list[str]) -> int:
+    """Draw mutants, run their tests, and say how many were found."""
+    count = int(arguments[0]) if arguments else 300
+    folder = Path(arguments[1]) if len(arguments) > 1 else ROOT / "mutants"
+    folder.mkdir(parents=True, exist_ok=True)
+    calls_file = folder / "calls.json"
+    os.chdir(ROOT)
+    sys.path.insert(0, str(ROOT))
+    if not calls_file.exists():
+        environment = {**os.environ, "MUTANTS_CALLS": str(calls_file.resolve())}
+        command = [sys.executable, "-m", "pytest", "-p", "tests.mutants", "-p", "no:xdist", *TESTS]
+        subprocess.run(command, env=environment, check=True)
+    calls = json.loads(calls_file.read_text())
+    for name in THIRD:
+        __import__(name)
+    mutants_drawn = drawn(count, arguments[2:] or CORE)
+    first = next(mutant for mutant in mutants_drawn if chosen(mutant, calls))
+    unchanged = first._replace(source=(ROOT / "rpim_opt" / first.file).read_text(encoding="utf-8"))
+    if survives(unchanged, chosen(first, calls)) != "survives":
+        print("the tests fail without a change, too")
+        return 2
+    results: list[dict[str, Any]] = []
+    counts: Counter[str] = Counter()
+    for mutant in mutants_drawn:
+        tests = chosen(mutant, calls)
+        answer = survives(mutant, tests) if tests else "untested"
+        counts[answer] += 1
+        results.append({**mutant._asdict(), "source": "", "answer": answer, "tests": len(tests)})
+        (folder / "mutants.json").write_text(json.dumps(results, indent=1))
+        if answer in ("survives", "untested"):
+            print(f"{answer}: {mutant.file}:{mutant.line}: {mutant.before}  ->  {mutant.after}", flush=True)
+    found = counts["killed"] + counts["timeout"]
+    print(f"{found} of {count} mutants are found ({found / count:.1%}); {dict(counts)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
