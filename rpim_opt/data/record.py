@@ -7,10 +7,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from typing import NamedTuple
 
 from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
+
+
+class Earlier(NamedTuple):
+    """The calibration that another one carries on, and how.
+
+    Its title, when it was made, the digest of its file and its number of rows; the factor on its standard deviations;
+    parameters that were let go, and rows of the new data that were left out.
+    """
+
+    title: str
+    made: str
+    digest: str
+    rows: int
+    inflate: float = 1.0
+    let_go: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +50,10 @@ class Record:
         When, UTC (ISO 8601).
     versions
         Of the packages that made it, by name.
+    earlier
+        The calibrations that this one carries on (`use.update`), the last one last.
+    digest
+        Of the file that it was read from; empty where there is none.
 
     Examples
     --------
@@ -50,6 +71,8 @@ class Record:
     simulated: bool = False
     made: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
+    earlier: tuple[Earlier, ...] = ()
+    digest: str = ""
 
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""

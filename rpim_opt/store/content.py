@@ -141,4 +141,14 @@ def _record(record: Record) -> dict[str, Any]:
         "simulated": record.simulated,
         "made": record.made,
         "versions": dict(record.versions),
+        **_earlier(record),
     }
+
+
+def _earlier(record: Record) -> dict[str, Any]:
+    """Return what a calibration carries on; nothing of one that starts from a drawing, as files always were."""
+    if not record.earlier:
+        return {}
+    parts = [each._asdict() for each in record.earlier]
+    listed = [{**part, "let_go": list(part["let_go"]), "left_out": list(part["left_out"])} for part in parts]
+    return {"earlier": listed}

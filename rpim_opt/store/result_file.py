@@ -25,7 +25,7 @@ from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import READY, Measurement
-from rpim_opt.data.record import Record
+from rpim_opt.data.record import Earlier, Record
 from rpim_opt.problem.frames import own_frames
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
@@ -36,7 +36,7 @@ from rpim_opt.store.content import content, derived, digest, sets
 from rpim_opt.store.definition import formulation_of, quadratic_of
 from rpim_opt.store.learned_parts import learned_of, scatter_of
 from rpim_opt.store.parts import data_of, parameters_of, robots_of, selection_of
-from rpim_opt.store.schema import FORMAT, VERSION, File, RowPart
+from rpim_opt.store.schema import FORMAT, VERSION, EarlierPart, File, RowPart
 
 Models = Model | Mapping[str, Model]
 AGREEMENT_MM = 1e-6
@@ -201,7 +201,7 @@ def _certificate(file: File) -> Certificate:
 
 def _rule(file: File) -> float | Selector | None:
     """Return the selector that chose the weight, where it is a ready one, and otherwise the weight; None: learned."""
-    if file.learned is not None:
+    if file.learned is not None and not file.record.earlier:
         return None
     if file.selection is None:
         return file.weight
@@ -210,7 +210,7 @@ def _rule(file: File) -> float | Selector | None:
 
 def _model(file: File) -> str:
     """Return whether families were compared."""
-    if file.learned is not None and file.learned.trials:
+    if file.learned is not None and file.learned.trials and not file.record.earlier:
         return "auto"
     return "geometry"
 
@@ -230,7 +230,14 @@ def _record(file: File, problem: CalibrationProblem, known: Mapping[str, Measure
         stated.simulated,
         stated.made,
         stated.versions,
+        tuple(_earlier(each) for each in stated.earlier),
+        file.digest,
     )
+
+
+def _earlier(part: EarlierPart) -> Earlier:
+    lists = {"let_go": tuple(part.let_go), "left_out": tuple(part.left_out)}
+    return Earlier(part.title, part.made, part.digest, part.rows, part.inflate, **lists)
 
 
 def _validation(file: File, problem: CalibrationProblem, known: Mapping[str, Measurement]) -> Dataset | None:

@@ -181,6 +181,18 @@ class PricePart(Part):
     misfit: float
 
 
+class EarlierPart(Part):
+    """A calibration that this one carries on."""
+
+    title: str
+    made: str
+    digest: str
+    rows: int
+    inflate: float
+    let_go: list[str]
+    left_out: list[str]
+
+
 class RecordPart(Part):
     """Where the measurements come from."""
 
@@ -190,6 +202,7 @@ class RecordPart(Part):
     simulated: bool
     made: str
     versions: dict[str, str]
+    earlier: list[EarlierPart] = Field(default_factory=list)
 
 
 class RowPart(Part):

@@ -8,3 +8,5 @@ from .targets import read_targets as read_targets
 from .validation import Validation as Validation
 from .validation import read_measurements as read_measurements
 from .validation import validate as validate
+from .updated import Update as Update
+from .updating import update as update
