@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -294,6 +295,73 @@ def validate(
         text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
     show(text + written_line(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
     if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def update(
+    result: Result,
+    data: Annotated[Path, typer.Argument(help="New measurements of the same robot, in the same instrument's frame.")],
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    inflate: Annotated[
+        float, typer.Option(help="Factor on the earlier standard deviations, where all may have drifted.")
+    ] = 1.0,
+    anew: Annotated[
+        str, typer.Option(help="Parameters that were set up anew: 'base_*' of another place of the instrument.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Folder for the new result.json.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Carry a result on with new measurements: it is their prior; say whether the robot changed, and what did.
+
+    Exit code 1 if nothing explains what they miss, or it did not converge.
+    """
+    with progress() as say:
+        from rpim_opt.basics.files import sha256_of
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.updating import update
+        from rpim_opt.use.validation import read_measurements
+
+        say("reading the result")
+        loaded = load_result(result)
+        rows, left_out = read_measurements(loaded, data, measurement, units)
+        found = update(loaded, rows, inflate=inflate, anew=anew.replace(",", " ").split(), progress=say)
+        updated = found.result
+        updated = replace(updated, record=replace(updated.record, files={data.name: sha256_of(data)}))
+    written = _saved(updated, out)
+    text = str(found) + left_out_line(left_out) + "".join(written_line(file) for file in written)
+    show(text, {**found.content(), "left_out": left_out, "written": written}, as_json)
+    if not (found.explained and updated.converged):
+        raise typer.Exit(1)
+
+
+@app.command()
+def monitor(
+    result: Result,
+    checks: Annotated[Path, typer.Argument(help="Check readings; a column time, timestamp or date orders them.")],
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The chart over time: .html, or its points as .csv.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Look for drift in check readings over time, each and together against the interval of a new reading.
+
+    Exit code 1 if the robot is not where its calibration says.
+    """
+    with progress() as say:
+        from rpim_opt.show.checks_page import written_checks
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.monitoring import monitor, read_checks
+
+        say("reading the result")
+        loaded = load_result(result)
+        read = read_checks(loaded, checks, measurement, units)
+        found = monitor(loaded, read.data, read.when, read.times)
+        written = written_checks(found, out, loaded.record.title)
+    text = str(found) + left_out_line(read.left_out) + "".join(written_line(file) for file in written)
+    show(text, {**found.content(), "left_out": read.left_out, "written": written}, as_json)
+    if found.drifts:
         raise typer.Exit(1)
 
 

@@ -10,3 +10,6 @@ from .validation import read_measurements as read_measurements
 from .validation import validate as validate
 from .updated import Update as Update
 from .updating import update as update
+from .monitored import Monitoring as Monitoring
+from .monitoring import monitor as monitor
+from .monitoring import read_checks as read_checks

@@ -91,7 +91,8 @@ class Missed:
         self.model = model
         self.L = prior.matrix / sigma
         self.freedom = max(freedom, 1.0)
-        B = np.vstack([model.A / sigma, self.L])
+        self.A = model.A / sigma
+        B = np.vstack([self.A, self.L])
         y = np.concatenate([model.b / sigma, prior.c / sigma])
         U, s, _ = np.linalg.svd(B, full_matrices=False)
         self.Q = U[:, s > RANK_TOLERANCE * s[0]]
@@ -114,6 +115,12 @@ class Missed:
         """Return the same of readings that are wrong."""
         D = np.zeros((len(self.e), len(index)))
         D[index, np.arange(len(index))] = 1.0
+        return self._moved(D)
+
+    def of_drift(self, index: Sequence[int], course: Array) -> tuple[Array, Array]:
+        """Return the same of parameters that move while readings are taken, by ``course`` (m,) of the whole change."""
+        D = np.zeros((len(self.e), len(index)))
+        D[: len(course)] = self.A[:, list(index)] * course[:, None]
         return self._moved(D)
 
     def _moved(self, D: Array) -> tuple[Array, Array]:

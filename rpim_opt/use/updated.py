@@ -136,7 +136,10 @@ class Update:
         if self.changes:
             lines.append(f"What is left: {_said(self.after)}.")
         if not self.explained:
-            lines.append("No change of one parameter, frame or reading explains the rest: calibrate anew.")
+            lines.append(
+                "No few changes of parameters, frames or readings explain the rest: is it the same robot? "
+                "If so, calibrate it anew."
+            )
         return lines
 
     def _causes(self) -> str:

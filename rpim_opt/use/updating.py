@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.constraints import matching
-from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.structure import identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Record
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.content import content
-from rpim_opt.use.changes import SIZES, Cause, Fit, Missed, Reading, most_believed, possible, weighed, widths
+from rpim_opt.use.carried import Carried
+from rpim_opt.use.changes import Cause, Fit, Reading, most_believed, possible, weighed
 from rpim_opt.use.updated import Moved, Update
 
-MOST = 8
-"""Changes that are looked for one after the other."""
+MOST = 4
+"""Changes of robot and frames that are looked for one after the other: of more it is another robot."""
+SPARED = 0.25
+"""Part of the readings that may be wrong."""
 STRANGE = 5.0
 """Readings that no change explains, and that miss by so many times the error before any calibration, are another's."""
-OPEN = SIZES[-1]
-"""Widths within which a parameter that changed may be: far enough that readings alone decide where they see it."""
 
 
 def update(
@@ -79,16 +73,16 @@ def update(
     (['position'], ())
     """
     say = progress or (lambda text: None)
-    asking = _Asking(result, inflate)
+    asking = Carried(result, inflate)
     problem = asking.problem(data)
     let_go = _named(problem, anew)
     say("comparing with the last calibration")
     # a frame that was set up anew may be anywhere: then the start is looked for
     found = asking.calibrated(problem, let_go, None if let_go else result.x)
-    causes, before = asking.asked(found, let_go)
+    causes, before = _asked(asking, found, let_go)
     first, after = causes, before
     changes: list[Cause] = []
-    while len(changes) < MOST and (cause := most_believed(causes)) is not None:
+    while (cause := most_believed(causes)) is not None and _may(changes, cause, len(data)):
         say(f"letting {cause.name} go")
         changes.append(cause)
         if cause.kind == "reading":
@@ -96,13 +90,21 @@ def update(
         else:
             let_go += cause.members
         found = asking.calibrated(problem, let_go, found.x)
-        causes, after = asking.asked(found, let_go)
+        causes, after = _asked(asking, found, let_go)
     if not after.likely:
         _require_this_robot(result, found, data)
     moved = tuple(_moved(result, found, name) for name in let_go)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = _record(result, inflate, let_go, left_out)
     return Update(replace(found, record=record), before, after, tuple(changes), first, moved, len(data))
+
+
+def _may(changes: Sequence[Cause], cause: Cause, readings: int) -> bool:
+    """Return whether one more change still leaves something of the robot, or of the readings."""
+    alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
+    if cause.kind == "reading":
+        return len(alike) < max(SPARED * readings, 1)
+    return len(alike) < MOST
 
 
 def _named(problem: CalibrationProblem, anew: Sequence[str]) -> tuple[str, ...]:
@@ -113,64 +115,13 @@ def _named(problem: CalibrationProblem, anew: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name, new in zip(free.names, named, strict=True) if new)
 
 
-@dataclass(frozen=True, eq=False)
-class _Asking:
-    """How one result is carried on: its posterior as a prior, its noise as it was learned."""
-
-    result: Calibration
-    inflate: float
-
-    def problem(self, data: Dataset) -> CalibrationProblem:
-        """Return the result's problem with other measurements."""
-        problem = self.result.problem
-        if not isinstance(problem, CalibrationProblem):
-            raise InputError("update", "a calibration of measurements in parts", "one of measurements in memory")
-        return problem.on(data)
-
-    @cached_property
-    def widths(self) -> Array:
-        """(n,) how large deviations were expected before any calibration [SI]."""
-        return widths(self.result)
-
-    def prior(self, problem: CalibrationProblem, let_go: Sequence[str]) -> Prior:
-        """Return what is known still; what was let go may be far from where it was."""
-        free = problem.parameters.free
-        centre = {}
-        scale = {}
-        for i in [free.names.index(name) for name in let_go]:
-            unit = next(u for u in accepted_units(free.dimensions[i]) if UNITS[u].si == 1.0)
-            centre[f"{free.names[i]}_{unit}"] = float(self.result.x[i])
-            scale[f"{free.names[i]}_{unit}"] = float(OPEN * self.widths[i])
-        released = Prior(centre=centre, scale=scale)
-        if len(let_go) == len(free):
-            return released
-        # in units of the declared noise, as the new readings are: weight 1 then joins both
-        return Prior.from_result(self.result, self.inflate, let_go, noise=1.0) & released
-
-    def formulation(self, problem: CalibrationProblem, let_go: Sequence[str]) -> Formulation:
-        """Return the result's loss and constraints with the prior as the penalty."""
-        prior = self.prior(problem, let_go)
-        plain = replace(self.result.formulation, penalty=SQUARES, penalty_over=None)
-        return prior.penalized(plain, prior.stated(problem.parameters, widened=False))
-
-    def calibrated(self, problem: CalibrationProblem, let_go: Sequence[str], start: Array | None) -> Calibration:
-        """Return the calibration; what was learned of sizes and noise stays."""
-        formulation = self.formulation(problem, let_go)
-        found = calibrate(problem, formulation, 1.0, start=start)
-        asked = partial(calibrate, formulation=formulation, weight=1.0)
-        learned = self.result.learned
-        if learned is not None:
-            learned = replace(learned, left_out=(), notes=())
-        return replace(found, learned=learned, asked=asked)
-
-    def asked(self, found: Calibration, let_go: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
-        """Return all causes with their evidence, and how well readings and prior fit without them."""
-        model = found.program.model
-        penalty = found.program.penalty_form or identity(len(found.x))
-        missed = Missed(model, penalty, self.result.noise_level, self.result.freedom)
-        free = found.problem.parameters.free
-        causes = possible(free, ~np.isin(free.names, let_go))
-        return weighed(missed, causes, self.widths / free.scale, _readings(found, model.group)), missed.fit
+def _asked(asking: Carried, found: Calibration, let_go: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
+    """Return all causes with their evidence, and how well readings and prior fit without them."""
+    model = found.program.model
+    missed = asking.missed(model, found.program.penalty_form or identity(len(found.x)))
+    free = found.problem.parameters.free
+    causes = possible(free, ~np.isin(free.names, let_go))
+    return weighed(missed, causes, asking.widths / free.scale, _readings(found, model.group)), missed.fit
 
 
 def _readings(found: Calibration, group: np.ndarray) -> list[Reading]:
