@@ -38,7 +38,9 @@ class Innovations:
     deviate: Array
 
 
-def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndarray) -> Innovations:
+def innovations(
+    result: Calibration, problem: CalibrationProblem, order: np.ndarray, rare: float = 0.0
+) -> Innovations:
     """Return what checks say one after the other, each after all before it.
 
     What is not known of the robot bends all predictions alike. A Kalman filter takes that away as checks show it, so
@@ -54,6 +56,8 @@ def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndar
         Its problem with the checks.
     order
         (N,) their rows in the order of time.
+    rare
+        A check less probable than this is beyond what a reading may be: nothing is learned from it.
 
     Raises
     ------
@@ -79,6 +83,8 @@ def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndar
         squares = float(e @ np.linalg.solve(S, e))
         sigmas[t] = np.sqrt(squares)
         chance[t] = fdtrc(len(r), freedom, squares / len(r))
+        if chance[t] < rare:
+            continue
         m = m + gain @ e
         C = C - gain @ S @ gain.T
     deviate = -np.asarray(ndtri(np.clip(chance, SMALLEST, 1 - SMALLEST)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,14 +72,14 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
             raise InputError("monitor, when", f"shape {np.shape(when)}", f"{count} finite times [s], one a check")
         order = np.argsort(when, kind="stable")
     carried = Carried(result)
-    problem = carried.problem(data)
-    found = innovations(result, problem, order)
-    sums = cumulative(found.deviate)
+    problem = carried.problem(replace(data, configuration=_visits(data, when)))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
-    freedom = max(result.freedom, 1.0)
-    allowed = np.sqrt(sizes * fdtri(sizes, freedom, 1 - RARE / TESTS / count))
+    rare = RARE / TESTS
+    allowed = np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - rare / count))
+    found = innovations(result, problem, order, rare / count)
+    sums = cumulative(found.deviate)
     return Monitoring(
         label=tuple(data.label[i] for i in order),
         times=tuple(times[i] for i in order) if times else (),
@@ -87,9 +88,18 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         sigmas=found.sigmas,
         allowed=allowed[order],
         sums=sums,
-        limit=limit(count, RARE / TESTS),
-        drift=likeliest(carried, problem, order, RARE / TESTS),
+        limit=limit(count, rare),
+        drift=likeliest(carried, problem, order, rare),
     )
+
+
+def _visits(data: Dataset, when: Array | None) -> np.ndarray:
+    """Return a number (N,) for every visit to a configuration: a place that is checked again and again is many."""
+    changed = np.diff(data.configuration, prepend=data.configuration[0]) != 0
+    visit = np.cumsum(changed)
+    if when is not None:
+        visit = np.unique(when, return_inverse=True)[1]
+    return np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
 
 
 def read_checks(result: Calibration, source: Any, measurement: str | None = None, units: str = "") -> Checks:
