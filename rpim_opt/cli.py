@@ -190,9 +190,10 @@ def calibrate(
             result = _calibrated(instance, select, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())
         without: list[str] = []
-        if refit and result.flagged:
+        if refit:
+            without = [flag.label for flag in result.flagged if flag.label not in result.kept_together]
+        if without:
             say("calibrating without the distrusted rows")
-            without = [flag.label for flag in result.flagged]
             result = result.without_flagged()
         found = summary(result, instance.published)
     text = describe(result, found)

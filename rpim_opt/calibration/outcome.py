@@ -13,6 +13,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.calibration import diagnosis
+from rpim_opt.calibration.blunders import coherent
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
 from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
@@ -584,6 +585,25 @@ class Outcome:
         """
         return diagnosis.flagged(self.problem, self.x)
 
+    @cached_property
+    def kept_together(self) -> tuple[str, ...]:
+        """Labels of flagged rows that err together with their neighbours in joint space or in time.
+
+        They are no blunders of their own: the model lacks something there, or the set-up moved. `without_flagged` keeps
+        them.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0).kept_together
+        ()
+        """
+        problem = self.problem
+        if not self.flagged or not isinstance(problem, CalibrationProblem):
+            return ()
+        index = {label: i for i, label in enumerate(problem.labels)}
+        rows = np.array([index[flag.label] for flag in self.flagged])
+        together = coherent(problem, self.x, rows)
+        return tuple(flag.label for flag, kept in zip(self.flagged, together, strict=True) if kept)
+
     @property
     def doubted(self) -> list[str]:
         """Labels of all rows that are not trusted: left out as blunders before the fit, and flagged after it."""
@@ -595,14 +615,17 @@ class Outcome:
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
 
+        Rows that are `kept_together` stay: without them the robot would be extrapolated where the model fails.
+
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
         >>> [len(result.problem.labels) - len(result.without_flagged().problem.labels), len(result.flagged)]
         [5, 5]
         """
-        kept = self.stated.without({flag.label for flag in self.flagged})
-        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in self.flagged}
-        record = replace(self.record, excluded={**self.record.excluded, **reasons})
+        out = [flag for flag in self.flagged if flag.label not in self.kept_together]
+        kept = self.stated.without({flag.label for flag in out})
+        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in out}
+        record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.asked(kept), record=record)
 
     @cached_property

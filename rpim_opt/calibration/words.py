@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.markup import html_table
-from rpim_opt.basics.text import joined, table
+from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.learned_words import sentences
@@ -173,7 +173,14 @@ def _distrust(result: Outcome) -> list[str]:
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"
     lines = [f"{text}."]
-    if result.squared_loss:
+    together = result.kept_together
+    if together:
+        lines.append(
+            f"Of them {listed(together)} err with their neighbours in joint space or in time: they are no blunders, "
+            "the model lacks something there (model 'auto' looks for gravity and eccentric joints) or the set-up "
+            "moved; a refit keeps them."
+        )
+    if len(together) < len(flagged) and result.squared_loss:
         lines.append("A squared loss lets such rows pull the fit: use formulation 'robust', or leave them out.")
     return lines
 

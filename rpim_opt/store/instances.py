@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import sha256_of
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.calibration.asking import calibrate
