@@ -82,6 +82,9 @@ def new(
     sheet: Annotated[str, typer.Option(help="Excel sheet, by name or number.")] = "",
     columns: Annotated[str, typer.Option(help="Names of the columns, where there is no header: label,q1_deg,...")] = "",
     key: Annotated[str, typer.Option(help="Column that joins several files, or row for the number of the row.")] = "",
+    within: Annotated[
+        float | None, typer.Option(help="Join files by the nearest time, so many seconds apart at most.")
+    ] = None,
     quaternion: Annotated[str, typer.Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, typer.Option(help="vector, where rx, ry, rz are a rotation vector.")] = "",
     encoding: Annotated[str, typer.Option(help="Of text files, if not found: utf-8, cp1252, utf-16.")] = "",
@@ -108,7 +111,7 @@ def new(
 
         asked = asked_of(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
-            separator=separator, decimal=decimal,
+            separator=separator, decimal=decimal, within=within,
         )  # fmt: skip
         if dry_run:
             found = understand_tables(robot, data, measurement, asked, urdf_base, urdf_tip)

@@ -169,7 +169,7 @@ def _by_chance(clustered: int, suspects: int, rows: int) -> bool:
 
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
-    """Return which of some rows (r,) are no blunders of their own: neighbours in joint space, or in time, err with them.
+    """Return which of some rows (r,) are no blunders of their own: neighbours in joint space or in time err with them.
 
     In time that is a run of visits one after the other, too long for so many rows dealt out at random.
     """

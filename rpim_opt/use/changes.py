@@ -33,8 +33,8 @@ WEAK = 1e-9
 class Cause(NamedTuple):
     """A change that may be why readings miss their predictions.
 
-    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much chi-squared
-    falls with it, the probability of such a fall where nothing changed, and how much it is believed after the readings.
+    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
+    chi-squared falls with it, the probability of that where nothing changed, and how much it is believed afterwards.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Reading(NamedTuple):
     """A configuration's rows by their labels, and the numbers of their equations."""
 
     labels: tuple[str, ...]
-    index: np.ndarray
+    equations: np.ndarray
 
 
 class Missed:

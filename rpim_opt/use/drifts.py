@@ -85,9 +85,7 @@ def _tried(missed: Missed, causes: list[Cause], when: np.ndarray, count: int) ->
             g, G = missed.of_drift(index, course)
             gain, chance = missed.gain(g, G)
             change, std = _size(g, G, float(free.scale[index[0]]))
-            yield Drift(
-                cause._replace(gain=gain, chance=chance), first, steady, change, std, free.dimensions[index[0]]
-            )
+            yield Drift(cause._replace(gain=gain, chance=chance), first, steady, change, std, free.dimensions[index[0]])
 
 
 def _moments(count: int) -> np.ndarray:

@@ -38,9 +38,7 @@ class Innovations:
     deviate: Array
 
 
-def innovations(
-    result: Calibration, problem: CalibrationProblem, order: np.ndarray, rare: float = 0.0
-) -> Innovations:
+def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndarray, rare: float = 0.0) -> Innovations:
     """Return what checks say one after the other, each after all before it.
 
     What is not known of the robot bends all predictions alike. A Kalman filter takes that away as checks show it, so

@@ -1,4 +1,4 @@
-"""Checks of a calibrated robot over time: does it drift?"""
+"""Checks of a calibrated robot over time, and whether it drifts."""
 
 from __future__ import annotations
 

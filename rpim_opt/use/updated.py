@@ -143,9 +143,7 @@ class Update:
         return lines
 
     def _causes(self) -> str:
-        rows = [
-            [c.name, c.kind, f"{c.gain:.1f}", f"{c.chance:.2g}", f"{c.believed:.2g}"] for c in self.causes[:SHOWN]
-        ]
+        rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.chance:.2g}", f"{c.believed:.2g}"] for c in self.causes[:SHOWN]]
         return table(["may have changed", "kind", "chi-squared falls by", "by chance", "belief"], rows)
 
 

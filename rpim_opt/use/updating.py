@@ -39,8 +39,8 @@ def update(
 
     First it is asked whether the robot is still the same. While a change of one parameter, of one frame, or one wrong
     reading lets chi-squared fall by more than chance would in one robot of a hundred (over all that may have changed),
-    the most believed change is let go: its parameters start from where they were with tails wide enough for a crash, and
-    all others keep what is known of them.
+    the most believed change is let go: its parameters are expected where they were, within widths that no crash leaves,
+    and all others keep what is known of them.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _record(result: Calibration, inflate: float, let_go: Sequence[str], left_out
     return Record(
         old.title,
         old.source,
-        excluded={label: "far from what the last calibration allows" for label in left_out},
+        excluded=dict.fromkeys(left_out, "far from what the last calibration allows"),
         simulated=old.simulated,
         earlier=(*old.earlier, last),
     )
