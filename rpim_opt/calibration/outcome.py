@@ -584,7 +584,7 @@ class Outcome:
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
         >>> len(result.flagged), len(result.without_flagged().flagged)
-        (5, 1)
+        (5, 0)
         """
         found = diagnosis.flagged(self.problem, self.x)
         problem = self.problem

@@ -24,8 +24,10 @@ class Monitoring:
 
     Parameters
     ----------
-    label, times, when
-        Of the N checks: names, times as the table states them (empty without), and in seconds (None without).
+    label, times
+        Names of the N checks, and their times as the table states them; empty without.
+    when
+        (N,) times [s]; None without.
     error
         (N,) errors against the calibration [m].
     sigmas, allowed
@@ -70,11 +72,24 @@ class Monitoring:
 
     @property
     def drifts(self) -> bool:
-        """Whether the robot is not where its calibration says: one check, their sum, or a parameter says so."""
+        """Whether the robot is not where its calibration says: one check, their sum, or a parameter says so.
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).drifts
+        False
+        """
         return bool(self.beyond) or self.alarm is not None or self.drift is not None
 
     def content(self) -> dict[str, Any]:
-        """Return the figures, and the chart's points [mm]."""
+        """Return the figures, and the chart's points [mm].
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation).content()
+        >>> found["drifts"], found["checks"], list(found["rows"][0])
+        (False, 40, ['label', 'error_mm', 'sigmas', 'allowed_sigmas', 'sum'])
+        """
         alarm = self.alarm
         began = None
         if alarm is not None:
@@ -91,7 +106,13 @@ class Monitoring:
         }
 
     def csv(self) -> str:
-        """Return the chart's points as CSV."""
+        """Return the chart's points as CSV.
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).csv().splitlines()[0]
+        'label,error_mm,sigmas,allowed_sigmas,sum'
+        """
         rows = self._rows()
         return csv_text(list(rows[0]), [[str(cell) for cell in row.values()] for row in rows])
 

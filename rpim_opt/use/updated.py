@@ -84,7 +84,16 @@ class Update:
         return self.after.likely
 
     def content(self) -> dict[str, Any]:
-        """Return the figures [mm, deg], all causes, and what the result says."""
+        """Return the figures [mm, deg], all causes, and what the result says.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
+        >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40))).content()
+        >>> found["changed"], found["readings"], found["earlier"][0]["rows"]
+        (False, 8, 32)
+        """
         return {
             "changed": self.changed,
             "explained": self.explained,
