@@ -91,6 +91,9 @@ def new(
     sheet: Annotated[str, typer.Option(help="Excel sheet, by name or number.")] = "",
     columns: Annotated[str, typer.Option(help="Names of the columns, where there is no header: label,q1_deg,...")] = "",
     key: Annotated[str, typer.Option(help="Column that joins several files, or row for the number of the row.")] = "",
+    within: Annotated[
+        float | None, typer.Option(help="Join files by the nearest time, so many seconds apart at most.")
+    ] = None,
     quaternion: Annotated[str, typer.Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, typer.Option(help="vector, where rx, ry, rz are a rotation vector.")] = "",
     encoding: Annotated[str, typer.Option(help="Of text files, if not found: utf-8, cp1252, utf-16.")] = "",
@@ -117,7 +120,7 @@ def new(
 
         asked = asked_of(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
-            separator=separator, decimal=decimal,
+            separator=separator, decimal=decimal, within=within,
         )  # fmt: skip
         if dry_run:
             found = understand_tables(robot, data, measurement, asked, urdf_base, urdf_tip)
@@ -206,9 +209,10 @@ def calibrate(
             result = _calibrated(instance, select, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())
         without: list[str] = []
-        if refit and result.flagged:
+        if refit:
+            without = [flag.label for flag in result.flagged if flag.label not in result.kept_together]
+        if without:
             say("calibrating without the distrusted rows")
-            without = [flag.label for flag in result.flagged]
             result = result.without_flagged()
         if refit_all:
             from rpim_opt.calibration.refit import refit_all as refitted
@@ -389,6 +393,73 @@ def iso9283(
                 "within_limits": within if over else None, "written": written_to(out, found.csv())}  # fmt: skip
     show("\n".join([str(found), *lines]) + written_line(out), document, as_json)
     if not within:
+        raise typer.Exit(1)
+
+
+@app.command()
+def update(
+    result: Result,
+    data: Annotated[Path, typer.Argument(help="New measurements of the same robot, in the same instrument's frame.")],
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    inflate: Annotated[
+        float, typer.Option(help="Factor on the earlier standard deviations, where all may have drifted.")
+    ] = 1.0,
+    anew: Annotated[
+        str, typer.Option(help="Parameters that were set up anew: 'base_*' of another place of the instrument.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Folder for the new result.json.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Carry a result on with new measurements: it is their prior; say whether the robot changed, and what did.
+
+    Exit code 1 if nothing explains what they miss, or it did not converge.
+    """
+    with progress() as say:
+        from rpim_opt.basics.files import sha256_of
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.updating import update
+        from rpim_opt.use.validation import read_measurements
+
+        say("reading the result")
+        loaded = load_result(result)
+        rows, left_out = read_measurements(loaded, data, measurement, units)
+        found = update(loaded, rows, inflate=inflate, anew=anew.replace(",", " ").split(), progress=say)
+        updated = found.result
+        updated = replace(updated, record=replace(updated.record, files={data.name: sha256_of(data)}))
+    written = _saved(updated, out)
+    text = str(found) + left_out_line(left_out) + "".join(written_line(file) for file in written)
+    show(text, {**found.content(), "left_out": left_out, "written": written}, as_json)
+    if not (found.explained and updated.converged):
+        raise typer.Exit(1)
+
+
+@app.command()
+def monitor(
+    result: Result,
+    checks: Annotated[Path, typer.Argument(help="Check readings; a column time, timestamp or date orders them.")],
+    units: Units = "",
+    measurement: Annotated[str | None, typer.Option(help="Which of the result's kinds, if there are several.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The chart over time: .html, or its points as .csv.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Look for drift in check readings over time, each and together against the interval of a new reading.
+
+    Exit code 1 if the robot is not where its calibration says.
+    """
+    with progress() as say:
+        from rpim_opt.show.checks_page import written_checks
+        from rpim_opt.store.result_file import load_result
+        from rpim_opt.use.monitoring import monitor, read_checks
+
+        say("reading the result")
+        loaded = load_result(result)
+        read = read_checks(loaded, checks, measurement, units)
+        found = monitor(loaded, read.data, read.when, read.times)
+        written = written_checks(found, out, loaded.record.title)
+    text = str(found) + left_out_line(read.left_out) + "".join(written_line(file) for file in written)
+    show(text, {**found.content(), "left_out": read.left_out, "written": written}, as_json)
+    if found.drifts:
         raise typer.Exit(1)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import to_jsonable_python
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.inputs import LARGEST_DATA, read_text
+from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, read_text
 from rpim_opt.basics.units import UNITS, number, quantities
 from rpim_opt.basics.writing import write_text
 
@@ -163,3 +164,8 @@ def read_json(path: Path) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; lists that deep
         raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal digits."""
+    return sha256(read_bytes(path, LARGEST_DATA)).hexdigest()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, chdtri, pdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.diagnosis import error_vectors
@@ -24,8 +24,12 @@ TRUSTED, STEPS = 1.5, 50
 """Medians up to which a resistant fit trusts a row wholly; reweighted fits, at most."""
 SAME = 1e-3
 """Weights of rows that have settled change by no more."""
+RUN = 0.01
+"""Probability with which chance makes neighbours of suspects: below, they are a cluster."""
 NEIGHBOURS, ALIKE = 3, 0.7
 """Suspects from which on they may be a cluster, and the cosine of errors that point the same way."""
+POINTING = (1 - ALIKE) / 2
+"""Probability of that for two directions in space that have nothing to do with each other."""
 
 
 def ratios(problem: CalibrationProblem, x: Array) -> Array:
@@ -151,7 +155,47 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
         apart[whose != whose[i]] = np.inf
         j = int(np.argmin(apart))
         found[k] = among[j] and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
+    if _by_chance(int(found.sum()), len(rows), len(q)):
+        return np.zeros(len(rows), dtype=bool)
     return found
+
+
+def _by_chance(clustered: int, suspects: int, rows: int) -> bool:
+    """Return whether so many suspects dealt out at random are neighbours as often; two are each other's neighbour."""
+    if not clustered:
+        return False
+    expected = suspects * suspects / rows * POINTING
+    return bool(pdtrc(np.ceil(clustered / 2) - 1, expected) >= RUN)
+
+
+def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
+    """Return which of some rows (r,) are no blunders of their own: neighbours in joint space or in time err with them.
+
+    In time that is a run of visits one after the other, too long for so many rows dealt out at random.
+    """
+    return clustered(problem, x, rows) | _in_runs(problem, rows)
+
+
+def _in_runs(problem: CalibrationProblem, rows: np.ndarray) -> np.ndarray:
+    """Return which of some rows (r,) are in runs that chance makes once in a hundred sets of data."""
+    visit = _visits(problem)
+    suspect = np.zeros(visit[-1] + 1, dtype=bool)
+    suspect[visit[rows]] = True
+    share = suspect.mean()
+    edges = np.flatnonzero(np.diff(suspect, prepend=False, append=False))
+    long = np.zeros(len(suspect), dtype=bool)
+    for start, end in edges.reshape(-1, 2):
+        # a run of so many begins at any visit with probability share^length
+        if end - start >= NEIGHBOURS and len(suspect) * share ** (end - start) < RUN:
+            long[start:end] = True
+    return long[visit[rows]]
+
+
+def _visits(problem: CalibrationProblem) -> np.ndarray:
+    """Return the number (N,) of every row's visit: rows of the same joint values one after the other are one."""
+    q = problem.data.q
+    moved = np.any(np.diff(q, axis=0, prepend=q[:1]) != 0, axis=1)
+    return np.cumsum(moved)
 
 
 def beyond(problem: Source, x: Array) -> dict[str, float]:

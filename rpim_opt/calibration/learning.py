@@ -29,6 +29,8 @@ ROUNDS = 6
 """Linearizations at which sizes are looked for."""
 ASKED = 3.0
 """By how much -2 ln L must fall for a doubted prior: on simulated fleets no arm of another kind was harmed then."""
+LOOKS = 4
+"""How often blunders are looked for again without those that were found: they hide behind each other."""
 STEP = 0.05
 """Of logarithms of sizes, for second derivatives."""
 FLATTEST = 0.05
@@ -85,12 +87,15 @@ def _found(problem: Source, prior: Prior, model: str, start: Array | None, noise
     learning, whole, doubt = _believed(every, prior, noise, _begin(every, start))
     blunders = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = _explained(learning, whole, blunders, model)
-    if trials and trials[0].families:  # what they explain stood before the smaller blunders
+    for _ in range(LOOKS):  # what families explain, and the worst blunders, stood before the smaller ones
+        if not blunders and not (trials and trials[0].families):
+            break
         again = fit.problem.on(every.data)
         more = suspected(again, fit.x, fit.laid.parameters.free.scale, fit.spare)
-        if more.keys() - blunders.keys():
-            blunders |= more
-            fit, trials = _explained(learning, whole, blunders, model)
+        if not more.keys() - blunders.keys():
+            break
+        blunders = {**more, **blunders}
+        fit, trials = _explained(learning, whole, blunders, model)
     if blunders:
         left = unbelievable(fit.laid.on(every.data), fit.x, fit.covariance, blunders)
         if left.keys() != blunders.keys():

@@ -13,6 +13,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.calibration import diagnosis
+from rpim_opt.calibration.accused import contradicted
+from rpim_opt.calibration.blunders import coherent
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
 from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
@@ -25,6 +27,7 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.select import Selection
+from rpim_opt.convex.stated import default_widths
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, position
@@ -574,15 +577,48 @@ class Outcome:
     def flagged(self) -> tuple[Flag, ...]:
         """Rows that the fit distrusts, the worst first.
 
-        Those beyond `trust.outlying`, with the noise that the other rows show. After a squared loss blunders may
-        hide behind each other: a robust loss finds them.
+        Those beyond `trust.outlying`, with the noise that the other rows show; after a robust loss of these those that
+        a fit without them contradicts, because it may sacrifice half of few rows to the other half. After a squared
+        loss blunders may hide behind each other: a robust loss finds them.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
         >>> len(result.flagged), len(result.without_flagged().flagged)
-        (5, 1)
+        (5, 0)
         """
-        return diagnosis.flagged(self.problem, self.x)
+        found = diagnosis.flagged(self.problem, self.x)
+        problem = self.problem
+        if not found or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
+            return found
+        model = self.program.model
+        if len(model.b) != sum(len(part.owners) for part in problem.rows()):  # reduced to a triangle
+            return found
+        number = dict(zip(problem.labels, problem.data.configuration, strict=True))
+        groups = np.array([number[flag.label] for flag in found])
+        p = problem.parameters
+        width = (default_widths(p) / p.scale)[p.identified]
+        weight = self.penalty_weight / self._factor
+        sure = contradicted(model, self.program.penalty_form, weight, width, groups)
+        return tuple(flag for flag, certain in zip(found, sure, strict=True) if certain)
+
+    @cached_property
+    def kept_together(self) -> tuple[str, ...]:
+        """Labels of flagged rows that err together with their neighbours in joint space or in time.
+
+        They are no blunders of their own: the model lacks something there, or the set-up moved. `without_flagged` keeps
+        them.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0).kept_together
+        ()
+        """
+        problem = self.problem
+        if not self.flagged or not isinstance(problem, CalibrationProblem):
+            return ()
+        index = {label: i for i, label in enumerate(problem.labels)}
+        rows = np.array([index[flag.label] for flag in self.flagged])
+        together = coherent(problem, self.x, rows)
+        return tuple(flag.label for flag, kept in zip(self.flagged, together, strict=True) if kept)
 
     @property
     def doubted(self) -> list[str]:
@@ -595,14 +631,17 @@ class Outcome:
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
 
+        Rows that are `kept_together` stay: without them the robot would be extrapolated where the model fails.
+
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
         >>> [len(result.problem.labels) - len(result.without_flagged().problem.labels), len(result.flagged)]
         [5, 5]
         """
-        kept = self.stated.without({flag.label for flag in self.flagged})
-        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in self.flagged}
-        record = replace(self.record, excluded={**self.record.excluded, **reasons})
+        out = [flag for flag in self.flagged if flag.label not in self.kept_together]
+        kept = self.stated.without({flag.label for flag in out})
+        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in out}
+        record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.asked(kept), record=record)
 
     @cached_property

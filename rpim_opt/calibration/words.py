@@ -10,12 +10,13 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.markup import html_table
-from rpim_opt.basics.text import table
+from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.learned_words import sentences
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.select import disagreement
+from rpim_opt.data.record import Earlier
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
 """Distrusted rows and bounds that are named one by one."""
@@ -105,6 +106,8 @@ def selector(result: Outcome) -> str:
     """Return the rule's name: ``learned`` sizes, ``given`` for a number, ``none`` without a penalty."""
     if result.formulation.penalty is None:
         return "none"
+    if result.record.earlier:
+        return "earlier result"
     if result.learned is not None:
         return "learned"
     if result.selection is None:
@@ -114,6 +117,8 @@ def selector(result: Outcome) -> str:
 
 def weight_lines(result: Outcome) -> list[str]:
     """Say the weight and where it came from, or what was learned in its place: a few sentences."""
+    if result.record.earlier:
+        return [f"Formulation '{result.formulation.name}'.", _carried_on(result.record.earlier[-1])]
     if result.learned is None:
         return [_one_weight(result)]
     names = result.problem.parameters.free.names
@@ -123,6 +128,17 @@ def weight_lines(result: Outcome) -> list[str]:
 def weight_sentence(result: Outcome) -> str:
     """Say the same in one line."""
     return " ".join(weight_lines(result))
+
+
+def _carried_on(last: Earlier) -> str:
+    """Say which calibration's posterior the prior is."""
+    text = f"Prior: the posterior of '{last.title}', {last.rows} rows, made {last.made or 'just now'}"
+    text += f" (digest {last.digest[:12]})"
+    if last.inflate != 1:
+        text += f", its standard deviations times {last.inflate:g}"
+    if last.let_go:
+        text += f", without {joined(last.let_go)}"
+    return f"{text}."
 
 
 def _one_weight(result: Outcome) -> str:
@@ -157,7 +173,14 @@ def _distrust(result: Outcome) -> list[str]:
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"
     lines = [f"{text}."]
-    if result.squared_loss:
+    together = result.kept_together
+    if together:
+        lines.append(
+            f"Of them {listed(together)} err with their neighbours in joint space or in time: they are no blunders, "
+            "the model lacks something there (model 'auto' looks for gravity and eccentric joints) or the set-up "
+            "moved; a refit keeps them."
+        )
+    if len(together) < len(flagged) and result.squared_loss:
         lines.append("A squared loss lets such rows pull the fit: use formulation 'robust', or leave them out.")
     return lines
 

@@ -7,12 +7,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from typing import NamedTuple
 
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.held_out import HeldOut
 from rpim_opt.data.requirement import Requirement
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
+
+
+class Earlier(NamedTuple):
+    """The calibration that another one carries on, and how.
+
+    Its title, when it was made, the digest of its file and its number of rows; the factor on its standard deviations;
+    parameters that were let go, and rows of the new data that were left out.
+    """
+
+    title: str
+    made: str
+    digest: str
+    rows: int
+    inflate: float = 1.0
+    let_go: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +58,10 @@ class Record:
         What the robot is accepted by; None where nobody demanded anything.
     held_out
         Rows that were kept apart and judged before they were used; None where validation data are still unused.
+    earlier
+        The calibrations that this one carries on (`use.update`), the last one last.
+    digest
+        Of the file that it was read from; empty where there is none.
 
     Examples
     --------
@@ -61,6 +82,8 @@ class Record:
     details: Mapping[str, str] = field(default_factory=dict)
     requirement: Requirement | None = None
     held_out: HeldOut | None = None
+    earlier: tuple[Earlier, ...] = ()
+    digest: str = ""
 
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""

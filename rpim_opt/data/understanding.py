@@ -51,6 +51,8 @@ class Asked:
         ``"vector"`` where rx, ry, rz are a rotation vector (Universal Robots), else roll, pitch, yaw.
     key
         The column by which several files are joined; ``"row"`` for the number of the row.
+    within
+        Tolerance [s] where they are joined by the nearest time.
 
     Examples
     --------
@@ -65,6 +67,7 @@ class Asked:
     quaternion: str = ""
     rotation: str = ""
     key: str = ""
+    within: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +195,7 @@ def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Col
     notes = []
     for what, of in (("measured", measured), ("joint", joints)):
         rows = missing_rows(columns, [name for name, stem in stems.items() if stem in of])
-        if rows:
-            labels = columns.get("label", [str(i + 1) for i in range(max(rows) + 1)])
-            notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
+        notes += _without(columns, rows, what)
         out |= set(rows)
     count = len(next(iter(columns.values()), ()))
     kept = [i for i in range(count) if i not in out]
@@ -203,6 +204,14 @@ def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Col
     if not out:
         return columns, kept, notes
     return {name: [cells[i] for i in kept] for name, cells in columns.items()}, kept, notes
+
+
+def _without(columns: Columns, rows: Sequence[int], what: str) -> list[str]:
+    """Say which rows have no values of a kind."""
+    if not rows:
+        return []
+    labels = columns.get("label", [str(i + 1) for i in range(max(rows) + 1)])
+    return [f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}."]
 
 
 def _labelled(columns: Columns) -> tuple[Columns, list[str]]:

@@ -112,14 +112,23 @@ def _box(text: str) -> tuple[tuple[float, float], tuple[float, float], tuple[flo
     return (numbers[0], numbers[1]), (numbers[2], numbers[3]), (numbers[4], numbers[5])
 
 
-def asked_of(units: str, *, columns: str, key: str, quaternion: str, rotation: str, **layout: str) -> Asked:
+def asked_of(
+    units: str,
+    *,
+    columns: str,
+    key: str,
+    quaternion: str,
+    rotation: str,
+    within: float | None = None,
+    **layout: str,
+) -> Asked:
     """Return what the options of a command state of its raw tables."""
     from rpim_opt.basics.layouts import Layout
     from rpim_opt.data.spelling import parse_units
     from rpim_opt.data.understanding import Asked
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
-    return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key)
+    return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key, within)
 
 
 def listed_words(text: str) -> list[str]:

@@ -10,6 +10,7 @@ from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import data_table, facts, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block
+from rpim_opt.data.record import Earlier
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.show.pieces import sets
 from rpim_opt.store.definition import definition
@@ -37,6 +38,10 @@ def provenance_section(result: Calibration) -> list[Element]:
     if record.files:
         files = [[name, digest] for name, digest in record.files.items()]
         tables.append(data_table("Input files", ["file", "SHA-256"], files, prose=True))
+    if record.earlier:
+        earlier = [[each.title, each.made, str(each.rows), _carried(each), each.digest] for each in record.earlier]
+        head = ["calibration", "made", "rows", "changed since", "digest"]
+        tables.append(data_table("Carries on", head, earlier, prose=True))
     return section(
         "Where the data come from",
         facts(list(said.items())),
@@ -55,6 +60,14 @@ def stated_details(result: Calibration) -> list[Element]:
     if not details:
         return []
     return [facts([(FIELDS.get(key, key), text) for key, text in details.items()])]
+
+
+def _carried(each: Earlier) -> str:
+    """Return what changed since an earlier calibration, and how far it was trusted."""
+    said = [", ".join(each.let_go) or "nothing that readings show"]
+    if each.inflate != 1:
+        said.append(f"standard deviations times {each.inflate:g}")
+    return "; ".join(said)
 
 
 def _robot(name: str, robot: Robot) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.inputs import LARGEST_DATA, inside, read_bytes
+from rpim_opt.basics.files import sha256_of
+from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
@@ -264,7 +264,7 @@ def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
     for files in tables.files.values():
         used |= {file: folder / file for file in files}
     used |= {file: _result(folder / file) for file in prior_files(stated.table.prior)}
-    return {name: sha256(read_bytes(file, LARGEST_DATA)).hexdigest() for name, file in used.items()}
+    return {name: sha256_of(file) for name, file in used.items()}
 
 
 def _result(file: Path) -> Path:

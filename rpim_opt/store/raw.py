@@ -204,7 +204,7 @@ def _whole(
     paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked, tables: Sequence[Understood]
 ) -> Understanding:
     try:
-        whole = together(tables, arm.robot, kind, asked.key)
+        whole = together(tables, arm.robot, kind, asked.key, asked.within)
     except InputError as error:
         raise error.within(paths[0] if len(paths) == 1 else None) from None
     return Understanding(kind, whole.columns, tuple(tables), whole.notes, asked, str(paths[0]))

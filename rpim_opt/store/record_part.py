@@ -9,10 +9,10 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.held_out import HeldOut
-from rpim_opt.data.record import Record
+from rpim_opt.data.record import Earlier, Record
 from rpim_opt.data.requirement import Requirement, Side
 from rpim_opt.store.parts import finite
-from rpim_opt.store.schema import HeldOutPart, RecordPart, RequirementPart
+from rpim_opt.store.schema import EarlierPart, HeldOutPart, RecordPart, RequirementPart
 
 
 def record_part(record: Record) -> dict[str, Any]:
@@ -27,11 +27,12 @@ def record_part(record: Record) -> dict[str, Any]:
         "details": dict(record.details),
         "requirement": _requirement_part(record.requirement),
         "held_out": _held_out_part(record.held_out),
+        **_earlier_part(record),
     }
 
 
-def record_of(title: str, stated: RecordPart, validation: Dataset | None) -> Record:
-    """Return the record that a file states."""
+def record_of(title: str, stated: RecordPart, validation: Dataset | None, digest: str) -> Record:
+    """Return the record that a file with a digest states."""
     return Record(
         title=title,
         source=stated.source,
@@ -44,7 +45,23 @@ def record_of(title: str, stated: RecordPart, validation: Dataset | None) -> Rec
         details=stated.details,
         requirement=_requirement(stated.requirement),
         held_out=_held_out(stated.held_out),
+        earlier=tuple(_earlier(each) for each in stated.earlier),
+        digest=digest,
     )
+
+
+def _earlier_part(record: Record) -> dict[str, Any]:
+    """Return what a calibration carries on; nothing of one that starts from a drawing, as files always were."""
+    if not record.earlier:
+        return {}
+    parts = [each._asdict() for each in record.earlier]
+    listed = [{**part, "let_go": list(part["let_go"]), "left_out": list(part["left_out"])} for part in parts]
+    return {"earlier": listed}
+
+
+def _earlier(part: EarlierPart) -> Earlier:
+    lists = {"let_go": tuple(part.let_go), "left_out": tuple(part.left_out)}
+    return Earlier(part.title, part.made, part.digest, part.rows, part.inflate, **lists)
 
 
 def _requirement_part(requirement: Requirement | None) -> dict[str, Any] | None:

@@ -177,7 +177,7 @@ def _calibration(file: File, known: Mapping[str, Measurement], model: Models) ->
         program=program,
         certificate=_certificate(file),
         asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
-        record=record_of(file.title, file.record, _validation(file, problem, known)),
+        record=record_of(file.title, file.record, _validation(file, problem, known), file.digest),
         kept=None if formulation.solvable else _kept(file, program),
         learned=learned_of(file.learned),
     )
@@ -202,7 +202,7 @@ def _certificate(file: File) -> Certificate:
 
 def _rule(file: File) -> float | Selector | None:
     """Return the selector that chose the weight, where it is a ready one, and otherwise the weight; None: learned."""
-    if file.learned is not None:
+    if file.learned is not None and not file.record.earlier:
         return None
     if file.selection is None:
         return file.weight
@@ -211,7 +211,7 @@ def _rule(file: File) -> float | Selector | None:
 
 def _model(file: File) -> str:
     """Return whether families were compared."""
-    if file.learned is not None and file.learned.trials:
+    if file.learned is not None and file.learned.trials and not file.record.earlier:
         return "auto"
     return "geometry"
 

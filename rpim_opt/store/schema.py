@@ -203,6 +203,18 @@ class HeldOutPart(Part):
     coverage: float | None
 
 
+class EarlierPart(Part):
+    """A calibration that this one carries on."""
+
+    title: str
+    made: str
+    digest: str
+    rows: int
+    inflate: float
+    let_go: list[str]
+    left_out: list[str]
+
+
 class RecordPart(Part):
     """Where the measurements come from."""
 
@@ -215,6 +227,7 @@ class RecordPart(Part):
     details: dict[str, str] = Field(default_factory=dict)
     requirement: RequirementPart | None = None
     held_out: HeldOutPart | None = None
+    earlier: list[EarlierPart] = Field(default_factory=list)
 
 
 class RowPart(Part):

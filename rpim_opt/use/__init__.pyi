@@ -7,7 +7,12 @@ from .geometry import geometry_alone as geometry_alone
 from .identified import identified as identified
 from .iso9283 import Performance as Performance
 from .iso9283 import iso9283 as iso9283
+from .monitored import Monitoring as Monitoring
+from .monitoring import monitor as monitor
+from .monitoring import read_checks as read_checks
 from .targets import read_targets as read_targets
+from .updated import Update as Update
+from .updating import update as update
 from .validation import Validation as Validation
 from .validation import read_measurements as read_measurements
 from .validation import validate as validate

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -195,28 +195,45 @@ def read_measurements(
     >>> len(data), left_out
     (2, ('note',))
     """
+    found = read_table(result, source, measurement, units)
+    return found.data, found.left_out
+
+
+class Read(NamedTuple):
+    """A table's measurements, the columns that were left out, and all columns as they stand there, of the same rows."""
+
+    data: Dataset
+    left_out: tuple[str, ...]
+    raw: Columns
+
+
+def read_table(result: Calibration, source: Any, measurement: str | None, units: str) -> Read:
+    """Return what a table says; arguments as for `read_measurements`."""
     kinds = {block.measurement.name: block.measurement for block in result.problem.data.blocks}
     name = measurement or (next(iter(kinds)) if len(kinds) == 1 else "")
     if name not in kinds:
         raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
     given = parse_units(units)
     try:
-        columns, left_out = _columns(source, result.problem.robot, kinds[name], given)
+        columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
         data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
-    return data, left_out
+    return Read(data, left_out, raw)
 
 
-def _columns(source: Any, robot: Robot, kind: Measurement, units: Mapping[str, str]) -> tuple[Columns, tuple[str, ...]]:
-    """Return the columns of a table by our names, and those that were left out; files as `rpim-opt new` has them."""
+def _columns(
+    source: Any, robot: Robot, kind: Measurement, units: Mapping[str, str]
+) -> tuple[Columns, tuple[str, ...], Columns]:
+    """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
     if not isinstance(source, str | Path):
-        renamed = rename(read_columns(source), robot, kind, units)
-        return renamed.columns, renamed.left_out
+        raw = read_columns(source)
+        renamed = rename(raw, robot, kind, units)
+        return renamed.columns, renamed.left_out, raw
     found = understand(Path(source), robot, kind, Asked(units=units))
     if found.numbered and kind.name == "pose":
         raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-    return found.columns, tuple(each.column for each in found.meant if each.meaning == "left out")
+    return found.columns, tuple(each.column for each in found.meant if each.meaning == "left out"), found.raw
 
 
 def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:

@@ -48,6 +48,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
     held = tuple(Held("a2", 0.0005, 1.0, 0.05) for _ in range(count))
     stand_in: Any = SimpleNamespace(
         flagged=flags,
+        kept_together=(),
         held=held,
         prices=(),
         squared_loss=squared_loss,

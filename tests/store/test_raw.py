@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
+from rpim_opt.data.nearest import partners
 from rpim_opt.robot.plain import write_robot
 from tests.simulate import ARM
-from tests.store.raw_files import HEAD, LABELS, POINTS, RAW, ROWS, WXYZ, P, Q, T, beside, cells, text
+from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, RAW, ROWS, WXYZ, P, Q, T, beside, cells, text
 from tests.test_cli import run
 
 
@@ -242,3 +243,60 @@ def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatc
         assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
         assert perf_counter() - start < 2.0
         assert "a row of 100000 cells, accepted: at most 1000 columns" in capsys.readouterr().err
+
+
+def _clocked(tmp_path, rate: float, apart: float, shift: float = 0.0) -> list:
+    """Write joints at a rate [1/s] while the arm rests at each place, and points with times of another clock."""
+    joints, points = tmp_path / "joints.csv", tmp_path / "points.csv"
+    lines = []
+    for i, row in enumerate(ROWS):
+        lines += [[f"{i + k / rate:.4f}", *row[1:7]] for k in range(int(0.1 * rate))]
+    joints.write_text(text([["time [s]", *HEAD[1:7]]], lines))
+    moments = [f"{1e3 * (i + 0.05 + apart + shift):.2f}" for i in range(len(ROWS))]
+    rows = [[name[0], moment, *point] for name, moment, point in zip(NAMED, moments, POINTS, strict=True)]
+    points.write_text(text([["Point", "Timestamp [ms]", *HEAD[7:]]], rows))
+    return [joints, points]
+
+
+def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys, tmp_path, arm) -> None:
+    files = _clocked(tmp_path, rate=100.0, apart=0.003)
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.006") == 0
+    said = capsys.readouterr().out
+    assert "joined by the nearest time: 12 rows of 120 with joints and 12 measured" in said
+    assert "times differ by 0.003 s at most, +0.003 s on average" in said
+    data = ro.load(tmp_path / "cell").problem.data
+    np.testing.assert_allclose(np.degrees(data.q), [[float(cell) for cell in row] for row in JOINTS], atol=1e-9)
+    assert list(data.label) == [name[0] for name in NAMED]
+
+
+def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_path, arm) -> None:
+    files = _clocked(tmp_path, rate=100.0, apart=0.003)
+    late = [["late", "99000", *POINTS[0]]]
+    files[1].write_text(files[1].read_text() + text([], late))
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.006") == 0
+    assert "1 measured rows without a partner within 0.006 s, left out: late." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("shift", "within", "said"),
+    [(5000.0, "0.01", "no two within 0.01 s"), (0.0, "-1", "zero or more"), (0.0, "nan", "zero or more")],
+)
+def test_clocks_that_do_not_agree_are_one_sentence(monkeypatch, capsys, tmp_path, arm, shift, within, said) -> None:
+    files = _clocked(tmp_path, rate=100.0, apart=0.0, shift=shift)
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", within) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    assert said in error
+    files[1].write_text(files[1].read_text().replace("Timestamp [ms]", "Remark"))
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.01") == 2
+    assert "no column of times among" in capsys.readouterr().err
+
+
+def test_each_of_the_fewer_has_its_own_partner() -> None:
+    """A row of the longer table serves the nearest alone; both ways round the pairs are the same."""
+    few, many = np.array([0.0, 0.9, 1.15, 5.0]), np.arange(0.0, 10.0, 1.0)
+    pairs = partners(few, many, 0.2)
+    turned = partners(many, few, 0.2)
+    assert list(zip(pairs.left.tolist(), pairs.right.tolist(), strict=True)) == [(0, 0), (1, 1), (3, 5)]
+    assert (turned.right.tolist(), turned.left.tolist()) == (pairs.left.tolist(), pairs.right.tolist())
+    np.testing.assert_allclose(turned.apart, -pairs.apart)

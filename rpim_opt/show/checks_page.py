@@ -1,0 +1,112 @@
+"""A page of checks over time: each against the interval of a new reading, and their cumulative sum with its limit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.markup import Element, tag
+from rpim_opt.basics.page import data_table, page, section
+from rpim_opt.basics.writing import refused, write_text
+from rpim_opt.show.pieces import figure, mm
+from rpim_opt.show.svg import Axis, Chart
+from rpim_opt.use.monitored import Monitoring
+
+DAY, HOUR = 86400.0, 3600.0
+
+
+def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
+    """Write checks over time as one HTML page that works offline: the verdict, two charts, every check.
+
+    Parameters
+    ----------
+    found
+        As `use.monitor` returns it.
+    path
+        The file; whole or not written at all.
+    title
+        What was calibrated.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
+    >>> ro.show.write_checks(found, "checks.html", "Cell 7")
+    >>> "No drift in 40 checks." in Path("checks.html").read_text(encoding="utf-8")
+    True
+    """
+    place, axis = _times(found)
+    verdict, *rest = str(found).splitlines()
+    lead = tag("p", verdict, class_="lead alarm" if found.drifts else "lead")
+    figures = [_misses(found, place, axis), _sums(found, place, _times(found)[1])]
+    rows = [[str(cell) for cell in row.values()] for row in found.content()["rows"]]
+    table = data_table("Checks in the order of time", list(found.content()["rows"][0]), rows)
+    parts = [
+        *section("Verdict", lead, *(tag("p", line) for line in rest)),
+        *section("Over time", tag("div", *figures, class_="figures")),
+        *section("Every check", table),
+    ]
+    name = title or "Checks"
+    write_text(Path(path), page(f"Checks: {name}", "Checks of a calibrated robot", name, parts))
+
+
+def written_checks(found: Monitoring, out: Path | None, title: str) -> list[Path]:
+    """Write the page, or its points where the file is a table; nothing without a file."""
+    if out is None:
+        return []
+    if out.suffix.lower() not in (".html", ".csv"):
+        raise InputError("--out", f"'{out.name}'", "a name that ends in .html or .csv")
+    with refused(out):
+        if out.suffix.lower() == ".csv":
+            write_text(out, found.csv())
+        else:
+            write_checks(found, out, title)
+    return [out]
+
+
+def _times(found: Monitoring) -> tuple[Array, Axis]:
+    """Return where checks stand on the axis of time, and that axis."""
+    count = len(found.label)
+    if found.when is None or not np.ptp(found.when) > 0:
+        place = np.arange(1, count + 1, dtype=float)
+        return place, Axis("check", (1, max(count, 2)))
+    span = float(np.ptp(found.when))
+    unit, name = 1.0, "seconds"
+    if span > 2 * HOUR:
+        unit, name = HOUR, "hours"
+    if span > 2 * DAY:
+        unit, name = DAY, "days"
+    place = (found.when - found.when[0]) / unit
+    return place, Axis(f"{name} since the first check", (0.0, float(place[-1])))
+
+
+def _misses(found: Monitoring, place: Array, axis: Axis) -> Element:
+    """Draw what every check misses, in standard deviations of a new reading, and what one of all may."""
+    high = float(max(found.sigmas.max(), found.allowed.max()))
+    chart = Chart("What every check misses, and what it may", axis, Axis("standard deviations", (0.0, 1.05 * high)))
+    chart.line(place, found.allowed, "mark")
+    hints = [
+        f"{label}: {sigmas:.1f} standard deviations, {mm(1e3 * error)} mm"
+        for label, sigmas, error in zip(found.label, found.sigmas, found.error, strict=True)
+    ]
+    beyond = np.isin(np.arange(len(place)), found.beyond)
+    for which, class_ in ((~beyond, "after"), (beyond, "mark")):
+        chart.dots(place[which], found.sigmas[which], class_, [hints[i] for i in np.flatnonzero(which)])
+    return figure(chart, "Each alone, beyond the checks before it.", ("after", "check"), ("mark", "limit, beyond it"))
+
+
+def _sums(found: Monitoring, place: Array, axis: Axis) -> Element:
+    """Draw the cumulative sum, its limit, and where it passes that first."""
+    high = float(max(found.sums.max(), found.limit))
+    chart = Chart("Cumulative sum of what checks miss, and its limit", axis, Axis("sum", (0.0, 1.05 * high)))
+    chart.line(place, np.full(len(place), found.limit), "mark")
+    chart.line(place, found.sums, "after")
+    alarm = found.alarm
+    if alarm is not None:
+        chart.dots(place[[alarm]], found.sums[[alarm]], "mark", [f"alarm at {found.label[alarm]}"])
+    return figure(chart, "Together (CUSUM).", ("after", "sum"), ("mark", "limit, alarm"))

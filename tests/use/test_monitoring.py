@@ -1,0 +1,128 @@
+"""Checks over time: no drift where there is none, and where there is one, since when and of what."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.data.times import seconds, time_column
+from rpim_opt.use.cusum import cumulative, limit, passing
+from tests.simulate import simulated
+from tests.test_cli import run
+
+SIGMA = 5e-5
+FIRST, PLACES, CHECKS = 40, 6, 24
+
+
+@cache
+def calibrated(seed: int) -> tuple[ro.calibration.Calibration, np.ndarray, np.ndarray]:
+    """Return a calibration, the true deviations, and places where the arm is checked."""
+    problem, truth = simulated(configurations=FIRST + PLACES, noise=SIGMA, seed=seed)
+    first = problem.on(problem.data.take(np.arange(FIRST)))
+    return ro.calibrate(first, ro.tikhonov, weight=1.0), truth, problem.data.q[FIRST:]
+
+
+def checked(seed: int, course: np.ndarray, name: str = "theta3") -> tuple[ro.calibration.Calibration, ro.Dataset]:
+    """Return a calibration, and checks of its arm while one parameter moves by a course (N,) [SI]."""
+    result, truth, places = calibrated(seed)
+    k = result.problem.parameters.free.names.index(name)
+    q = places[np.arange(len(course)) % PLACES]
+    problem = result.problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), SIGMA))
+    y = []
+    for i, moved in enumerate(course):
+        x = truth.copy()
+        x[k] += moved
+        y.append(-problem.residual(x).reshape(-1, 3)[i])
+    noise = SIGMA * np.random.default_rng([seed, 5]).normal(size=(len(q), 3))
+    return result, ro.Dataset.of(q, np.array(y) + noise, SIGMA)
+
+
+def test_a_robot_that_stays_as_it_is() -> None:
+    found = ro.use.monitor(*checked(0, np.zeros(CHECKS)))
+    assert not found.drifts
+    assert found.content()["moved"] is None
+    assert str(found).startswith("No drift in 24 checks.")
+
+
+def test_a_step_is_found_with_its_moment_and_size() -> None:
+    found = ro.use.monitor(*checked(1, np.where(np.arange(CHECKS) >= 12, 5e-4, 0.0)))
+    assert found.drifts
+    assert found.alarm is not None
+    assert 12 <= found.alarm <= 16
+    drift = found.drift
+    assert drift is not None
+    assert (drift.cause.name, drift.first, drift.steady) == ("theta3", 12, False)
+    assert abs(drift.change - 5e-4) < 4 * drift.std
+
+
+def test_a_slow_drift_is_no_step() -> None:
+    found = ro.use.monitor(*checked(2, np.linspace(0, 1e-3, CHECKS)))
+    assert found.drift is not None
+    assert (found.drift.cause.name, found.drift.steady) == ("theta3", True)
+    assert "steadily" in str(found)
+
+
+def test_one_wrong_check_is_named() -> None:
+    result, data = checked(0, np.zeros(CHECKS))
+    block = data.blocks[0]
+    y = block.y.copy()
+    y[7] += 1e-3
+    found = ro.use.monitor(result, ro.Dataset.of(block.q[:, 0], y, SIGMA))
+    assert found.beyond == (7,)
+
+
+def test_times_order_the_checks() -> None:
+    result, data = checked(1, np.where(np.arange(CHECKS) >= 12, 5e-4, 0.0))
+    order = np.random.default_rng(0).permutation(CHECKS)
+    found = ro.use.monitor(result, data)
+    shuffled = ro.use.monitor(result, data.take(order), 86400.0 * order)
+    np.testing.assert_allclose(shuffled.sums, found.sums, atol=1e-6)
+    with pytest.raises(InputError, match="one a check"):
+        ro.use.monitor(result, data, np.zeros(3))
+
+
+def test_the_limit_is_passed_as_rarely_as_it_says() -> None:
+    """5000 draws of 30 deviates, of which one in twenty passes: within four standard deviations of that."""
+    h = limit(30, 0.05)
+    draws = np.random.default_rng(3).normal(size=(5000, 30))
+    passed = np.mean([cumulative(each).max() > h for each in draws])
+    assert abs(passed - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 5000)
+    assert passing(0.0, 5) == 1.0
+
+
+def test_times_of_tables() -> None:
+    assert time_column(["q1_deg", "Timestamp", "x_mm"]) == "Timestamp"
+    assert time_column(["theta1", "x_mm", "tool"]) is None
+    assert seconds("t [ms]", ["0", "1500"]).tolist() == [0.0, 1.5]
+    assert np.ptp(seconds("stamp", ["1700000000000000000", "1700000001000000000"])) == pytest.approx(1.0)
+    assert np.ptp(seconds("date", ["2026-03-01 10:00", "2026-03-01T10:01:00+00:00"])) == 60
+    with pytest.raises(InputError, match="row 2"):
+        seconds("time", ["0", "noon"])
+
+
+def test_the_command(monkeypatch, capsys, tmp_path) -> None:
+    result, data = checked(1, np.where(np.arange(CHECKS) >= 12, 5e-4, 0.0))
+    ro.store.save_result(result, tmp_path / "result.json")
+    block = data.blocks[0]
+    columns = {"date": [f"2026-03-{i + 1:02}" for i in range(CHECKS)]}
+    columns |= {f"q{i + 1}_rad": [repr(float(v)) for v in block.q[:, 0, i]] for i in range(6)}
+    columns |= {f"{axis}_m": [repr(float(v)) for v in block.y[:, i]] for i, axis in enumerate("xyz")}
+    file = tmp_path / "checks.csv"
+    file.write_text(csv_text(list(columns), zip(*columns.values(), strict=True)), encoding="utf-8")
+    page = tmp_path / "checks.html"
+    assert run(monkeypatch, "monitor", str(tmp_path), str(file), "--out", str(page), "--json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["moved"]["name"] == "theta3"
+    assert document["rows"][0]["time"] == "2026-03-01"
+    assert document["left_out"] == []
+    text = page.read_text(encoding="utf-8")
+    assert "days since the first check" in text
+    assert text.count("<svg") == 2
+    assert run(monkeypatch, "monitor", str(tmp_path), str(file), "--out", str(tmp_path / "checks.csv.txt")) == 2
+    assert "ends in .html or .csv" in capsys.readouterr().err
