@@ -100,7 +100,10 @@ def new(
     separator: Annotated[str, typer.Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, typer.Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[
-        str | None, typer.Option(help="position, pose, cable, distance, plane or sphere; guessed from the columns.")
+        str | None,
+        typer.Option(
+            help="position, pose, cable, distance, plane, sphere, eye_in_hand, ...; guessed from the columns."
+        ),
     ] = None,
     validation: Annotated[Path | None, typer.Option(help="A table to keep apart for validation.")] = None,
     hold_out: Annotated[
@@ -109,6 +112,9 @@ def new(
     seed: Annotated[int, typer.Option(min=0, help="Of the configurations that are kept apart.")] = 0,
     urdf_base: Annotated[str | None, typer.Option(help="Link where the robot starts, if not the root.")] = None,
     urdf_tip: Annotated[str | None, typer.Option(help="Link where it ends, if there are several.")] = None,
+    target: Annotated[
+        str, typer.Option(help="What a camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm.")
+    ] = "",
     as_json: Json = False,
 ) -> None:
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
@@ -129,7 +135,7 @@ def new(
         with refused(folder):
             made = new_problem(
                 folder, robot, data, measurement=measurement, asked=asked, validation=validation, hold_out=hold_out,
-                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip,
+                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, target=target,
                 understood=None if as_json else lambda found: show(f"{found}\n", {}, as_json),
             )  # fmt: skip
     document = {"written": [made.folder], "rows": made.rows, "notes": made.notes, **made.understood.content()}

@@ -44,6 +44,8 @@ UNITS = {
     "rad_per_K": Unit("angle per temperature", 1.0),
     "mrad_per_K": Unit("angle per temperature", 1e-3),
     "urad_per_K": Unit("angle per temperature", 1e-6),
+    "px": Unit("pixel", 1.0),
+    "px2": Unit("pixel2", 1.0),
     "m_per_N": Unit("length per force", 1.0),
     "mm_per_N": Unit("length per force", 1e-3),
     "um_per_N": Unit("length per force", 1e-6),
@@ -67,6 +69,7 @@ DISPLAY = {
     "length per temperature": "um_per_K",
     "angle per temperature": "urad_per_K",
     "length per force": "um_per_N",
+    "pixel": "px",
 }
 """The unit in which a dimension is shown and written."""
 
@@ -77,7 +80,9 @@ def accepted_units(dimension: str) -> list[str]:
 
 
 def display(dimension: str) -> tuple[str, float]:
-    """Return the unit for showing a dimension and its size in SI."""
+    """Return the unit for showing a dimension and its size in SI; no unit for the dimension ``""``."""
+    if not dimension:
+        return "", 1.0
     name = DISPLAY[dimension]
     return name, UNITS[name].si
 
@@ -178,7 +183,8 @@ def quantities(
         if stem not in dimensions:
             names = _accepted(dimensions)
             raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
-        if unit is None or unit.dimension not in dimensions[stem]:
+        unit = unit or Unit("", 1.0)
+        if unit.dimension not in dimensions[stem]:
             raise InputError(place, "no unit that fits", ", ".join(spelled(stem, dimensions[stem])))
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")

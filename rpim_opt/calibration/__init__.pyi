@@ -4,6 +4,8 @@ from .acceptance import accept as accept
 from .asking import calibrate as calibrate
 from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
+from .expected import Improvement as Improvement
+from .expected import improvement as improvement
 from .leaving_out import Influence as Influence
 from .leaving_out import influence as influence
 from .outcome import Iteration as Iteration

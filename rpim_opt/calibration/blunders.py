@@ -22,6 +22,8 @@ WELL_DETERMINED = 10.0
 """Equations a parameter from which on no single row can pull the fit to itself."""
 TRUSTED, STEPS = 1.5, 50
 """Medians up to which a resistant fit trusts a row wholly; reweighted fits, at most."""
+KINDS = {"angle": 1, "pixel": 2}
+"""Numbers of the dimensions whose errors are compared with their own medians; 0 for all others."""
 SAME = 1e-3
 """Weights of rows that have settled change by no more."""
 RUN = 0.01
@@ -80,11 +82,11 @@ def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     X = problem.jacobian(x) * scale
     y = problem.residual(x) + problem.jacobian(x) @ x
     rows = np.concatenate([np.repeat(b.row, len(b.measurement.components)) for b in problem.data.blocks])
-    angles = np.concatenate([_angles(b.measurement.components.values(), len(b.row)) for b in problem.data.blocks])
+    kinds = np.concatenate([_kinds(b.measurement.components.values(), len(b.row)) for b in problem.data.blocks])
     z = x / scale
     weight = np.ones(len(problem.data))
     for _ in range(STEPS):
-        unit = _medians(y - X @ z, rows, angles)
+        unit = _medians(y - X @ z, rows, kinds)
         relative = (y - X @ z) / unit
         size = np.sqrt(np.bincount(rows, relative**2) / np.bincount(rows))
         before = weight
@@ -97,14 +99,15 @@ def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     return scale * z
 
 
-def _angles(dimensions: Iterable[str], rows: int) -> np.ndarray:
-    return np.tile([dimension == "angle" for dimension in dimensions], rows)
+def _kinds(dimensions: Iterable[str], rows: int) -> np.ndarray:
+    return np.tile([KINDS.get(dimension, 0) for dimension in dimensions], rows)
 
 
-def _medians(e: Array, rows: np.ndarray, angles: np.ndarray) -> Array:
-    """Return the median size of an error of its kind for every equation (m,): of angles, and of all others."""
+def _medians(e: Array, rows: np.ndarray, kinds: np.ndarray) -> Array:
+    """Return the median size of an error of its kind for every equation (m,): angles, pixels, and all others."""
     found = np.empty_like(e)
-    for kind in (angles, ~angles):
+    for number in range(1 + max(KINDS.values())):
+        kind = kinds == number
         if kind.any():
             mean = np.bincount(rows[kind], e[kind] ** 2) / np.maximum(np.bincount(rows[kind]), 1)
             seen = np.bincount(rows[kind]) > 0

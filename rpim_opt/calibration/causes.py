@@ -72,7 +72,8 @@ def likely_causes(result: Outcome) -> list[str]:
     head = f"The fit is bad: {'; '.join(signs)}."
     if causes or shared:
         return [head, *(f"Likely: {text}" for text in [*causes, *shared])]
-    if noise_ratio(problem, errors) > HOPELESS:
+    pixels = problem.errors(result.x, "pixel")
+    if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
         return [
             head,
             "No mistake that was tried explains it: look at rpim-opt inspect, the robot's drawing, the units.",
@@ -102,17 +103,21 @@ def _signs(result: Outcome, problem: CalibrationProblem, errors: Array) -> list[
     ratio = noise_ratio(problem, errors)
     if ratio > NOISY:
         signs.append(f"its errors have an RMS of {1e3 * _rms(errors):.3g} mm, {ratio:.3g} times the stated noise")
+    pixels = problem.errors(result.x, "pixel")
+    ratio = noise_ratio(problem, pixels, "pixel")
+    if ratio > NOISY:
+        signs.append(f"its errors have an RMS of {_rms(pixels):.3g} px, {ratio:.3g} times the stated noise")
     if not result.converged:
         signs.append("it did not converge")
     signs += _large(result, problem)
     return signs
 
 
-def noise_ratio(problem: CalibrationProblem, errors: Array) -> float:
-    """Return the RMS of errors (N,) [m] over that of the stated noise; 0 where no length was measured."""
+def noise_ratio(problem: CalibrationProblem, errors: Array, dimension: str = "length") -> float:
+    """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 where none of the dimension was measured."""
     squares = np.zeros(len(errors))
     for block in problem.data.blocks:
-        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
+        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == dimension]
         squares[block.row] = np.einsum("nii->ni", block.covariance)[:, lengths].sum(axis=1)
     of = np.isfinite(errors) & (squares > 0)
     if not of.any():

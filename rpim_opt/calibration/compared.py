@@ -71,16 +71,15 @@ class Comparison:
 
     @cached_property
     def dimension(self) -> str:
-        """``length``, or ``angle`` where none was measured."""
-        if any(stack.length.any() for stack in self.columns.data.stacks):
-            return "length"
-        return "angle"
+        """``length``; ``angle`` where none was measured, ``pixel`` where a camera alone has seen."""
+        stacks = self.columns.data.stacks
+        return next(d for d in ("length", "angle", "pixel") if any(stack.of(d).any() for stack in stacks))
 
     @cached_property
     def equations(self) -> np.ndarray:
         """The numbers of the equations of that dimension."""
         stacks = self.columns.data.stacks
-        return np.sort(np.concatenate([stack.index[getattr(stack, self.dimension)] for stack in stacks]))
+        return np.sort(np.concatenate([stack.index[stack.of(self.dimension)] for stack in stacks]))
 
     @cached_property
     def row(self) -> np.ndarray:

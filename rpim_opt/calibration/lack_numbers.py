@@ -18,7 +18,8 @@ ALIKE = 4.0
 class LeftOver:
     """What a calibration leaves in numbers; `LackOfFit` says it in words.
 
-    RMS values are lengths of vectors [m], root of the mean square over the rows; [rad] where no length was measured.
+    RMS values are lengths of vectors [m], root of the mean square over the rows; [rad] or [px] where no length
+    was measured.
 
     Parameters
     ----------
@@ -27,7 +28,7 @@ class LeftOver:
     equations, spare
         How many equations there are, and how many the deviations leave over; with fewer than 6 nothing else is judged.
     dimension
-        ``"length"`` or ``"angle"``.
+        ``"length"``, ``"angle"`` or ``"pixel"``.
     left
         RMS of the errors of the rows.
     instrument, position, joint

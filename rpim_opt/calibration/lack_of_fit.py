@@ -57,12 +57,12 @@ class LackOfFit(LeftOver):
         return " ".join(self.sentences())
 
     def content(self) -> dict[str, Any]:
-        """Return the same as a document [mm or mrad]."""
-        unit = UNITS[self.dimension]
+        """Return the same as a document [mm, mrad or px]."""
+        unit, si = UNITS[self.dimension]
         milli = ("left", "instrument", "position", "joint", "repeatable", "excess")
         repeated = None
         if self.repeated is not None:
-            repeated = 1e3 * self.repeated
+            repeated = self.repeated / si
         likeness = None
         if self.alike is not None:
             likeness = self.alike._asdict()
@@ -70,14 +70,14 @@ class LackOfFit(LeftOver):
         for family, effect in self.present.items():
             size = None
             if effect.rms is not None:
-                size = 1e3 * effect.rms
+                size = effect.rms / si
             own[family] = {"gain": effect.gain, f"rms_{unit}": size}
         return {
             "configurations": self.configurations,
             "equations": self.equations,
             "spare": self.spare,
             "dimension": self.dimension,
-            **{f"{key}_{unit}": 1e3 * getattr(self, key) for key in milli},
+            **{f"{key}_{unit}": getattr(self, key) / si for key in milli},
             f"repeated_{unit}": repeated,
             "missing": list(self.missing),
             "identify": list(self.parameters),

@@ -13,7 +13,8 @@ NEGLIGIBLE = 0.1
 """Parts below this share of a larger one are not worth a word."""
 LOW = 0.7
 """What is left over the instrument's noise, below which that is declared too large."""
-UNITS = {"length": "mm", "angle": "mrad"}
+UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
+"""Unit in which what is left is said, and its size in SI."""
 WHAT = {
     "gravity": "gravity",
     "first harmonic": "unevenly turning joints (eccentric encoders or gears)",
@@ -45,7 +46,8 @@ def sentences(found: LeftOver) -> list[str]:
 
 
 def _size(found: LeftOver, value: float) -> str:
-    return f"{1e3 * value:.3g} {UNITS[found.dimension]}"
+    unit, si = UNITS[found.dimension]
+    return f"{value / si:.3g} {unit}"
 
 
 def _division(found: LeftOver) -> str:

@@ -232,10 +232,11 @@ def _curvature(evidence: Evidence, point: Point) -> tuple[Array, Array, Array]:
 
 
 def _variance(evidence: Evidence, point: Point) -> float:
-    """Return tr(X C X' + R) over the lengths (the angles where there are none): of a new reading, summed."""
+    """Return tr(X C X' + R) over the lengths (else angles, else pixels): of a new reading, summed."""
     total = 0.0
     for stack in evidence.data.stacks:
-        which = stack.length if stack.length.any() else stack.angle
+        kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
+        which = next(kind for kind in kinds if kind.any())
         X = evidence.data.X[stack.index[which]]
         R = stack.covariance(evidence.scatter(point.logs))
         total += float(np.sum((X @ point.C) * X) + np.sum(np.einsum("nkk->nk", R)[which]))

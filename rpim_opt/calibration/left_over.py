@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from rpim_opt.calibration.alike import Alike, alike
 from rpim_opt.calibration.compared import OWNED, SPEAK, Comparison, Judged
 from rpim_opt.calibration.families import TURNED
 from rpim_opt.convex.prior import family_of
-from rpim_opt.problem.loads import measured_torques
+from rpim_opt.problem.loads import measured_torques, repeatable
 from rpim_opt.problem.problem import CalibrationProblem
 
 PATTERNS = {
@@ -59,12 +60,16 @@ def parts(compared: Comparison, model: Judged) -> dict[str, float]:
     own = scatter.position
     if compared.dimension == "angle":
         own = scatter.orientation
+    only = replace(scatter, instrument=0.0, joint=0.0)
     for stack in model.evidence.data.stacks:
-        which = getattr(stack, compared.dimension)
+        which = stack.of(compared.dimension)
         stated = np.einsum("nkk->nk", stack.instrument)
         levers = np.sum(stack.joint**2, axis=2)
         squares["instrument"] += scatter.instrument**2 * float(np.sum(stated[which]))
-        squares["position"] += own**2 * float(np.sum(which))
+        if compared.dimension == "pixel":
+            squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
+        else:
+            squares["position"] += own**2 * float(np.sum(which))
         squares["joint"] += scatter.joint**2 * float(np.sum(levers[which]))
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
@@ -161,7 +166,7 @@ def repeated(problem: CalibrationProblem, x: Array, dimension: str) -> Repeated:
         r = residual[start:end].reshape(-1, len(components))
         start = end
         r = r[:, [d == dimension for d in components]]
-        same = np.unique(block.q.reshape(len(r), -1).round(7), axis=0, return_inverse=True)[1].ravel()
+        same = np.unique(repeatable(block).round(7), axis=0, return_inverse=True)[1].ravel()
         count = np.bincount(same)
         mean = np.array([np.bincount(same, column) / count for column in r.T]).reshape(-1, len(count)).T
         squares += float(np.sum((r - mean[same]) ** 2))

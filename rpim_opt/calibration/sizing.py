@@ -125,7 +125,7 @@ class Learning:
     def _kinds(self, data: Linearized) -> tuple[str, ...]:
         """Return the parts of the scatter that the equations have."""
         have = {"instrument"}
-        if any(stack.length.any() for stack in data.stacks):
+        if any(stack.positional for stack in data.stacks):
             have |= {"position", "joint"}
         if any(stack.angle.any() for stack in data.stacks):
             have.add("orientation")

@@ -62,7 +62,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
         seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
         sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
         allowed[block.row] = np.where(seen, _limit(k, result.freedom, N), np.nan)
-        lengths = np.array([d == "length" for d in block.measurement.components.values()])
+        lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
         inside.append(within[seen][:, lengths].ravel())
     covered = np.concatenate(inside)

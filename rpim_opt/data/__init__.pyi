@@ -1,3 +1,6 @@
+from .board import grid_board as grid_board
+from .board import read_board as read_board
+from .board import views as views
 from .contact import KnownAngle as KnownAngle
 from .contact import KnownDistance as KnownDistance
 from .contact import touches as touches

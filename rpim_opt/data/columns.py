@@ -12,6 +12,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, numbers, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, spelled, split_unit, with_unit
 from rpim_opt.data.models import Measurement
+from rpim_opt.data.projection import TARGET
 from rpim_opt.robot.mdh import Robot
 
 Numbers = dict[tuple[str, str], Array]
@@ -27,6 +28,8 @@ def text_columns(kind: Measurement) -> list[str]:
         names.append("to_marker")
     if kind.touching:
         names += ["point", "plane"]
+    if kind.metres is not None:
+        names.append("point")
     return names
 
 
@@ -72,6 +75,11 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
             _add(columns, name, table[name], known, names, label)
     for stem in _required(columns, robot, kind):
         if (stem, "") not in columns:
+            if stem in TARGET:
+                accepted = (
+                    'the target\'s points: target = "board.csv", or columns target_x_mm, target_y_mm, target_z_mm'
+                )
+                raise InputError("the target", "nothing", accepted)
             accepted = " or ".join(with_unit(stem, known[stem][0]))
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
     return columns
@@ -132,7 +140,7 @@ def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
     """Return the stems that must be there: joints, measured values, and whole groups of what is there in part."""
     joints = [f"q{i}" for i in range(1, robot.dof + 1)]
     torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
-    required = [*joints, *values_form(columns, kind)[0]]
+    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in TARGET)]
     sides = [f"approach{i}" for i in range(1, robot.dof + 1)]
     groups = [torques, sides]
     if kind.points == 2:

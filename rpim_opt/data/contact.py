@@ -282,8 +282,8 @@ def by_points(data: Dataset) -> Dataset:
         return of
 
     for block in data.blocks:
-        if block.point is not None:
-            for row, names in zip(block.row, block.point, strict=True):
+        if block.touched is not None:
+            for row, names in zip(block.row, block.touched, strict=True):
                 for name in names:
                     group[root(("point", name))] = root(("rows", data.configuration[row]))
     joined = [root(("rows", number)) for number in data.configuration]

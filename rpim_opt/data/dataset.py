@@ -48,7 +48,7 @@ class Block(Brief):
     robot
         Whose rows these are; ``""`` for the only robot.
     point
-        (N, p) names of the points that were touched, or None.
+        (N, p) names of the points that were touched or seen, or None.
     """
 
     measurement: Measurement
@@ -67,6 +67,13 @@ class Block(Brief):
 
     def _short(self) -> str:
         return f"{counted(len(self.row), 'row')} of {self.measurement.name}"
+
+    @property
+    def touched(self) -> np.ndarray | None:
+        """(N, p) names of the points that were touched; None for what a camera has seen."""
+        if self.measurement.metres is not None:
+            return None
+        return self.point
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""

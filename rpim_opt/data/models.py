@@ -11,6 +11,15 @@ import casadi as ca
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief
+from rpim_opt.data.projection import (
+    INTRINSICS,
+    STRETCH,
+    TARGET,
+    beside_the_robot,
+    metres_beside_the_robot,
+    metres_on_the_flange,
+    on_the_flange,
+)
 from rpim_opt.data.rotations import (
     from_angles,
     from_matrices,
@@ -79,6 +88,9 @@ class Measurement(Brief):
         the point, in the robot's own base frame.
     planar
         Whether what was touched is a plane.
+    metres
+        ``metres(*T, **own)``: how long a unit of the residual is at the thing that was measured [m], for residuals that
+        are no lengths: errors in millimetres are the residual times it. None for lengths and angles.
 
     Examples
     --------
@@ -127,6 +139,7 @@ class Measurement(Brief):
     extra: Mapping[str, str] = field(default_factory=dict)
     touching: bool = False
     planar: bool = False
+    metres: Callable[..., Any] | None = None
 
     def _short(self) -> str:
         return f"'{self.name}': {', '.join(self.components)}"
@@ -252,7 +265,27 @@ known_parallel = Measurement(
 )
 """Two touched planes are parallel: r = -(t1'n2, t2'n2), with two directions t in the first."""
 
-MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere, revisit)}
+eye_in_hand = Measurement(
+    "eye_in_hand",
+    model=on_the_flange,
+    columns={"u": "pixel", "v": "pixel"},
+    noise={"pixel": "pixel"},
+    parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
+    | {f"board_{name}": d for name, d in STRETCH.items()},
+    sees=tuple(TARGET),
+    extra=TARGET,
+    metres=metres_on_the_flange,
+)
+"""A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
+in the board's frame, which is the instrument's."""
+
+eye_to_hand = replace(eye_in_hand, name="eye_to_hand", model=beside_the_robot, metres=metres_beside_the_robot)
+"""A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
+camera's frame, which is the instrument's."""
+
+CAMERAS = {m.name: m for m in (eye_in_hand, eye_to_hand)}
+"""Measurements by a camera."""
+MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere, revisit, *CAMERAS.values())}
 """What a problem file may name."""
 KNOWN = (known_distance, known_square, known_parallel)
 """What a drawing knows of things that were touched: no measurements, though they have equations."""

@@ -274,6 +274,8 @@ def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[s
         return "", ""
     if dimensions[0] in units:
         return units[dimensions[0]], "--units"
+    if dimensions[0] == "pixel":
+        return "px", "the only unit"
     of = dialect(name)
     if of is not None and dimensions[0] in ("angle", "length"):
         return getattr(of, dimensions[0]), of.why

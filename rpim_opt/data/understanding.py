@@ -19,9 +19,10 @@ from rpim_opt.data.orientations import from_vectors, quaternion_columns
 from rpim_opt.data.spelling import split
 from rpim_opt.robot.mdh import Robot
 
-_OF = {"x": "x", "y": "y", "z": "z", "rx": "roll", "ry": "pitch", "rz": "yaw", "distance": "distance"}
+_OF = {"x": "x", "y": "y", "z": "z", "rx": "roll", "ry": "pitch", "rz": "yaw", "distance": "distance",
+       "u": "pixel, to the right", "v": "pixel, downwards"}  # fmt: skip
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
-         "to_marker": "reflector of the second point", "point": "point that was touched",
+         "to_marker": "reflector of the second point", "point": "point that was touched or seen",
          "plane": "plane that was touched"}  # fmt: skip
 
 

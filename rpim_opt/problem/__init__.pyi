@@ -20,5 +20,7 @@ from .postures import postures_at as postures_at
 from .problem import CalibrationProblem as CalibrationProblem
 from .scatter import Scatter as Scatter
 from .several import together as together
+from .sight import postures_in_sight as postures_in_sight
 from .source import Source as Source
 from .verdict import CertifiedStart as CertifiedStart
+from .views import view_pose as view_pose

@@ -16,6 +16,7 @@ from rpim_opt.problem.located import locate
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.placing import NOMINAL_ERROR, Place
 from rpim_opt.problem.source import Source
+from rpim_opt.problem.views import camera_blocks, posed, starting_camera
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import model_parameters
@@ -70,9 +71,14 @@ def starting_parameters(
     place: Place = (0.0,) * 6 if base is None else base
     _require_reflectors(data, tools)
     places: dict[str, Place] = dict(tools)
+    own = {**(own or {}), **starting_cameras(data, own or {})}
     if base is None:
-        place, located, _ = locate(robot, data, tools)
+        place, located, _ = locate(robot, posed(data, own), tools)
         places |= {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
+        # a board or a camera that is turned otherwise is not in sight
+        turned = {block.markers[0] for block in camera_blocks(data)}
+        places |= {marker: located[marker] for marker in turned}
+        tools = {marker: places[marker] if marker in turned else tools[marker] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
     for block in data.blocks:
         kind = block.measurement
@@ -80,6 +86,17 @@ def starting_parameters(
         for name, dimension in kind.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
     return model_parameters(robot, place, tools, entries, own_frames(data))
+
+
+def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
+    """Return focal lengths and centres [px] by name of cameras of which nothing is stated in ``own``."""
+    found = {}
+    for block in camera_blocks(data):
+        names = {name: of_fixture(name, block.fixture) for name in block.measurement.parameters}
+        if len(block.row) and not any(full in own for name, full in names.items() if name.startswith("camera_")):
+            start = starting_camera(data, block)
+            found |= {of_fixture(f"camera_{name}", block.fixture): value for name, value in start.items()}
+    return found
 
 
 def own_frames(data: Dataset) -> tuple[str, ...]:
@@ -123,9 +140,9 @@ def relocated(problem: Source) -> Source | None:
     base = _frame_of(p, "base_")
     if not p.identified[base].all():
         return None
-    data = problem.sample().data
-    at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
     try:
+        data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
+        at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
         found, places, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
     except InputError:
         return None

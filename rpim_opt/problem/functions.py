@@ -18,7 +18,7 @@ from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
 
 Functions = Mapping[str, ca.Function]
-"""``residual``, ``jacobian`` and ``modelled`` of one row; inputs are deviations, nominal values and the row."""
+"""``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
 
 transform = Measurement(
     "transform", lambda T: ca.vec(T.T), {f"t{i}{j}": "" for i in range(4) for j in range(4)}, noise={"entry": ""}
@@ -55,6 +55,7 @@ class Row(NamedTuple):
     row: ca.SX
     residual: ca.SX
     modelled: ca.SX
+    metres: ca.SX
 
 
 class Kept:
@@ -111,6 +112,7 @@ def _derived(of: Row) -> Functions:
         "residual": ca.Function("residual", inputs, [of.residual]),
         "jacobian": ca.Function("jacobian", inputs, [of.residual, transposed]),
         "modelled": ca.Function("modelled", inputs, [of.modelled]),
+        "metres": ca.Function("metres", inputs, [of.metres]),
     }
 
 
@@ -151,12 +153,16 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     stated = of.loads.symbols(len(of.joint_types), len(of.markers))
     y = ca.SX.sym("y", len(measurement.columns))
     transforms = _reflectors(of, measurement, p, stated)
-    modelled = ca.densify(measurement.model(*transforms, **_keywords(of, measurement, p, stated)))
+    own = _keywords(of, measurement, p, stated)
+    modelled = ca.densify(measurement.model(*transforms, **own))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
     if residual.numel() != len(measurement.components):
         found = f"{residual.numel()} components of the residual"
         raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")
-    return Row(p.x, p.nominal, ca.vertcat(*stated, y), residual, modelled)
+    metres = ca.SX(1)
+    if measurement.metres is not None:
+        metres = measurement.metres(*transforms, **own)
+    return Row(p.x, p.nominal, ca.vertcat(*stated, y), residual, modelled, ca.densify(metres))
 
 
 def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> list[ca.SX]:

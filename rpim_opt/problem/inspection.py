@@ -17,6 +17,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.contact import contact_sentences
 from rpim_opt.problem.frames import fitted_frames
+from rpim_opt.problem.loads import repeatable
 from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.readings import better_reading
@@ -26,6 +27,8 @@ from rpim_opt.robot.mdh import Robot
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
 """A joint that moves less [rad, m] is hardly seen."""
+SPREAD = {"length": ("mm", 1e-3), "pixel": ("px", 1.0)}
+"""Units of typical deviations, where they are not milliradians."""
 STANDS_OUT = 5.0
 """Rows further than this many robust standard deviations above the median residual are listed."""
 
@@ -149,7 +152,8 @@ class Inspection(Tabled):
             for column, (dimension, cells, sigma) in values.items():
                 unit, si = display(dimension) if dimension else ("", 1.0)
                 low, high = (cells.min() / si, cells.max() / si) if len(cells) else (None, None)
-                spread = {"sigma_mm" if dimension == "length" else "sigma_mrad": None if sigma is None else 1e3 * sigma}
+                of, size = SPREAD.get(dimension, ("mrad", 1e-3))
+                spread = {f"sigma_{of}": None if sigma is None else sigma / size}
                 what = f"{name}{f' of {reflector}' if reflector else ''}: {column}"
                 rows.append({"measured": what, "unit": unit, "from": low, "to": high, **spread})
         return rows
@@ -158,7 +162,7 @@ class Inspection(Tabled):
         rows = []
         for r in self._measured_rows():
             figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
-            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad") if r.get(f"sigma_{u}") is not None]
+            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
             rows.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
         return table(["measured", "unit", "from", "to", "typical sigma"], rows)
 
@@ -276,8 +280,8 @@ def _repeated(data: Dataset) -> tuple[tuple[tuple[str, ...], ...], float | None]
     groups: list[tuple[str, ...]] = []
     squares, freedom = 0.0, 0
     for block in data.blocks:
-        N = len(block.row)
-        _, which, count = np.unique(block.q.reshape(N, -1).round(7), axis=0, return_inverse=True, return_counts=True)
+        same = repeatable(block).round(7)
+        _, which, count = np.unique(same, axis=0, return_inverse=True, return_counts=True)
         for k in np.flatnonzero(count > 1):
             rows = np.flatnonzero(which == k)
             groups.append(tuple(data.label[i] for i in block.row[rows]))

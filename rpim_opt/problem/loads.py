@@ -220,3 +220,15 @@ def bearing(
     known = {name: np.broadcast_to(np.asarray(values, dtype=float), len(data)) for name, values in columns.items()}
     block = replace(block, torque=torque, payload=payload, approach=approach, columns=known)
     return replace(data, blocks=(block,))
+
+
+def repeatable(block: Block) -> Array:
+    """Return what is the same (N, c) in rows that read the same thing again: joint values, and what a model sees else.
+
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.loads import repeatable
+    >>> repeatable(ro.load("paper_arm").problem.data.blocks[0]).shape
+    (9, 6)
+    """
+    seen = [block.columns[name][:, None] for name in block.measurement.sees if name in block.columns]
+    return np.hstack([block.q.reshape(len(block.row), -1), *seen])

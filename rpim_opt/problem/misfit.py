@@ -15,6 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.placing import NOMINAL_ERROR, TOOL_ERROR, hand_eye, transforms
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.views import camera_blocks, posed
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
@@ -53,6 +54,8 @@ class Points:
         (N, 3, 3) measured orientations; None where there are none.
     row
         (N,) row of the dataset.
+    seen
+        Whether they are poses of a camera's views.
     """
 
     q: Array
@@ -61,6 +64,7 @@ class Points:
     tools: Array
     turns: Array | None
     row: np.ndarray
+    seen: bool = False
 
     def take(self, index: Sequence[int] | np.ndarray) -> Points:
         """Return the points at ``index``."""
@@ -98,8 +102,18 @@ class Placed:
 
 
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
-    """Return the measured points of positions and poses; None where there are too few."""
-    blocks = [b for b in problem.data.blocks if b.measurement.name in ("position", "pose")]
+    """Return the measured points of positions, poses and a camera's views; None where there are too few."""
+    seen = bool(camera_blocks(problem.data))
+    data = problem.data
+    if seen:
+        own = dict(zip(problem.parameters.names, problem.parameters.nominal.tolist(), strict=True))
+        try:
+            data = posed(data, own)
+        except InputError:
+            return None
+    number = {label: i for i, label in enumerate(problem.data.label)}
+    first = np.array([number[label] for label in data.label], dtype=int)
+    blocks = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
     if sum(len(b.row) for b in blocks) < FEWEST_ROWS:
         return None
     markers = list(dict.fromkeys(b.markers[0] for b in blocks))
@@ -116,7 +130,8 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
         np.repeat(marker, [len(b.row) for b in blocks]),
         tools,
         turns,
-        np.concatenate([b.row for b in blocks]),
+        first[np.concatenate([b.row for b in blocks])],
+        seen,
     )
     whole = whole.take(np.argsort(whole.row, kind="stable"))
     if len(whole.row) > most:

@@ -34,9 +34,11 @@ from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameter_names import own_name, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
+SHIFTED = ("base_x", "base_y", "base_z")
+"""Parameters that move all of a robot alike."""
 SOME, LARGE = 1000, 20_000
 """Rows from which on a compiled function is worth loading, and worth compiling."""
 
@@ -385,8 +387,9 @@ class CalibrationProblem(Tabled):
             (n,) deviations [SI].
         dimension
             ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error. Rows without
-            such components get NaN. For touches the length is the distance from the mean of their point's touches, NaN
-            for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of them,
+            such components get NaN. ``"pixel"``: what cameras are off [px]; their length is by how much the line of
+            sight passes by the point. For touches the length is the distance from the mean of their point's touches,
+            NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of them,
             which is no measurement.
 
         Examples
@@ -400,12 +403,22 @@ class CalibrationProblem(Tabled):
         """
         errors = np.full(len(self.data), np.nan)
         for block, residual in self._residuals(x):
-            of = [i for i, d in enumerate(error_dimensions(block)) if d == dimension]
+            dimensions = list(block.measurement.components.values())
+            if dimension != "pixel":
+                dimensions = error_dimensions(block)
+                residual = self._in_lengths(block, residual, x)
+            of = [i for i, d in enumerate(dimensions) if d == dimension]
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
         if self.touches is not None:
             errors[self._rows_of_equations[self.touches.alone]] = np.nan
         return errors
+
+    def _in_lengths(self, block: Block, residual: Array, x: Array) -> Array:
+        """Return the residual (N, c) of a block in metres where it is measured in something else, else as it is."""
+        if block.measurement.metres is None:
+            return residual
+        return residual * self._evaluate(block, "metres", x)[0][:, 0]
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,).
@@ -621,7 +634,7 @@ class CalibrationProblem(Tabled):
         slopes = None
         if joints:
             slopes = self.joint_slopes(at)
-        found = stacked(self.data, slopes)
+        found = stacked(self.data, slopes, self.shifts(at))
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
@@ -682,6 +695,43 @@ class CalibrationProblem(Tabled):
             # the same joint of several robots: a row has slopes by those of its own robot alone
             np.add.at(found.T, columns, J.T)
         return found
+
+    def shifts(self, at: Array | None = None) -> Array | None:
+        """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
+
+        Zero for other rows, whose own lengths are shifted. A camera or a board that the robot holds elsewhere shifts
+        all points of a view together.
+
+        Parameters
+        ----------
+        at
+            (P,) values of all parameters [SI]; None for nominal.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> ro.load("paper_arm").problem.shifts() is None
+        True
+        >>> ro.load("camera").problem.shifts().shape
+        (960, 3)
+        """
+        if all(block.measurement.metres is None for block in self.data.blocks):
+            return None
+        p = self.parameters
+        places = np.array([own_name(name) in SHIFTED for name in p.names])
+        nominal = p.nominal
+        if at is not None:
+            nominal = at
+        alone = replace(self, parameters=replace(p, nominal=nominal, identified=places), scatter=None)
+        columns = [SHIFTED.index(own_name(name)) for name in np.array(p.names)[places]]
+        found = []
+        for block in self.data.blocks:
+            part = np.zeros((len(block.row) * len(block.measurement.components), 3))
+            if block.measurement.metres is not None:
+                slopes = alone._evaluate(block, "jacobian", np.zeros(len(columns)))[1]
+                np.add.at(part.T, columns, slopes.reshape(len(part), -1).T)
+            found.append(part)
+        return np.concatenate(found)
 
     @cached_property
     def _turning(self) -> dict[str, int]:
@@ -762,7 +812,7 @@ class CalibrationProblem(Tabled):
         alone = replace(self.data, configuration=np.arange(len(self.data)))
         count = len(self._rows_of_equations)
         found = {}
-        for stack in stacked(alone, slopes):
+        for stack in stacked(alone, slopes, self.shifts(scatter.at)):
             place = np.full(count, -1)
             place[stack.index[:, 0]] = np.arange(len(stack.index))
             found[stack.index.shape[1]] = (place, stack.covariance(scatter, reading))
@@ -831,6 +881,8 @@ def error_dimensions(block: Block) -> list[str]:
     ['length', 'length', 'length']
     """
     dimensions = list(block.measurement.components.values())
+    if block.measurement.metres is not None:
+        return ["length"] * len(dimensions)
     if block.point is not None and not block.measurement.touching:
         return ["stated " + dimension for dimension in dimensions]
     return dimensions

@@ -27,6 +27,8 @@ FEW = 60
 NEAR = 2.0
 SAME = 1.05
 """Readings that leave within this factor the same cannot be told apart."""
+MISTAKES = {False: 3, True: 1}
+"""Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
 BEAM = 8
 """First mistakes behind which a second one is looked for."""
 
@@ -126,13 +128,20 @@ def pose_readings() -> Iterator[Reading]:
         lambda points: replace(points, turns=None if points.turns is None else np.swapaxes(points.turns, 1, 2)),
     )
 
-    def inverted(points: Points) -> Points:
-        if points.turns is None:
-            return points
-        back = np.swapaxes(points.turns, 1, 2)
-        return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
+    yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", _inverted)
 
-    yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", inverted)
+
+def _inverted(points: Points) -> Points:
+    if points.turns is None:
+        return points
+    back = np.swapaxes(points.turns, 1, 2)
+    return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
+
+
+def view_readings() -> Iterator[Reading]:
+    """Yield readings of a camera's views: it is not where it is said to be."""
+    remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
+    yield Reading("the camera and the board exchanged", remedy, _inverted)
 
 
 def row_readings(count: int) -> Iterator[Reading]:
@@ -187,13 +196,16 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     if not np.isfinite(stated):
         return None
     found = _searched(problem.robot, points, stated)
-    if found is None and stated > WRONG:
+    if found is None and stated > WRONG and not points.seen:
         found = _reordered(problem.robot, points, stated) or _other_robot(problem.robot, points, stated)
     return found
 
 
 def _all(robot: Robot, points: Points) -> list[Reading]:
-    readings = [*joint_readings(robot), *measured_readings(), *row_readings(len(points.row))]
+    readings = [*joint_readings(robot), *row_readings(len(points.row))]
+    if points.seen:
+        return [*readings, *view_readings()]
+    readings += measured_readings()
     if points.turns is not None:
         readings += pose_readings()
     return readings
@@ -204,7 +216,7 @@ def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
     chain: list[Reading] = []
     current = points
     best = stated
-    for _ in range(3):
+    for _ in range(MISTAKES[points.seen]):
         each, size = _best(robot, current, _all(robot, current))
         if each is None or not size < FURTHER * best:
             break
@@ -213,7 +225,7 @@ def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
         best = size
         if best < BETTER * stated and best < WRONG:
             return _compared(chain, points, stated, current, best)
-    if stated > WRONG:
+    if stated > WRONG and not points.seen:
         pair = _pair(robot, points)
         if pair is not None and pair[1] < min(best, BETTER * stated):
             chain, best = pair

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,8 +69,8 @@ class Stack:
         (N, k, dof) slopes by the revolute joints' angles [SI]; (N, k, 0) where nobody asks. Where equations mix several
         stops of the joints, dof columns a stop.
     unit
-        (N, k, k) covariance of a unit scatter of every measured position where equations mix several; None where each
-        has its own, 1 on the diagonal for lengths.
+        (N, k, k) covariance of a unit scatter of every measured position where equations mix several, or a camera sees
+        several points of one; None where each has its own, 1 on the diagonal for lengths.
     """
 
     index: np.ndarray
@@ -79,6 +79,19 @@ class Stack:
     angle: np.ndarray
     joint: Array
     unit: Array | None = None
+
+    @property
+    def positional(self) -> bool:
+        """Whether any equation shows a scatter of positions."""
+        return self.unit is not None or bool(self.length.any())
+
+    def of(self, dimension: str) -> np.ndarray:
+        """Return which equations (N, k) are of a dimension: ``length``, ``angle``, or any other."""
+        if dimension == "length":
+            return self.length
+        if dimension == "angle":
+            return self.angle
+        return ~(self.length | self.angle)
 
     def covariance(self, scatter: Scatter, reading: bool = True) -> Array:
         """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""
@@ -96,7 +109,7 @@ class Stack:
         return found
 
 
-def stacked(data: Dataset, slopes: Array | None = None) -> list[Stack]:
+def stacked(data: Dataset, slopes: Array | None = None, shifts: Array | None = None) -> list[Stack]:
     """Return the equations of a dataset by configuration, those with equally many together.
 
     Parameters
@@ -105,6 +118,8 @@ def stacked(data: Dataset, slopes: Array | None = None) -> list[Stack]:
         The measurements; equations stand in the order of its blocks.
     slopes
         (m, dof) by the joints' angles, or None for none.
+    shifts
+        (m, 3) of what cameras see by where the robot is, zero for other equations; None where there are none.
     """
     rows = _Rows(data)
     order = np.argsort(data.configuration, kind="stable")
@@ -122,7 +137,11 @@ def stacked(data: Dataset, slopes: Array | None = None) -> list[Stack]:
         of_size = np.flatnonzero(total == k)
         place = np.full(len(total), -1)
         place[of_size] = np.arange(len(of_size))
-        found.append(rows.stack(place[number], offset, len(of_size), int(k), slopes))
+        stack = rows.stack(place[number], offset, len(of_size), int(k), slopes)
+        if shifts is not None:
+            G = shifts[stack.index]
+            stack = replace(stack, unit=G @ G.transpose(0, 2, 1) + stack.length[:, :, None] * np.eye(int(k)))
+        found.append(stack)
     return found
 
 

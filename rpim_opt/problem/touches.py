@@ -81,13 +81,13 @@ class Touches:
             each = len(block.measurement.components)
             first = start + each * np.arange(len(block.row))
             start += each * len(block.row)
-            if block.point is None:
+            if block.touched is None:
                 continue
             if not block.measurement.touching:
-                for i, (one, other) in enumerate(block.point):
+                for i, (one, other) in enumerate(block.touched):
                     stated.append((first[i] + np.arange(each), block, i, (one, other)))
                 continue
-            for equation, name in zip(first, block.point[:, 0], strict=True):
+            for equation, name in zip(first, block.touched[:, 0], strict=True):
                 at.setdefault(name, []).append(int(equation))
                 planar[name] = block.measurement.planar
         if not at:

@@ -26,6 +26,9 @@ DEFAULT_SCALE = {
     ("tool", "angle"): 10e-3,
     ("base", "length"): 100e-3,
     ("base", "angle"): 100e-3,
+    ("camera", "pixel"): 10.0,
+    ("camera", "ratio"): 1e-3,
+    ("camera", ""): 0.05,
 }
 """Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
 
@@ -110,7 +113,10 @@ def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str])
 
 def _usual(name: str, dimension: str) -> float:
     # own dimensions of a measurement have no usual size: their unit's
-    return DEFAULT_SCALE.get((group_of(name, dimension), dimension), 1.0)
+    group = group_of(name, dimension)
+    if name.startswith(("camera_", "board_")):
+        group = "camera"
+    return DEFAULT_SCALE.get((group, dimension), 1.0)
 
 
 def _of_joints(robot: Robot) -> Iterator[Entry]:

@@ -9,6 +9,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.show.pieces import mm, quantity, repeated, sets
@@ -95,6 +96,7 @@ def _notes(result: Calibration, name: str) -> list[str]:
     notes = []
     if result.record.simulated:
         notes.append("The measurements are simulated.")
+    notes += camera_remarks(result)
     notes += [line for line in result.remarks() if line != result.message or not result.converged]
     if name == "identification":
         notes.append("Without validation data the errors elsewhere in the workspace are not known to be as small.")

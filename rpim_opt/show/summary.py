@@ -10,6 +10,7 @@ import numpy as np
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import table
 from rpim_opt.calibration.acceptance import Acceptance, accept
+from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks
 from rpim_opt.calibration.lack_of_fit import judged
@@ -119,6 +120,7 @@ def _remarks(result: Calibration) -> list[str]:
         *weight_lines(result),
         count,
         *contact_remarks(result.problem.sample()),
+        *camera_remarks(result),
         *result.noise_sentence(),
         *result.remarks(),
     ]

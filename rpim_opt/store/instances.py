@@ -261,6 +261,8 @@ def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
     folder = stated.path.parent
     drawing = find_robot(stated.table.robot, folder)
     used = {stated.path.name: stated.path, drawing.name: drawing}
+    if isinstance(stated.table.target, str):
+        used[stated.table.target] = folder / stated.table.target
     for files in tables.files.values():
         used |= {file: folder / file for file in files}
     used |= {file: _result(folder / file) for file in prior_files(stated.table.prior)}

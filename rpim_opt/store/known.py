@@ -107,9 +107,9 @@ def _require_enough(data: Dataset) -> None:
     of: dict[str, tuple[Block, str]] = {}
     joined: set[str] = set()
     for block in data.blocks:
-        if block.point is None:
+        if block.touched is None:
             continue
-        for i, names in zip(block.row, block.point, strict=True):
+        for i, names in zip(block.row, block.touched, strict=True):
             if not block.measurement.touching:
                 joined |= set(names)
                 continue

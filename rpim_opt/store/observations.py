@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.tables import robodk_columns
+from rpim_opt.basics.tables import Columns, read_columns, robodk_columns
+from rpim_opt.data.board import Board, on_board
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import CAMERAS
 from rpim_opt.data.reading import read_data
 from rpim_opt.store.known import with_stated
 from rpim_opt.store.problem_file import Observation, Stated
@@ -63,10 +65,20 @@ def _read(stated: Stated, each: Observation, file: str, tcps: dict[str, list[flo
     robodk = each.layout == "robodk"
     try:
         source: Any = robodk_columns(path, stated.robot.joint_dimensions, tcps) if robodk else path
+        if stated.board is not None and each.measurement in CAMERAS:
+            source = _seen(path, stated.board)
         return read_data(source, stated.robot, each.noise or stated.table.noise, stated.kinds[each.measurement])
     except InputError as error:
         at_fault = path if robodk and error.where.startswith("row") else stated.path
         raise error.within(at_fault) from None
+
+
+def _seen(path: Path, board: Board) -> Columns:
+    """Return the columns of a table of corners, with where their points are on the board."""
+    try:
+        return on_board(read_columns(path), board)
+    except InputError as error:
+        raise error.within(path) from None
 
 
 def _together(parts: Sequence[_Part]) -> Dataset:

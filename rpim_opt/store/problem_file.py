@@ -13,6 +13,7 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.units import split_unit
+from rpim_opt.data.board import Board, grid_board, read_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.problem.scatter import Scatter
@@ -52,6 +53,14 @@ class ScatterTable(Table):
     joint: Angle = 0.0
 
 
+class GridTable(Table):
+    """A chessboard, or a grid of circles, whose points are numbered from 0 row by row."""
+
+    columns: int
+    rows: int
+    spacing: Length
+
+
 class Observation(Table):
     """Tables of one kind of measurement: ``[[observation]]``."""
 
@@ -77,6 +86,7 @@ class ProblemTable(Table):
     identification: str | None = None
     validation: str | None = None
     observation: list[Observation] = Field(default_factory=list)
+    target: str | dict[str, Any] | None = None
     exclude: dict[str, str] = Field(default_factory=dict)
     identify: list[Name] | Literal["auto"]
     formulation: str = "tikhonov"
@@ -115,6 +125,7 @@ class Stated:
     observations: tuple[Observation, ...]
     tools: Mapping[str, tuple[float, ...]]
     base: tuple[float, ...] | None
+    board: Board | None = None
 
     def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
         """Return the parameters with the file's scales and tolerances, and those identified that it names."""
@@ -155,7 +166,22 @@ def read_problem(
         observations=observations,
         tools=_tools(table, arm, path),
         base=_base(table, arm, path),
+        board=_board(table, path),
     )
+
+
+def _board(table: ProblemTable, path: Path) -> Board | None:
+    """Return the points of the board that cameras see: of a table of the folder, or of a pattern."""
+    if table.target is None:
+        return None
+    if isinstance(table.target, str):
+        return read_board(inside(path.parent, table.target, "key target", path))
+    try:
+        pattern = validate(GridTable, table.target, path)
+        return grid_board(pattern.columns, pattern.rows, float(pattern.spacing))
+    except InputError as error:
+        where = error.where.replace("key ", "key target.").replace("board", "key target").replace(".the top level", "")
+        raise InputError(where, error.found, error.accepted, path) from None
 
 
 def _tables(

@@ -13,11 +13,12 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layouts import read_raw
 from rpim_opt.basics.tables import Columns
-from rpim_opt.data.models import MEASUREMENTS, Measurement, pose, position, revisit
+from rpim_opt.data.models import MEASUREMENTS, Measurement, eye_in_hand, pose, position, revisit
 from rpim_opt.data.naming import TOUCHED
 from rpim_opt.data.orientations import ORDERS
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.several import together
+from rpim_opt.data.spelling import split
 from rpim_opt.data.understanding import Asked, Understood, meant_rows, understand
 from rpim_opt.problem.orientation import pose_misfit
 from rpim_opt.robot.chain import Described
@@ -184,7 +185,9 @@ def understand_of(
     kind = pose
     if measurement is not None:
         kind = pick(MEASUREMENTS, measurement, "measurement")
-    if measurement is None and _touching(paths, asked):
+    if measurement is None and _seeing(paths, asked):
+        kind = eye_in_hand
+    elif measurement is None and _touching(paths, asked):
         kind = revisit
     tables = _understood(paths, arm, kind, asked)
     if measurement is None and kind is pose:
@@ -219,6 +222,18 @@ def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
         raise InputError("the header", f"no positions among {names}", accepted, paths[0])
     forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
     return pose if any(form <= stems for form in forms) else position
+
+
+def _seeing(paths: Sequence[Path], asked: Asked) -> bool:
+    """Return whether a table has columns u and v: pixels."""
+    for path in paths:
+        try:
+            stems = {split(name)[0].strip().lower() for name in read_raw(path, asked.layout).columns}
+        except InputError:  # whatever it is, the one who understands it says so
+            return False
+        if {"u", "v"} <= stems:
+            return True
+    return False
 
 
 def _touching(paths: Sequence[Path], asked: Asked) -> bool:

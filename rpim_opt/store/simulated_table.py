@@ -20,6 +20,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.problem_file import Stated
+from rpim_opt.store.seen_table import seen_table
 from rpim_opt.store.touched_table import touched_table
 from rpim_opt.store.touching import touching_poses
 
@@ -75,6 +76,7 @@ class Simulation(Table):
     validation_points_mm: dict[str, list[float]] = Field(default_factory=dict)
     planes: dict[str, PlaneTable] = Field(default_factory=dict)
     validation_planes: dict[str, PlaneTable] = Field(default_factory=dict)
+    image_px: list[int] = Field(default=[1280, 960])
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -183,6 +185,8 @@ def simulated_table(
     if kind.touching:
         return touched_table(stated.robot, shape.markers, truth.parameters, truth.x, truth.plan, noise, rng, noisy), []
     count = len(random) // 2
+    if kind.metres is not None:
+        return seen_table(stated, kind, truth.parameters, truth.x, truth.plan, count, noise, rng, noisy), []
     draft = Draft(stated.robot, shape, _rows(shape, count, rng))
     draft.name(count)
     q = np.array([[random[k], random[count + k]][: kind.points] for k, _, _ in draft.rows])

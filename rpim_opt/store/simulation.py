@@ -123,7 +123,8 @@ def _truth_text(name: str | Path, made: Simulated) -> str:
     lines += ["[deviation]"]
     for parameter, (dimension, value) in made.deviations.items():
         unit, si = display(dimension)
-        lines.append(f"{parameter}_{unit} = {value / si:.12g}")
+        key = f"{parameter}_{unit}".rstrip("_")
+        lines.append(f"{key} = {value / si:.12g}")
     return "\n".join(lines).replace("'", '"') + "\n"
 
 

@@ -13,6 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import read_text
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
+from rpim_opt.data.board import on_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.naming import TOUCHED
@@ -24,9 +25,10 @@ from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.plain import toml, write_robot
 from rpim_opt.store.drawing import Source, find_source
 from rpim_opt.store.raw import Understanding, understand_of
+from rpim_opt.store.seen_target import TARGET_FILE, SeenTarget, seen_target, which_camera
 from rpim_opt.store.template import problem_text
 
-NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5)}
+NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
 """Standard deviations that are written where the data state none."""
 
 
@@ -58,6 +60,7 @@ def new_problem(
     seed: int = 0,
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
+    target: str = "",
     understood: Callable[[Understanding], None] | None = None,
 ) -> Started:
     """Make a problem folder that `load` reads; the folder is whole or not there.
@@ -84,6 +87,8 @@ def new_problem(
         Of the draw.
     urdf_base, urdf_tip
         Links between which a URDF's robot is.
+    target
+        What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
     understood
         Hears what was understood of the tables, before anything is computed.
 
@@ -110,16 +115,21 @@ def new_problem(
     found = understand_of(arm, paths, measurement, asked)
     if understood is not None:
         understood(found)
+    seen = seen_target(target)
+    _require_target(found, seen)
     kind = found.kind
+    guess = ""
+    if kind.metres is not None and measurement is None:
+        kind, guess = which_camera(arm, _on(found.columns, seen))
     noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
-    rows = _read(found.file, found.columns, arm, noise, kind)
+    rows = _read(found.file, _on(found.columns, seen), arm, noise, kind)
     columns = _labelled(found.columns, rows)
     notes = found.sentences
     tables = {"identification.csv": columns}
     apart = '# validation = "validation.csv"   # a table that no choice may see; none was given'
     if validation is not None:
         other = understand_of(arm, [validation], kind.name, found.asked)
-        _read(validation, other.columns, arm, noise, kind)
+        _read(validation, _on(other.columns, seen), arm, noise, kind)
         tables["validation.csv"] = other.columns
         notes = (*notes, *other.sentences)
         apart = f'validation = "validation.csv"\n# from {Path(validation).name}; no choice sees it'
@@ -128,10 +138,13 @@ def new_problem(
         tables = {"identification.csv": _taken(columns, ~held), "validation.csv": _taken(columns, held)}
         apart = f'validation = "validation.csv"\n# configurations drawn with seed {seed}; no choice sees them'
         rows = rows.take(np.flatnonzero(~held))
+    if seen is not None and seen.table:
+        tables[TARGET_FILE] = seen.table
     said = {
+        "target": seen.stated if seen is not None else "",
         "robot": toml(source.stated),
         "drawing": source.drawing,
-        "columns": "as you said" if measurement else _guessed(kind, columns),
+        "columns": "as you said" if measurement else guess or _guessed(kind, columns),
         "data": Path(found.file).name,
         "count": str(len(rows)),
         "validation": apart,
@@ -143,6 +156,25 @@ def new_problem(
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     return Started(folder, counts, (*notes, *guessed), found)
+
+
+def _on(columns: Columns, seen: SeenTarget | None) -> Columns:
+    """Return the columns with where their points are on the board, where there is one."""
+    if seen is None:
+        return columns
+    return on_board(columns, seen.board)
+
+
+def _require_target(found: Understanding, seen: SeenTarget | None) -> None:
+    """Refuse pixels without a board, and a board without pixels."""
+    if found.kind.metres is None and seen is not None:
+        raise InputError(
+            "--target", "a board", f"none: measurement {found.kind.name} sees no points of one", found.file
+        )
+    stated = any(name.startswith("target_x") for name in found.columns)
+    if found.kind.metres is not None and seen is None and not stated:
+        accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
+        raise InputError("the target", "nothing", accepted, found.file)
 
 
 def _guessed(kind: Measurement, columns: Columns) -> str:

@@ -9,9 +9,11 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement
-from rpim_opt.problem.frames import starting_parameters
+from rpim_opt.data.models import Measurement, of_fixture
+from rpim_opt.data.projection import INTRINSICS
+from rpim_opt.problem.frames import starting_cameras, starting_parameters
 from rpim_opt.problem.located import locate
+from rpim_opt.problem.views import camera_blocks, posed
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH
@@ -32,7 +34,7 @@ measurement = {measurement}
 identification = "identification.csv"
 # {count} rows, from {data}
 {validation}
-
+{target}
 # What may deviate from the drawing, by name or pattern: alpha, a, theta, d of every joint, Hayati's beta where axes
 # are near parallel, base_x ... base_rz, tool_x ... tool_rz. This is what "auto" means for these data.
 identify = {identify}
@@ -62,9 +64,9 @@ base_mrad = {scale}
 length_mm = 5.0
 angle_mrad = 10.0
 {base}
-# The reflector in the flange frame: {known}.
+# {reflector} in the flange frame: {known}.
 {tools}
-{known_of}
+{camera}{known_of}
 # How far the robot may miss where, for a verdict in result and report; who measured, when, with what:
 # [acceptance]
 # limit_mm = 0.1                # and a box x_mm = [300, 800], y_mm, z_mm of the base frame; else all that was measured
@@ -85,6 +87,17 @@ KNOWN_OF = """
 # sigma_mm = 0.01
 """
 """What the text says where points were touched."""
+TARGET_TEXT = """
+# Where the points that the camera sees are on their board: x along its rows, y along its columns. No view tells whether
+# it is as large as stated; where it was printed, identify board_stretch_x and board_stretch_y, too.
+{target}
+"""
+"""What it says of a board."""
+REFLECTOR = {
+    "eye_in_hand": "The camera (z forwards, x right, y down in the image)",
+    "eye_to_hand": "The board",
+}
+"""What is on the flange, where it is no reflector."""
 
 
 def problem_text(
@@ -95,8 +108,9 @@ def problem_text(
     tools = dict.fromkeys(markers, arm.tool)
     base, how = _base(arm, rows, tools)
     parameters = starting_parameters(arm.robot, rows, base, tools)
+    seen = camera_blocks(rows)
     text = TEMPLATE.format(
-        **said,
+        **{**said, "target": TARGET_TEXT.format(target=said["target"]) if seen else ""},
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
         identify=toml(_patterns(proposed(arm.robot, parameters, rows), arm.robot.dof)),
@@ -108,6 +122,8 @@ def problem_text(
         tools="\n".join(_tool_tables(markers, arm.tool)),
         label=_key(rows.label[0]),
         known_of=KNOWN_OF * kind.touching,
+        camera=_camera_tables(rows) if seen else "",
+        reflector=REFLECTOR.get(kind.name, "The reflector"),
     )
     return text, [how]
 
@@ -117,6 +133,20 @@ def _base_table(base: Array | None, how: str) -> str:
         return ""
     about = "# The robot's base in the instrument's frame; rx, ry, rz are roll, pitch, yaw (R = Rz Ry Rx)."
     return "\n".join(["", about, f"# {how}", "[base]", *_frame(base), ""])
+
+
+def _camera_tables(rows: Dataset) -> str:
+    """Return the tables that state the cameras, with what their views show."""
+    found = starting_cameras(rows, {})
+    lines = [
+        "# The camera: focal lengths and centre as the views show them, distortion k1 k2 p1 p2 k3 as OpenCV has it.",
+        "# Where they are known, state them and leave camera_* out of identify.",
+    ]
+    for fixture in sorted({block.fixture for block in camera_blocks(rows)}):
+        lines.append(f"[camera.{_key(fixture)}]" if fixture else "[camera]")
+        values = [(name, found[of_fixture(f"camera_{name}", fixture)]) for name in ("fx", "fy", "cx", "cy")]
+        lines += [f"{name}_px = {value:.1f}" for name, value in values]
+    return "\n".join(["", *lines, ""])
 
 
 def _tool_tables(markers: Sequence[str], place: Array) -> list[str]:
@@ -129,6 +159,7 @@ def _tool_tables(markers: Sequence[str], place: Array) -> list[str]:
 
 def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array]) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
+    rows = posed(rows, starting_cameras(rows, {}))
     if not {block.measurement.name for block in rows.blocks} & {"position", "pose"}:
         return arm.base, "As the robot's file has it: these measurements do not depend on it."
     found, _, verdict = locate(arm.robot, rows, tools)
@@ -159,6 +190,7 @@ def _groups(names: Sequence[str], dof: int) -> dict[str, list[str]]:
     for prefix in dict.fromkeys(name[: name.rindex("_") + 1] for name in names if "_" in name):
         groups[f"{prefix}*"] = [prefix + c for c in FRAME]
         groups[f"{prefix}[xyz]"] = [prefix + c for c in FRAME[:3]]
+    groups["camera_*"] = [f"camera_{name}" for name in INTRINSICS]
     return groups
 
 

@@ -18,6 +18,7 @@ from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.unseen import judged
+from rpim_opt.data.board import board_of, on_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.naming import rename
@@ -216,6 +217,9 @@ def read_table(result: Calibration, source: Any, measurement: str | None, units:
     given = parse_units(units)
     try:
         columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
+        board = board_of(result.problem.sample().data)
+        if kinds[name].metres is not None and board and not any(column.startswith("target_") for column in columns):
+            columns = on_board(columns, board)
         data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None

@@ -9,14 +9,14 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
-from tests.data.test_measurement import random_problem
+from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
 
 TERMS = ("compliance?", "bend*", "backlash?", "theta?")
 
 
-@pytest.mark.parametrize("kind", MEASUREMENTS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_jacobians_under_gravity_are_differences_of_residuals(kind: str) -> None:
     types = ("revolute", "prismatic", "revolute", "revolute")
     problem, rng = random_problem(kind, 3, types, identify=TERMS)

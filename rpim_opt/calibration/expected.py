@@ -1,0 +1,149 @@
+"""Whether a calibration makes a robot's positions better, decided from what identified it alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.calibration.intervals import coverage_factor
+from rpim_opt.calibration.leaving_out import influence
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.problem.identified import Machine, require_robot
+from rpim_opt.problem.predicting import moved, predicted, within_ranges
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
+
+WORTH = 0.9
+"""A calibration whose predicted error is above this part of the drawing's is worth nothing."""
+CONFIDENCE = 0.95
+"""Of the intervals."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """Position errors of the flange [m] that are expected over the joint ranges, base and tool placed as fits best.
+
+    Parameters
+    ----------
+    before
+        RMS with the drawing's parameters.
+    after
+        RMS with the identified ones.
+    within
+        What 95 % of the errors along any axis do not exceed at the place where least is known.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.calibration.Improvement(before=1e-3, after=1e-4, within=3e-4)
+    >>> found.improves, ro.calibration.Improvement(before=1e-4, after=1e-4, within=3e-4).improves
+    (True, False)
+    """
+
+    before: float
+    after: float
+    within: float
+
+    @property
+    def improves(self) -> bool:
+        """Whether identified parameters are expected to be clearly better than the drawing's."""
+        return self.after < WORTH * self.before
+
+
+def improvement(result: Calibration) -> Improvement | None:
+    """Return the expected position errors of the flange, as drawn and as identified; None where nothing tells them.
+
+    With the deviations x, D their slopes of W positions over the joint ranges less what placing base and tool anew
+    takes back, N the covariance of x by noise and B the mean square of what the penalty holds back::
+
+        after^2  = tr(D (N + B) D') / W
+        before^2 = (|D x|^2 - tr(D N D') + tr(D B D')) / W
+
+    N is that of leaving out every configuration in turn (the jackknife) where that is more than the noise says: then
+    the rows of a configuration err together, by the robot or by how it was seen, and more of them do not help.
+
+    Parameters
+    ----------
+    result
+        With a squared penalty or none, of one robot with joint limits.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.calibration.improvement(ro.load("position").calibrate())
+    >>> found.improves, found.before > 10 * found.after
+    (True, True)
+    """
+    try:
+        D, directions = _slopes(result)
+        noise, prior = _moving_apart(result)
+    except InputError:
+        return None
+    count = len(directions)
+    shown = _trace(D, noise)
+    kept = _trace(D, prior)
+    before = float(np.sum((D @ result.x) ** 2)) - shown + kept
+    each = np.einsum("nij,jk,nik->ni", directions, noise + prior, directions)
+    factor = coverage_factor(result.freedom, CONFIDENCE)
+    return Improvement(
+        before=float(np.sqrt(max(before, 0.0) / count)),
+        after=float(np.sqrt((shown + kept) / count)),
+        within=float(factor * np.sqrt(each.max())),
+    )
+
+
+def _trace(D: Array, C: Array) -> float:
+    return float(np.sum((D @ C) * D))
+
+
+def _slopes(result: Calibration) -> tuple[Array, Array]:
+    """Return the slopes of flange positions without what placing takes back, (3 W, n) and (W, 3, n)."""
+    machine = _at_flange(result)
+    q = within_ranges(machine)
+    p = predicted(machine, q).position
+    J = moved(machine, q).slope
+    D = J.reshape(-1, J.shape[2])
+    p = p - p.mean(axis=0)
+    turning = np.zeros((len(p), 3, 3))
+    turning[:, [0, 1, 2], [1, 2, 0]] = p[:, [2, 0, 1]]
+    turning[:, [0, 1, 2], [2, 0, 1]] = -p[:, [1, 2, 0]]
+    nominal = dict(zip(machine.parameters.names, machine.parameters.nominal, strict=True))
+    base = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
+    along = base[:3, :3] @ forward_kinematics(require_robot(machine), q)[:, :3, :3]
+    placing = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
+    U = np.linalg.qr(placing)[0]
+    D = D - U @ (U.T @ D)
+    return D, D.reshape(J.shape)
+
+
+def _at_flange(result: Calibration) -> Machine:
+    """Return the machine with its reflectors at the flange, looked at where it was linearized."""
+    parameters = result.problem.parameters
+    only = next(iter(result.problem.arms.values()))
+    if len(result.problem.arms) > 1:
+        only = None
+    tools = np.array([name.startswith("tool_") for name in parameters.names])
+    nominal = np.where(tools, 0.0, parameters.nominal)
+    at = np.where(tools[parameters.identified], 0.0, result.x)
+    return Machine(only, replace(parameters, nominal=nominal), result.problem.sample().data, at=at)
+
+
+def _moving_apart(result: Calibration) -> tuple[Array, Array]:
+    """Return the covariance by noise and the mean square of what is held back, (n, n) [SI]."""
+    if not result.linear_penalty:
+        raise InputError("improvement", f"formulation '{result.formulation.name}'", "a squared penalty or none")
+    spread = result.spread
+    noise = spread.noise
+    change = influence(result).change
+    if np.isfinite(change).all():
+        jackknife = change.T @ change * (len(change) - 1) / len(change)
+        if np.trace(_scaled(result, jackknife)) > np.trace(_scaled(result, noise)):
+            noise = jackknife
+    return noise, spread.prior
+
+
+def _scaled(result: Calibration, C: Array) -> Array:
+    scale = result.problem.parameters.free.scale
+    return C / np.outer(scale, scale)

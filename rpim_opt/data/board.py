@@ -1,0 +1,205 @@
+"""What a camera looks at: the points of a board, from a table or as a pattern, beside the rows that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices, pick
+from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
+from rpim_opt.basics.units import LARGEST, split_unit
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import CAMERAS
+from rpim_opt.data.projection import TARGET
+
+Board = Mapping[str, Sequence[float] | Array]
+"""Where points are on their board, (3,) each [m], by name."""
+LEAST = 2
+"""Points along either side of a pattern."""
+
+
+def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
+    """Return the points (3,) of a chessboard or a grid of circles, numbered from 0 row by row as OpenCV finds them.
+
+    Parameters
+    ----------
+    columns, rows
+        Inner corners along x and along y.
+    spacing
+        From one to the next [m].
+
+    Raises
+    ------
+    InputError
+        For fewer than two columns or rows, and a spacing that is not positive.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> board = ro.data.grid_board(9, 6, 0.025)
+    >>> len(board), board["10"]
+    (54, array([0.025, 0.025, 0.   ]))
+    """
+    if columns < LEAST or rows < LEAST:
+        raise InputError("board", f"{columns} x {rows} points", "two or more along either side")
+    if not 0 < spacing <= LARGEST:
+        raise InputError("board", f"a spacing of {spacing:g} m", "a length greater than zero")
+    y, x = np.divmod(np.arange(columns * rows), columns)
+    places = spacing * np.column_stack([x, y, np.zeros(columns * rows)])
+    return {str(i): place for i, place in enumerate(places)}
+
+
+def read_board(source: Any) -> dict[str, Array]:
+    """Return the points (3,) [m] of a board by name, from a table with columns point, x_mm, y_mm and perhaps z_mm.
+
+    Parameters
+    ----------
+    source
+        A file, a data frame, or a mapping from column names to cells.
+
+    Raises
+    ------
+    InputError
+        For columns that are missing or unknown, and a point that is there twice.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.data.read_board({"point": ["a", "b"], "x_mm": [0, 25], "y_mm": [0, 0]})["b"]
+    array([0.025, 0.   , 0.   ])
+    """
+    try:
+        return _points(read_columns(source))
+    except InputError as error:
+        raise error.within(source if isinstance(source, str | Path) else None) from None
+
+
+def _points(table: Columns) -> dict[str, Array]:
+    names = texts(table.get("point", ()), "point")
+    if not names:
+        raise InputError("the header", f"no column point among {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
+    places = {axis: np.zeros(len(names)) for axis in "xyz"}
+    given = set()
+    for name, cells in table.items():
+        stem, unit = split_unit(name)
+        if name == "point":
+            continue
+        if stem not in places or unit is None or unit.dimension != "length" or stem in given:
+            raise InputError("the header", f"column '{name}'", "point, x_mm, y_mm, perhaps z_mm, once each")
+        given.add(stem)
+        places[stem] = unit.si * numbers(cells, names, name)
+    if not given >= {"x", "y"}:
+        raise InputError("the header", f"columns {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
+    again = next((name for name in names if names.count(name) > 1 or not name), None)
+    if again is not None:
+        raise InputError("column point", f"'{again}' twice" if again else "''", "a name for every point")
+    return dict(zip(names, np.column_stack(list(places.values())), strict=True))
+
+
+def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: str = "eye_in_hand") -> Dataset:
+    """Return what a camera saw of a board, view by view.
+
+    Parameters
+    ----------
+    q
+        (V, dof) joint values of the controller in every view [rad or m].
+    board
+        Its P points by name.
+    uv
+        (V, P, 2) where they appear [px]; NaN for points that were not found.
+    sigma
+        One standard deviation [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2].
+    measurement
+        ``"eye_in_hand"``, or ``"eye_to_hand"`` where the robot carries the board.
+
+    Raises
+    ------
+    InputError
+        For shapes that do not fit together, and a measurement that is no camera's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> board = ro.data.grid_board(4, 3, 0.03)
+    >>> data = ro.data.views(np.zeros((2, 6)), board, np.full((2, 12, 2), 500.0), sigma=0.1)
+    >>> len(data), data.label[12], len(set(data.configuration))
+    (24, 'v1/0', 2)
+    """
+    kind = pick(CAMERAS, measurement, "measurement")
+    q, uv = np.asarray(q, dtype=float), np.asarray(uv, dtype=float)
+    P = len(board)
+    if q.ndim != 2 or uv.shape != (len(q), P, 2):
+        raise InputError("q and uv", f"shapes {q.shape} and {uv.shape}", f"(V, dof) and (V, {P}, 2)")
+    view, point = np.nonzero(np.isfinite(uv).all(axis=2))
+    names = np.array(list(board), dtype=object)
+    places = np.array(list(board.values()), dtype=float)[point]
+    columns = dict(zip(TARGET, places.T, strict=True))
+    spread = np.asarray(sigma, dtype=float)
+    if spread.ndim == 4:
+        spread = spread[view, point]
+    label = tuple(f"v{v}/{names[p]}" for v, p in zip(view, point, strict=True))
+    found = Dataset.of(q[view], uv[view, point], spread, label, kind, columns=columns)
+    block = replace(found.blocks[0], point=names[point][:, None])
+    return replace(found, blocks=(block,), configuration=view)
+
+
+def on_board(table: Columns, board: Board) -> Columns:
+    """Return the columns of a table of corners with where their points are on the board.
+
+    Parameters
+    ----------
+    table
+        With a column point.
+    board
+        The points by name, of one board or several.
+
+    Raises
+    ------
+    InputError
+        For a table without points, with places of its own, or with a point that no board has.
+
+    Examples
+    --------
+    >>> from rpim_opt.data.board import grid_board, on_board
+    >>> list(on_board({"point": ["3"]}, grid_board(2, 2, 0.01)).items())[1:]
+    [('target_x_m', [0.01]), ('target_y_m', [0.01]), ('target_z_m', [0.0])]
+    """
+    own = [name for name in table if split_unit(name)[0] in TARGET]
+    if own:
+        raise InputError("the header", f"column '{own[0]}' beside a target", "one of them")
+    if "point" not in table:
+        raise InputError(
+            "the header", f"no column point among {', '.join(table)}", "point: which one of the board it is"
+        )
+    names = texts(table["point"], "point")
+    for i, name in enumerate(names):
+        if name not in board:
+            label = texts(table["label"], "label")[i] if "label" in table else str(i + 1)
+            raise InputError(
+                f"row {label}, column point", f"'{name}'", "a point of the target: " + choices(name, board)
+            )
+    places = np.array([board[name] for name in names]).T.tolist()
+    return {**table, **{f"{stem}_m": values for stem, values in zip(TARGET, places, strict=True)}}
+
+
+def board_of(data: Dataset) -> dict[str, Array]:
+    """Return the points that the rows of cameras name, by name.
+
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.data.board import board_of
+    >>> board_of(ro.load("paper_arm").problem.data)
+    {}
+    """
+    found = {}
+    for block in data.blocks:
+        if block.measurement.metres is None or block.point is None:
+            continue
+        places = np.column_stack([block.columns[stem] for stem in TARGET])
+        found |= {str(name): place for name, place in zip(block.point[:, 0], places, strict=True)}
+    return found

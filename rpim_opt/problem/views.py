@@ -1,0 +1,373 @@
+"""Where a camera and its board were in every view, by homographies: what a start needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import transform
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import CAMERAS, eye_in_hand, of_fixture, pose
+from rpim_opt.data.projection import INTRINSICS, TARGET
+from rpim_opt.problem.placing import proper
+
+FEWEST = {True: 4, False: 6}
+"""Points that a view of a plane, and of points in space, has to show."""
+FLAT = 1e-6
+"""Third singular value of a board's points over the first, below which they are in a plane."""
+LEAST_VIEWS = 3
+"""Views that show focal lengths and centre."""
+UNDISTORTING = 30
+"""Rounds by which distortion is taken back; each leaves a small part of the last one's error."""
+MOST_STEPS = 50
+SETTLED, TINY = 1e-10, 1e-30
+"""A pose is found when a step gains no more than this part; added to information that may be singular."""
+UNCERTAIN = 3.0
+"""By how much a view's pose is less certain than its points would be alone."""
+
+
+def camera_blocks(data: Dataset) -> list[Block]:
+    """Return the blocks that cameras have seen."""
+    return [block for block in data.blocks if block.measurement in CAMERAS.values()]
+
+
+def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
+    """Return the directions x = X / Z, y = Y / Z (N, 2) of pixels (N, 2), without distortion.
+
+    Parameters
+    ----------
+    uv
+        Pixels.
+    camera
+        ``fx, fy, cx, cy``, and distortion where it is known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rpim_opt.problem.views import normalized
+    >>> normalized(np.array([[740.0, 480.0]]), {"fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 480.0})
+    array([[0.1, 0. ]])
+    """
+    k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
+    seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
+    xy = seen
+    for _ in range(UNDISTORTING):
+        x, y = xy.T
+        r2 = x**2 + y**2
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        across = np.column_stack([2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y])
+        xy = (seen - across) / np.maximum(radial, 0.1)[:, None]
+    return np.asarray(xy, dtype=float)
+
+
+def view_pose(points: Array, xy: Array) -> Array:
+    """Return the board in the camera's frame (4, 4) [m], from where its points are seen: PnP.
+
+    By a homography for points in a plane, the direct linear transform for others, and least squares from there; of a
+    plane's two poses that look alike the one that fits better.
+
+    Parameters
+    ----------
+    points
+        (P, 3) on the board [m].
+    xy
+        (P, 2) directions, as `normalized` has them.
+
+    Raises
+    ------
+    InputError
+        For fewer than four points of a plane, or six in space, and points on a line.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> points = np.array(list(ro.data.grid_board(4, 3, 0.03).values()))
+    >>> seen = points + [0.01, 0.02, 0.5]  # upright before the camera
+    >>> ro.problem.view_pose(points, seen[:, :2] / seen[:, 2:])[:3].round(6) + 0.0
+    array([[1.  , 0.  , 0.  , 0.01],
+           [0.  , 1.  , 0.  , 0.02],
+           [0.  , 0.  , 1.  , 0.5 ]])
+    """
+    middle, axes, planar = _plane(points)
+    if planar:
+        H = _homography((points - middle) @ axes[:2].T, xy)
+        first = _of_homography(H)
+        starts = [first, _mirrored(first)]
+    else:
+        starts = [_of_space((points - middle) @ axes.T, xy)]
+    local = (points - middle) @ axes.T
+    T = min((_refined(start, local, xy) for start in starts), key=lambda found: found[1])[0]
+    board = np.eye(4)
+    board[:3, :3] = axes
+    board[:3, 3] = -axes @ middle
+    return T @ board
+
+
+def _plane(points: Array) -> tuple[Array, Array, bool]:
+    """Return a board's middle, right-handed axes (3, 3) in rows along which points spread, and whether it is flat."""
+    middle = points.mean(axis=0)
+    _, s, axes = np.linalg.svd(points - middle, full_matrices=True)
+    s = np.append(s, np.zeros(3 - len(s)))
+    planar = bool(s[2] <= FLAT * s[0])
+    if len(points) < FEWEST[planar] or s[1] <= FLAT * s[0]:
+        found = f"{len(points)} points" if s[1] > FLAT * s[0] else "points on a line"
+        raise InputError("a view", found, f"{FEWEST[True]} or more of a plane, {FEWEST[False]} or more in space")
+    axes[2] *= np.sign(np.linalg.det(axes))
+    return middle, axes, planar
+
+
+def _scaled(points: Array) -> Array:
+    """Return a similarity (d + 1, d + 1) that puts points (P, d) about the origin, at a distance of about one."""
+    d = points.shape[1]
+    middle = points.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)) / d))
+    T = np.eye(d + 1) / size
+    T[:d, d] = -middle / size
+    T[d, d] = 1.0
+    return T
+
+
+def _linear(points: Array, xy: Array) -> Array:
+    """Return P (3, d + 1) with xy ~ P points, by the smallest singular value (direct linear transform)."""
+    U = _scaled(points)
+    V = _scaled(xy)
+    ones = np.ones((len(points), 1))
+    X = np.hstack([points, ones]) @ U.T
+    x = np.hstack([xy, ones]) @ V.T
+    zero = np.zeros_like(X)
+    A = np.concatenate([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])])
+    P = np.linalg.svd(A)[2][-1].reshape(3, -1)
+    return np.asarray(np.linalg.solve(V, P @ U), dtype=float)
+
+
+def _homography(plane: Array, xy: Array) -> Array:
+    return _linear(plane, xy)
+
+
+def _of_homography(H: Array) -> Array:
+    """Return the pose (4, 4) whose first two axes and origin a homography shows, before the camera."""
+    scale = np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
+    H = H / np.copysign(scale, H[2, 2])
+    T = np.eye(4)
+    T[:3, :3] = proper(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
+    T[:3, 3] = H[:, 2]
+    return T
+
+
+def _mirrored(T: Array) -> Array:
+    """Return the pose whose normal leans to the other side of the line of sight: it looks much alike from far away."""
+    sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
+    turn = np.diag([-1.0, -1.0, 1.0])
+    to = transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
+    half = to.T @ turn @ to  # half a turn about the line of sight
+    found = T.copy()
+    found[:3, :3] = half @ T[:3, :3] @ turn  # and half a turn about the board's normal
+    return found
+
+
+def _of_space(points: Array, xy: Array) -> Array:
+    P = _linear(points, xy)
+    P *= np.sign(np.linalg.det(P[:, :3]))
+    T = np.eye(4)
+    T[:3, :3] = proper(P[:, :3])
+    T[:3, 3] = P[:, 3] / np.linalg.svd(P[:, :3])[1].mean()
+    return T
+
+
+def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
+    """Return the pose that fits best near a first one, by Marquardt's steps, and its sum of squares."""
+    cost, J, r = _linearized(T, points, xy)
+    damping = 1e-3
+    for _ in range(MOST_STEPS):
+        H = J.T @ J
+        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + TINY * np.eye(6), J.T @ r)
+        tried = np.eye(4)
+        tried[:3, :3] = transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
+        tried[:3, 3] = T[:3, 3] + step[3:]
+        now = _linearized(tried, points, xy)
+        damping *= 10
+        if now[0] < cost:
+            gain = cost - now[0]
+            T, (cost, J, r) = tried, now
+            damping /= 100
+            if gain < SETTLED * cost:
+                break
+        if damping > 1e6:
+            break
+    return T, cost
+
+
+def _linearized(T: Array, points: Array, xy: Array) -> tuple[float, Array, Array]:
+    """Return the sum of squares, infinite behind the camera, slopes (2 P, 6) by turn and place, and what is left."""
+    turned = points @ T[:3, :3].T
+    there = turned + T[:3, 3]
+    if not (there[:, 2] > 0).all():
+        return np.inf, np.zeros((2 * len(points), 6)), np.zeros(2 * len(points))
+    seen = there[:, :2] / there[:, 2:]
+    G = np.zeros((len(points), 2, 3))
+    G[:, 0, 0] = 1.0
+    G[:, 1, 1] = 1.0
+    G[:, :, 2] = -seen
+    G /= there[:, 2, None, None]
+    J = np.concatenate([np.cross(turned[:, None, :], G), G], axis=2).reshape(-1, 6)
+    r = (xy - seen).ravel()
+    return float(r @ r), J, r
+
+
+def views(data: Dataset, block: Block) -> Iterator[np.ndarray]:
+    """Yield the entries of a camera's block that were seen in one configuration."""
+    configuration = data.configuration[block.row]
+    for number in np.unique(configuration):
+        yield np.flatnonzero(configuration == number)
+
+
+def targets(block: Block) -> Array:
+    """Return where the points of a camera's block are on their board (N, 3) [m]."""
+    return np.column_stack([block.columns[stem] for stem in TARGET])
+
+
+def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
+    """Return focal lengths and centre [px] from the homographies of three views or more of a plane (Zhang 2000).
+
+    Parameters
+    ----------
+    data, block
+        What a camera has seen.
+
+    Raises
+    ------
+    InputError
+        For fewer views, boards that are not flat, and views all from one side, which tell no focal length.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.views import starting_camera
+    >>> data = ro.load("camera").problem.data
+    >>> found = starting_camera(data, data.blocks[0])
+    >>> list(found), 800 < found["fx"] < 1000, 800 < found["fy"] < 1000  # 915 and 880, with distortion
+    (['fx', 'fy', 'cx', 'cy'], True, True)
+    """
+    rows = []
+    points = targets(block)
+    middle, axes, planar = _plane(points)
+    unit = _scaled(block.y)
+    for view in views(data, block):
+        if planar and len(view) >= FEWEST[True]:
+            seen = np.hstack([block.y[view], np.ones((len(view), 1))]) @ unit.T
+            H = _homography((points[view] - middle) @ axes[:2].T, seen[:, :2])
+            H = H / np.linalg.norm(H[:, 0])
+            rows += [_product(H, 0, 1), _product(H, 0, 0) - _product(H, 1, 1)]
+    accepted = (
+        f"a table [camera] with fx_px, fy_px, cx_px, cy_px, or {LEAST_VIEWS} views of a flat board from several sides"
+    )
+    if len(rows) < 2 * LEAST_VIEWS:
+        raise InputError("the camera", f"{len(rows) // 2} views of a flat board", accepted)
+    b11, b22, b13, b23, b33 = np.linalg.svd(np.array(rows))[2][-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = b33 - b13**2 / b11 - b23**2 / b22
+        squares = np.array([size / b11, size / b22])
+    if not (np.isfinite(squares).all() and (squares > 0).all()):
+        raise InputError("the camera", "views that tell no focal length", accepted)
+    scale = unit[0, 0]
+    fx, fy = np.sqrt(squares) / scale
+    cx, cy = (np.array([-b13 / b11, -b23 / b22]) - unit[:2, 2]) / scale
+    return {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
+
+
+def _product(H: Array, i: int, j: int) -> Array:
+    """Return the row (5,) of h_i' B h_j in B11, B22, B13, B23, B33: the image of the absolute conic without skew."""
+    g = H[:, i]
+    h = H[:, j]
+    return np.array([g[0] * h[0], g[1] * h[1], g[0] * h[2] + g[2] * h[0], g[1] * h[2] + g[2] * h[1], g[2] * h[2]])
+
+
+def camera_of(block: Block, own: Mapping[str, float]) -> dict[str, float]:
+    """Return the intrinsics of a block from the values [SI] of all own parameters by name."""
+    return {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
+
+
+def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
+    """Return the data with a pose for every view of a camera; other measurements as they are.
+
+    Parameters
+    ----------
+    data
+        The measurements.
+    own
+        Values of the cameras' own parameters by name.
+
+    Raises
+    ------
+    InputError
+        For a camera without focal length, and views none of which shows a pose.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.views import posed
+    >>> problem = ro.load("camera").problem
+    >>> own = dict(zip(problem.parameters.names, problem.parameters.nominal))
+    >>> posed(problem.data, own).blocks
+    (<Block 24 rows of pose>,)
+    """
+    if not camera_blocks(data):
+        return data
+    blocks: list[Block] = []
+    labels: list[str] = []
+    configuration: list[int] = []
+    for block in data.blocks:
+        seen, found = block, block.row
+        if block.measurement in CAMERAS.values():
+            seen, found = _posed(data, block, camera_of(block, own))
+        blocks.append(replace(seen, row=len(labels) + np.arange(len(found))))
+        labels += [data.label[i] for i in found]
+        configuration += data.configuration[found].tolist()
+    return Dataset(tuple(blocks), tuple(labels), np.array(configuration, dtype=int))
+
+
+def _posed(data: Dataset, block: Block, camera: Mapping[str, float]) -> tuple[Block, np.ndarray]:
+    """Return the poses of a camera's views as a block, and the first row of each."""
+    if not (camera["fx"] > 0 and camera["fy"] > 0):
+        raise InputError("the camera", f"a focal length of {camera['fx']:g} px", "one greater than zero")
+    points = targets(block)
+    xy = normalized(block.y, camera)
+    _, _, planar = _plane(points)
+    f = float(np.sqrt(camera["fx"] * camera["fy"]))
+    size = float(np.ptp(points, axis=0).max())
+    entries = []
+    poses = []
+    spread = []
+    covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
+    for view in views(data, block):
+        if len(view) < FEWEST[planar]:
+            continue
+        try:
+            T = view_pose(points[view], xy[view])
+        except InputError:  # points on a line
+            continue
+        entries.append(int(view[0]))
+        poses.append(T)
+        spread.append(UNCERTAIN * np.sqrt(np.trace(covariance[view[0]]) / 2) / f * T[2, 3])
+    if not poses:
+        raise InputError("the camera", "no view that shows a pose", f"views of {FEWEST[planar]} points or more")
+    whole = np.array(poses)
+    if block.measurement is eye_in_hand:
+        whole = np.linalg.inv(whole)
+    deviation = np.array(spread)
+    variance = np.zeros((len(poses), 6))
+    variance[:, :3] = deviation[:, None] ** 2
+    variance[:, 3:] = (deviation[:, None] / size) ** 2
+    index = np.array(entries)
+    quaternion = transform.Rotation.from_matrix(whole[:, :3, :3]).as_quat()
+    y = np.hstack([whole[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
+    taken = block.take(index, index)
+    seen = replace(
+        taken, measurement=pose, y=y, covariance=variance[:, :, None] * np.eye(6), fixture="", point=None, columns={}
+    )
+    return seen, block.row[index]
