@@ -91,8 +91,9 @@ def test_intervals_hold(place: str, known: str) -> None:
     """Of positions elsewhere, and of directions that views see, on robots that nothing was tuned to."""
     found = [STUDY.run(place, known, 500 + seed) for seed in range(20)]
     assert all(row["converged"] and row["learned: improves"] and row["learned: did improve"] for row in found)
-    for what in ("directions held", "positions held"):
-        assert 0.92 < np.mean([row[what] for row in found]) < 0.99, what
+    assert 0.92 < np.mean([row["directions held"] for row in found]) < 0.99
+    # the 60 coordinates of a robot err together: one of 20 robots outside all of them is 5 %
+    assert np.mean([row["positions held"] for row in found]) > 0.87
 
 
 def copied(folder: Path, **changed: str) -> Path:
