@@ -84,7 +84,10 @@ def runs(line: str) -> bool:
 
 @pytest.mark.parametrize("block", [b for _, b in SHELL if any(map(runs, b))], ids=lambda block: block[0][:40])
 def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    write_cell(tmp_path)  # what the reader has: arm.urdf and measured.csv
+    write_cell(tmp_path)  # what the reader has: arm.urdf and measured.csv, and later new.csv and checks.csv
+    header, *later = (tmp_path / "later.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "new.csv").write_text("".join([header, *later[:8]]))
+    (tmp_path / "checks.csv").write_text("".join([header, *later[8:32]]))
     monkeypatch.chdir(tmp_path)
     for line in filter(runs, block):
         words = shlex.split(line.split("#")[0])
