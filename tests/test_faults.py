@@ -30,7 +30,7 @@ COMMANDS = {
     "study": ["study", "mine.py", "--out", "deep/study"],
     "compare": ["compare", "cell", "--formulations", "tikhonov", "--selectors", "1", "--splits", "0.25", "--out", "c"],
 }
-QUICK = ("new", "export", "export again")
+QUICK = ("new", "export again")
 RESUMED = {"study": "deep/study", "compare": "c"}
 """Where what was computed stays, to go on with."""
 

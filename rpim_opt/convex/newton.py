@@ -113,7 +113,10 @@ class Newton(Whitened):
                 vain = 0
             if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or hasty)):
                 break
-            point = self._next(point, slope, ended.gap)
+            ahead = self._next(point, slope, ended.gap)
+            if ahead is point:  # a kink that nothing told of: no step leads anywhere
+                break
+            point = ahead
         return best
 
     @property
@@ -144,6 +147,8 @@ class Newton(Whitened):
                 best = ended._replace(close=True)
                 break
             ahead = self._stepped(point, slope, bent)
+            if fresh and ahead is point:
+                break
             slope_ahead = self._slope(ahead)
             after = self._judged(ahead, slope_ahead, steps)
             if after.gap > SLOW * ended.gap and not fresh:

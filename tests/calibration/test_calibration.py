@@ -134,6 +134,7 @@ def test_identified_robot_predicts_what_the_calibration_does() -> None:
     assert np.abs(np.linalg.norm(position - data.blocks[0].y, axis=1) - result.errors()).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_covariance_is_the_spread_of_repeated_calibrations() -> None:
     identify, x = ("a[234]", "theta[234]", "d5"), []
     for seed in range(200):

@@ -44,6 +44,7 @@ def test_two_threads_calibrate_with_one_formulation(name: str) -> None:
         assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_two_threads_ask_one_program_for_violations() -> None:
     model = ro.load("paper_arm").problem.linearize(np.zeros(26))
     ball = ro.Formulation("ball", penalty=cp.sum_squares, constraints=(lambda z, p: cp.norm(z) <= 1.0,))
@@ -82,6 +83,7 @@ def test_two_threads_solve_one_program() -> None:
         np.testing.assert_allclose(one, other, atol=1e-5)  # of a scale; the square root of that
 
 
+@pytest.mark.slow
 def test_processes_get_lambdas() -> None:
     """joblib's loky sends formulations with lambdas and own variables by cloudpickle."""
     radius = 2.0

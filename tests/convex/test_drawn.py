@@ -117,7 +117,7 @@ def test_statements_hold_of_the_identified_robot() -> None:
     assert d[0] + d[1] == pytest.approx(0.29, abs=1e-9)
 
 
-@pytest.mark.parametrize("where", ["home", "fixture"])
+@pytest.mark.parametrize("where", ["home", pytest.param("fixture", marks=pytest.mark.slow)])
 def test_no_movement_is_larger_than_stated(where: str) -> None:
     """Of the robot alone, by its forward kinematics and not to first order."""
     result = calibrated(f"move at most 0.3 mm: {where}")

@@ -14,7 +14,7 @@ from tests.test_cli import run
 Q = np.random.default_rng(77).uniform(-2, 2, (50, 6))
 
 
-@pytest.mark.parametrize("criterion", ["D", "A", "E", "V"])
+@pytest.mark.parametrize("criterion", ["D", "A", pytest.param("E", marks=pytest.mark.slow), "V"])
 def test_a_design_is_near_the_best_and_better_than_chance(criterion: str) -> None:
     problem = ro.load("position").problem
     q = random_candidates(problem.robot, 300, 1)

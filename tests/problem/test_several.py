@@ -212,6 +212,7 @@ def test_one_robot_in_two_campaigns_is_one_robot_with_two_bases() -> None:
     assert len(apart.parameters.free) == len(problem.parameters.free) + 6
 
 
+@pytest.mark.slow
 def test_a_result_goes_to_a_file_and_a_report_and_commands_and_back(tmp_path: Path) -> None:
     left, right, _ = two(counts=(30, 30))
     term = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1}, joints=(2,))

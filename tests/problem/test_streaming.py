@@ -145,6 +145,7 @@ def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Datas
         ro.calibrate(problem, ro.Formulation("worst", loss=ro.minimax.loss, penalty=ro.minimax.penalty), 1.0)
 
 
+@pytest.mark.slow
 def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.Dataset], tmp_path: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet

@@ -85,6 +85,7 @@ def test_the_tables_come_from_the_seed(name: str, tmp_path: Path) -> None:
     assert_made_as_kept(name, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_tables_come_from_the_seed_on_another_processor(tmp_path: Path) -> None:
     """OpenBLAS chooses its kernels by processor; Nehalem's, without fused operations, run on every x86 of today."""
     script = """

@@ -30,6 +30,7 @@ def stating(folder: Path, text: str) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_drawing_makes_the_arm_better() -> None:
     """True statements about it: the ten of the variant, against nothing besides the data."""
     plain, drawn = ro.load("constrained"), ro.load("constrained", "drawing")
@@ -40,6 +41,7 @@ def test_a_drawing_makes_the_arm_better() -> None:
     assert after.errors(drawn.validation).mean() < 0.85 * before.errors(plain.validation).mean()
 
 
+@pytest.mark.slow
 def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
     out = tmp_path / "out"
     said = CliRunner().invoke(app, ["calibrate", "constrained", "--variant", "drawing", "--out", str(out), "--json"])

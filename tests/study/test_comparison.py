@@ -266,6 +266,7 @@ def test_functions_are_known_by_what_they_do() -> None:
     assert first == lower  # where it stands
 
 
+@pytest.mark.slow
 def test_two_processes_and_a_cluster_give_the_same(tmp_path: Path) -> None:
     own = ro.Formulation("own", loss=lambda r: cp.sum(cp.huber(r, 1.5)), penalty=cp.sum_squares)
     asked = {"problems": ["position"], "formulations": ["tikhonov", own], "selectors": ["reml", 1.0]}
@@ -363,6 +364,7 @@ def test_a_profile_counts_what_failed_as_never_near() -> None:
     np.testing.assert_allclose(of["c"], [3.0, np.inf])
 
 
+@pytest.mark.slow
 def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
     nasty = "<script>alert(1)</script>"
     found = ro.compare({nasty: "position"}, ["tikhonov", "lasso"], ["learned", "reml"], splits=5, progress=False)

@@ -300,6 +300,7 @@ def test_a_row_does_not_depend_on_the_others() -> None:
     assert ro.use.compensate(result, poses=poses[7:8]).q[0] == pytest.approx(searched.q[7], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_predicted_uncertainty_covers_what_is_missed() -> None:
     """Mean square miss over its prediction, 60 calibrations with deviations and noise as the scales say."""
     ratios, q = [], commands(ARM, 40)
