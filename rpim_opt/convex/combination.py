@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import UNITS
+from rpim_opt.basics.units import LARGEST, SMALLEST, UNITS
 
 ACCEPTED = "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'"
 NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -89,7 +89,7 @@ def _terms(terms: str, text: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
         if name in names:
             raise _wrong(text, f"'{name}' twice", "every parameter once")
         names.append(name)
-        factors.append(float(f"{sign}{factor or 1}"))
+        factors.append(_number(f"{sign}{factor or 1}", text))
         place = found.end()
     return tuple(names), tuple(factors)
 
@@ -99,7 +99,7 @@ def _figures(right: str, equals: bool, spread: str, text: str) -> tuple[float | 
     sd, unit = _quantity(spread, text)
     if not unit:
         raise _wrong(text, "no unit", f"one of {', '.join(units())} at the end")
-    if not sd > 0:
+    if not sd * UNITS[unit].si >= SMALLEST:
         raise _wrong(text, f"a standard deviation of {sd:g} {unit}", "one above zero; [constraints] fixes parameters")
     dimension = UNITS[unit].dimension
     value: float | None = None
@@ -129,7 +129,14 @@ def _quantity(figure: str, text: str) -> tuple[float, str]:
     unit = found[2] or ""
     if unit and unit not in units():
         raise _wrong(text, f"unit '{unit}'", choices(unit, units()))
-    return float(found[1].replace(" ", "")), unit
+    return _number(found[1].replace(" ", ""), text), unit
+
+
+def _number(digits: str, text: str) -> float:
+    value = float(digits)
+    if not abs(value) <= LARGEST:
+        raise _wrong(text, digits, f"numbers of at most {LARGEST:g}")
+    return value
 
 
 def units() -> list[str]:

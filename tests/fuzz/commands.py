@@ -27,7 +27,9 @@ from tests.fuzz.trial import Failure, failure, limited
 
 LONGEST = 120.0
 """Seconds that a command may take that was given a problem it can solve, on a machine that does other things, too."""
-CODES = (0, 1, 2, 3)
+CODES = (0, 1, 2, 3, 4)
+DEFAULTS = {"simulate": ("sim/",), "study": ("results/",)}
+"""What commands write where no option says where."""
 STUDY = """QUESTION = "Does it run?"
 METRICS = {}
 def cases(quick): return [{"seed": 1}, {"seed": 2}]
@@ -222,7 +224,7 @@ def _oddity(line: list[str], code: int, out: str, err: str, before: dict[str, tu
     if "output cannot be written" in err:
         return Failure(f"an input taken for an output by {line[0]}", said)
     changed = {name for name, state in listing().items() if before.get(name) != state}
-    places = ("out", "report.html", "sim/") if line[0] == "simulate" else ("out", "report.html")
+    places = ("out", "report.html", *DEFAULTS.get(line[0], ()))
     allowed = {name for name in changed if name.startswith(places)}
     left = {name for name in changed if ".part" in name}
     if changed - allowed or left:
