@@ -12,18 +12,14 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.convex.whitened import Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
 
-SOUGHT = 1e-12
-"""Duality gap, relative to the objective, that the method goes on to while that falls."""
 MOST, SOON = 100, 15
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
 """How sharp they then are, relative to those that a loss without multipliers begins with."""
 SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
-FLAT = 1e-10
-"""Curvature that unknowns have at least, where the data have about one."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 DEAR = 200_000
@@ -36,8 +32,6 @@ SLOW = 0.1
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12
 """Changes of slope below this part of what lengths allow tell nothing."""
-VAIN = 3
-"""Steps that lower the gap no more, after which a good one is taken."""
 
 _potrf: Any
 _potrs: Any
@@ -102,22 +96,21 @@ class Newton(Whitened):
 
     def _descent(self, point: Point, most: int, hasty: bool = False) -> Ended:
         """Return the best point of so many steps; a hasty one ends where some lower the gap no more."""
-        best: Any = None
-        vain = 0
-        for steps in range(most):
-            slope = self._slope(point)
-            ended = self._judged(point, slope, steps)
-            vain += 1
-            if best is None or ended.gap < best.gap:
-                best = ended
-                vain = 0
-            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and (best.good or hasty)):
+        slope = self._slope(point)
+        best = Best(self._judged(point, slope, 0))
+        gap = best.ended.gap
+        for steps in range(1, most):
+            if best.will_do(hasty=hasty):
                 break
-            ahead = self._next(point, slope, ended.gap)
+            ahead = self._next(point, slope, gap)
             if ahead is point:  # a kink that nothing told of: no step leads anywhere
                 break
             point = ahead
-        return best
+            slope = self._slope(point)
+            ended = self._judged(point, slope, steps)
+            best.meets(ended)
+            gap = ended.gap
+        return best.ended
 
     @property
     def _dear(self) -> bool:
@@ -130,40 +123,45 @@ class Newton(Whitened):
         Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
         it is computed anew.
         """
+        bent = self._known(point)
         slope = self._slope(point)
         ended = self._judged(point, slope, 0)
-        best = ended
-        bent = None
-        if point.kinked.curved is not None:
-            bent = self.at.B.T @ point.kinked.curved @ self.at.B
-        vain = 0
+        best = Best(ended)
         for steps in range(1, MOST):
-            if best.gap <= ENOUGH * abs(best.objective) or (vain >= VAIN and best.good):
+            if best.will_do(ENOUGH):
                 break
             fresh = bent is None
             if bent is None:
                 bent = self._hessian(point)
             if self.rough and self._promised(slope, bent) <= PROMISED * abs(ended.objective):
-                best = ended._replace(close=True)
-                break
+                return self._with(ended._replace(close=True), bent)
             ahead = self._stepped(point, slope, bent)
             if fresh and ahead is point:
                 break
             slope_ahead = self._slope(ahead)
-            after = self._judged(ahead, slope_ahead, steps)
-            if after.gap > SLOW * ended.gap and not fresh:
-                bent = None
-            else:
+            gap = ended.gap
+            ended = self._judged(ahead, slope_ahead, steps)
+            best.meets(ended)
+            if fresh or ended.gap <= SLOW * gap:
                 bent = self._updated(bent, point, ahead, slope_ahead - slope)
-            point, slope, ended = ahead, slope_ahead, after
-            vain += 1
-            if ended.gap < best.gap:
-                best = ended
-                vain = 0
+            else:
+                bent = None
+            point = ahead
+            slope = slope_ahead
+        return self._with(best.ended, bent)
+
+    def _known(self, point: Point) -> Array | None:
+        """Return a neighbour's second derivative of the loss (p, p), by the coordinates."""
+        if point.kinked.curved is None:
+            return None
+        return self.at.B.T @ point.kinked.curved @ self.at.B
+
+    def _with(self, ended: Ended, bent: Array | None) -> Ended:
+        """Return where the method ended, with the loss's second derivative (p, p) for the next one."""
         if bent is None:
-            return best
+            return ended
         curved = self.at.inverse.T @ bent @ self.at.inverse
-        return best._replace(kinked=best.kinked._replace(curved=curved))
+        return ended._replace(kinked=ended.kinked._replace(curved=curved))
 
     def _promised(self, slope: Array, bent: Array) -> float:
         """Return by how much the objective would fall, were it quadratic; infinite in a box."""

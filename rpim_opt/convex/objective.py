@@ -239,9 +239,14 @@ class Objective(Brief):
         >>> [ro.convex.pose(f, model).separated is not None for f in (ro.robust, ro.sum_of_norms, ro.minimax)]
         [True, True, False]
         """
-        if not self.linear_penalty or (self.constrained and self.box is None):
+        if not self._whitens:
             return None
         return self._posed.separated
+
+    @property
+    def _whitens(self) -> bool:
+        """Whether penalty and constraints fit `Whitened`: squares, or none, and at most a box."""
+        return self.linear_penalty and (self.box is not None or not self.constrained)
 
     @cached_property
     def worst(self) -> Largest | None:
@@ -256,7 +261,7 @@ class Objective(Brief):
         >>> [ro.convex.pose(f, model).worst is not None for f in (ro.minimax, mine, ro.robust)]
         [True, True, False]
         """
-        if not self.linear_penalty or (self.constrained and self.box is None):
+        if not self._whitens:
             return None
         return self._posed.worst
 

@@ -14,6 +14,12 @@ from rpim_opt.problem.linear import RANK_TOLERANCE
 
 ACCEPTED = 1e-10
 """Duality gap, relative to the objective, that a method must reach."""
+SOUGHT = 1e-12
+"""Duality gap, relative to the objective, that methods go on to while it falls."""
+VAIN = 3
+"""Steps that lower the gap no more, after which a good point is taken."""
+FLAT = 1e-10
+"""Curvature that unknowns without penalty have at least, where the data have about one."""
 FAR = 100.0
 """No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
 UNSEEN = RANK_TOLERANCE**2
@@ -53,6 +59,27 @@ class Ended(NamedTuple):
     def good(self) -> bool:
         """Whether the gap says that this is a minimum."""
         return self.gap <= ACCEPTED * max(1.0, abs(self.objective))
+
+
+@dataclass
+class Best:
+    """The point with the smallest gap that a method has met, and how many after it had none smaller."""
+
+    ended: Ended
+    vain: int = 0
+
+    def meets(self, ended: Ended) -> None:
+        """Take note of another point."""
+        self.vain += 1
+        if ended.gap < self.ended.gap:
+            self.ended = ended
+            self.vain = 0
+
+    def will_do(self, sought: float = SOUGHT, hasty: bool = False) -> bool:
+        """Whether nothing is left to go on for: the gap is as sought, or falls no more and is good or one is hasty."""
+        if self.ended.gap <= sought * abs(self.ended.objective):
+            return True
+        return self.vain >= VAIN and (self.ended.good or hasty)
 
 
 @dataclass(frozen=True, eq=False)

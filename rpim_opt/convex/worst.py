@@ -11,22 +11,16 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.epigraph import Epigraph, Least
 from rpim_opt.convex.largest import Largest
-from rpim_opt.convex.whitened import Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
 
-SOUGHT = 1e-12
-"""Duality gap, relative to the objective, at which the method ends."""
 MOST, CHANGES = 40, 1000
 """Quadratic programs, and changes of the set in each, after which another method is asked."""
-FLAT = 1e-10
-"""Curvature that unknowns without penalty have at least, where the data have about one."""
 HALVES = 12
 """How often a step is halved at most."""
 SOON = 10
 """Quadratic programs after which a neighbour was too far to begin with."""
 NEAR = 1e-2
 """Gaps below this part of the objective tell whether a step was good; larger ones do not."""
-VAIN = 3
-"""Programs that lower the gap no more, after which a good one is taken."""
 FALL = 0.1
 """Part of what the quadratic program promises that a step has to keep, or its gap is this much smaller."""
 
@@ -76,21 +70,17 @@ class Worst(Whitened):
         if kinked is not None and kinked.multipliers:
             shares = kinked.multipliers[0]
         point = self._point(z, a, r, shares, 0)
-        best = point.ended
-        vain = 0
+        best = Best(point.ended)
         most = MOST if kinked is None else SOON
         for steps in range(1, most + 1):
-            if best.gap <= SOUGHT * abs(best.objective) or (vain >= VAIN and best.good):
+            if best.will_do():
                 break
             ahead = self._next(point, steps)
             if ahead is None:
                 break
             point = ahead
-            vain += 1
-            if point.ended.gap < best.gap:
-                best = point.ended
-                vain = 0
-        return best
+            best.meets(point.ended)
+        return best.ended
 
     def _point(self, z: Array, a: Array, r: Array, shares: Array, steps: int) -> Point:
         of_loss = self.loss.slope(r, shares)

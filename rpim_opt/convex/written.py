@@ -81,9 +81,7 @@ def by_solver(
     verbose: bool,
 ) -> Found:
     """Return the minimum that a solver of CVXPY finds; without a point where it finds none."""
-    if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
-        installed = ", ".join(cp.installed_solvers())
-        raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
+    _require_installed(solver)
     written = in_numbers(objective, weight, damping)
     problem, z = written.problem, written.z
     with warnings.catch_warnings():
@@ -94,12 +92,7 @@ def by_solver(
             if not settings:
                 raise
             raise InputError("settings", f"{error}".rstrip("."), f"settings that {solver} knows") from None
-        except cp.SolverError as error:
-            if solver.upper() not in cp.installed_solvers():
-                installed = ", ".join(cp.installed_solvers())
-                raise InputError("solver", f"'{solver}'", f"one that is installed: {installed}") from None
-            return Found(f"an error of {solver}: {error}")
-        except (ValueError, ArithmeticError, RuntimeError) as error:  # solvers have errors of their own
+        except (cp.SolverError, ValueError, ArithmeticError, RuntimeError) as error:  # solvers have errors of their own
             return Found(f"an error of {solver}: {error}")
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
         return Found(problem.status)
@@ -109,3 +102,9 @@ def by_solver(
         return Found(f"{problem.status}, but outside the constraints by {missed:.1e}")
     values = [[np.ravel(np.asarray(c.dual_value, dtype=float)) for c in group] for group in written.groups]
     return Found(problem.status, point, multipliers(objective, values), int(problem.solver_stats.num_iters or 0))
+
+
+def _require_installed(solver: Any) -> None:
+    if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
+        installed = ", ".join(cp.installed_solvers())
+        raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
