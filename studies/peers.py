@@ -2,8 +2,8 @@
 
 Simulated arms (`ro.study.simulated_arm`): three ready robots in turn with errors in all six directions behind every
 link, sizes that differ from arm to arm and from link to link, every other one with a joint that is off by a degree;
-base and reflector known to some millimetres; 0.03 mm noise a coordinate; 10, 25 or 52 configurations, 52 with three
-errors of 3 mm, or 52 of arms that sag and have eccentric encoders. Judged at 200 other configurations without noise.
+base and reflector known to some millimetres; 0.03 mm noise a coordinate; 10, 15, 25, 52 or 200 configurations, 52 with
+three errors of 3 mm, or 52 of arms that sag and have eccentric encoders. Judged at 200 others without noise.
 
 All tools have the same data, the same nominal arm with base and reflector as they are known (as URDF or as rows alpha,
 a, theta, d), and identify a complete model: geometry, base and reflector. Joint values are those of the model.
@@ -78,8 +78,10 @@ CROSS_VALIDATED = "figaroh, map_cv"
 """Half a minute with 52 configurations, where its own prior without cross-validation does the same; left out there."""
 SITUATIONS = {
     "clean10": (10, {}),
+    "clean15": (15, {}),
     "clean25": (25, {}),
     "clean52": (52, {}),
+    "clean200": (200, {}),
     "blunders52": (52, {"blunders": 3}),
     "physics52": (52, {"physics": 2e-4}),
 }
@@ -409,11 +411,10 @@ def _figure(rows: list[dict[str, Any]], situations: list[str], seeds: list[int])
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-    shown = [name for name in ("clean10", "clean25", "clean52", "blunders52", "physics52") if name in situations]
     names = list(METHODS)[::-1]
-    figure = Figure(figsize=(2.2 + 2.1 * len(shown), 0.3 * len(names) + 1.2), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(shown), sharey=True))
-    for ax, situation in zip(axes, shown, strict=True):
+    figure = Figure(figsize=(2.2 + 2.1 * len(situations), 0.3 * len(names) + 1.2), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(situations), sharey=True))
+    for ax, situation in zip(axes, situations, strict=True):
         errors = _errors(rows, situation, seeds)
         for y, method in enumerate(names):
             values = errors.get(method, np.zeros(0))
