@@ -20,6 +20,8 @@ from rpim_opt.data.record import Earlier
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
 """Distrusted rows and bounds that are named one by one."""
+LAST_DIGIT = 1e-4
+"""What tables of parameters show [mm, degree]."""
 
 
 def standard_deviations(result: Outcome) -> Array:
@@ -49,6 +51,19 @@ def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
             row["std"] = float(std[i] / si)
         rows.append(row)
     return rows
+
+
+def turned_frames(result: Outcome) -> list[str]:
+    """Say where a deviation is not the difference of the columns beside it: turns of a frame are composed."""
+    names = [
+        row["name"]
+        for row in parameter_rows(result)
+        if abs(row["identified"] - row["nominal"] - row["deviation"]) > LAST_DIGIT
+    ]
+    if not names:
+        return []
+    turn = "turn the frame about the axes of the one before it: no differences of the values beside them"
+    return [f"Deviations of {listed(names)} {turn}."]
 
 
 def parameter_table(result: Outcome) -> str:

@@ -11,6 +11,7 @@ from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
+from rpim_opt.calibration.words import turned_frames
 from rpim_opt.show.pieces import figure
 from rpim_opt.show.scales import kept_tolerance
 from rpim_opt.show.svg import Axis, Chart
@@ -29,7 +30,7 @@ def parameters_section(result: Calibration) -> list[Element]:
     charts = [_deviations(result, dimension, half) for dimension in ("length", "angle") if dimension in own]
     return section(
         "Parameters",
-        tag("p", note),
+        tag("p", " ".join([note, *turned_frames(result)])),
         tag("div", *charts, class_="figures"),
         data_table("Identified parameters", head, rows),
     )

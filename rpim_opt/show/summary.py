@@ -15,7 +15,7 @@ from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.words import weight_lines
+from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import known_distance, known_parallel, known_square
 from rpim_opt.store.content import figures, sets
@@ -117,6 +117,7 @@ def _remarks(result: Calibration) -> list[str]:
     model = result.program.model
     count = f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see."
     remarks = [
+        *turned_frames(result),
         *weight_lines(result),
         count,
         *contact_remarks(result.problem.sample()),

@@ -110,3 +110,17 @@ def test_passes_are_counted(count: int, said: str) -> None:
     assert "still promises 0.5 of the objective" in doubted
     ended = _message(replace(before, outcome="", history=()), evidence, False, 7)
     assert ended == "Not converged: 7 passes were not enough; give more (max_iterations)."
+
+
+def test_turns_of_frames_are_no_differences() -> None:
+    """Whoever subtracts the columns of a frame's angles gets something else than the deviation, and is told."""
+    problem = ro.load("position").problem
+    lengths = problem.with_parameters(problem.parameters.identify(["d?", "base_[xyz]"]))
+    assert not words.turned_frames(ro.calibrate(lengths, ro.tikhonov, weight=1.0))
+    result = ro.calibrate(problem, ro.tikhonov, weight=1.0)
+    rows = {row["name"]: row for row in result.parameter_rows()}
+    told = words.turned_frames(result)[0].split(" turn ")[0]
+    for name, row in rows.items():
+        missed = abs(row["identified"] - row["nominal"] - row["deviation"])
+        assert (name in told) == (missed > 1e-4)
+    assert "base_rx" in told
