@@ -9,7 +9,7 @@ from rpim_opt.data.joining import joined
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.nearest import nearest
 from rpim_opt.data.stacking import Whole, stacked
-from rpim_opt.data.understanding import Understood
+from rpim_opt.data.understanding import Understood, row_stems
 from rpim_opt.robot.mdh import Robot
 
 
@@ -38,16 +38,21 @@ def together(
     InputError
         For columns that one table lacks, keys that are there twice, and tables without a common key.
     """
-    joints = {f"q{i}" for i in range(1, robot.dof + 1)}
-    values = {*kind.columns, *(stem for form, _ in kind.forms for stem in form)}
-    moving = [table for table in tables if table.stems & joints]
-    seen = [table for table in tables if table.stems & values]
+    stems = row_stems(robot, kind)
+    moving = [table for table in tables if table.stems & stems["joint"]]
+    seen = [table for table in tables if table.stems & stems["measured"]]
     if len(tables) == 1 or (len(moving) == len(seen) == len(tables)):
         return stacked(tables)
-    if not moving or not seen or len(moving) + len(seen) != len(tables):
-        what = ", ".join(table.file for table in tables if table not in moving and table not in seen)
-        found = f"{what or 'some tables'} with only part of joint and measured values"
-        raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
+    _require_parts(tables, moving, seen)
     if within is not None:
         return nearest(moving, seen, key, within)
     return joined(moving, seen, key)
+
+
+def _require_parts(tables: Sequence[Understood], moving: Sequence[Understood], seen: Sequence[Understood]) -> None:
+    """Raise `InputError` unless some tables have joint values, and all others measured ones."""
+    if moving and seen and len(moving) + len(seen) == len(tables):
+        return
+    lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
+    found = f"{lost or 'some tables'} with only part of joint and measured values"
+    raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")

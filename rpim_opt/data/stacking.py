@@ -25,27 +25,23 @@ def stacked(tables: Sequence[Understood]) -> Whole:
     first = tables[0]
     if len(tables) == 1:
         return Whole(first.columns, ())
-    whole: dict[str, list[Any]] = {name: list(cells) for name, cells in first.columns.items() if name != "label"}
-    notes = []
-    for table in tables[1:]:
-        matched = _matched(table, first)
-        for name in whole:
-            whole[name] += matched[name]
+    matched = [_matched(table, first) for table in tables]
+    whole = {name: [cell for columns in matched for cell in columns[name]] for name in matched[0]}
     counts = ", ".join(f"{table.file} {count(table.columns)}" for table in tables)
-    notes.append(f"rows of the files below each other: {counts}.")
-    named = [label for table in tables for label in labels(table.columns)]
-    if len(set(named)) < len(named):
-        names = _file_names(tables)
-        named = [f"{name}:{label}" for name, t in zip(names, tables, strict=True) for label in labels(t.columns)]
-        notes.append("labels are there in several files: the file's name is put before them.")
-    return Whole({"label": named, **whole}, tuple(notes))
-
-
-def _file_names(tables: Sequence[Understood]) -> list[str]:
-    names = [Path(table.file).stem for table in tables]
+    notes = [f"rows of the files below each other: {counts}."]
+    names = [name for table in tables for name in labels(table.columns)]
     if len(set(names)) < len(names):
-        return [str(i) for i in range(1, len(names) + 1)]
-    return names
+        names = [f"{file}:{name}" for file, table in _by_file(tables).items() for name in labels(table.columns)]
+        notes.append("labels are there in several files: the file's name is put before them.")
+    return Whole({"label": names, **whole}, tuple(notes))
+
+
+def _by_file(tables: Sequence[Understood]) -> dict[str, Understood]:
+    """Return tables by their files' names, by their numbers where those are the same."""
+    found = {Path(table.file).stem: table for table in tables}
+    if len(found) == len(tables):
+        return found
+    return {str(i): table for i, table in enumerate(tables, 1)}
 
 
 def count(columns: Columns) -> int:
@@ -58,21 +54,24 @@ def labels(columns: Columns) -> list[str]:
     return [str(label) for label in columns.get("label", range(1, count(columns) + 1))]
 
 
-def _matched(table: Understood, first: Understood) -> dict[str, list[Any]]:
-    """Return a table's columns under the first one's names, in its units."""
-    own = {split_unit(name): name for name in table.columns if name != "label"}
-    by_stem = {stem: (name, unit) for (stem, unit), name in own.items()}
-    wanted = [name for name in first.columns if name != "label"]
-    lacking = {split_unit(name)[0] for name in wanted} ^ set(by_stem)
+def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
+    """Return a table's columns but for labels under the first one's names, in its units."""
+    own, wanted = (_by_stem(each.columns) for each in (table, first))
+    lacking = own.keys() ^ wanted.keys()
     if lacking:
         found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
         raise InputError("the header", found, "the same columns in all files, or one file of joints and one of values")
-    matched = {}
-    for name in wanted:
-        stem, unit = split_unit(name)
-        source, other = by_stem[stem]
-        cells = list(table.columns[source])
-        if unit and other and unit.si != other.si:
-            cells = [repr(float(cell) * other.si / unit.si) for cell in cells]
-        matched[name] = cells
-    return matched
+    return {name: _in_unit(table.columns[own[stem]], own[stem], name) for stem, name in wanted.items()}
+
+
+def _by_stem(columns: Columns) -> dict[str, str]:
+    return {split_unit(name)[0]: name for name in columns if name != "label"}
+
+
+def _in_unit(cells: Sequence[Any], name: str, wanted: str) -> Sequence[Any]:
+    """Return a column's cells in the unit of another name."""
+    old = split_unit(name)[1]
+    new = split_unit(wanted)[1]
+    if old is None or new is None or old.si == new.si:
+        return cells
+    return [repr(float(cell) * old.si / new.si) for cell in cells]

@@ -14,8 +14,9 @@ from rpim_opt.basics.exceptions import InputError
 
 NAME = re.compile(r"[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|zeit|zeitstempel|date|datum|t)", re.IGNORECASE)
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
-SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9,
+SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
+"""What a unit is in lower case (`str.casefold`)."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
@@ -50,17 +51,26 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     >>> seconds("time_ms", ["0", "250"]).tolist(), seconds("date", ["1970-01-01T00:01", "1970-01-02"]).tolist()
     ([0.0, 0.25], [60.0, 86400.0])
     """
-    unit = SECONDS.get(_split(name)[1].lower(), 0.0)
-    found = np.array([_second(name, i, cell) for i, cell in enumerate(cells)], dtype=float)
-    texts = any(isinstance(cell, datetime) or not _number(cell) for cell in cells)
-    if texts:
-        return found
-    if not unit:
-        unit = SECONDS[_guessed(float(np.median(np.abs(found))) if len(found) else 0.0)]
-    return unit * found
+    read = [_read(cell) for cell in cells]
+    dates = [time for time in read if isinstance(time, datetime)]
+    numbers = [time for time in read if isinstance(time, float)]
+    if len(numbers) < len(cells) and len(dates) < len(cells):
+        raise _neither(name, cells, read)
+    if dates:
+        return np.array([date.replace(tzinfo=date.tzinfo or UTC).timestamp() for date in dates])
+    found = np.array(numbers)
+    return SECONDS[_split(name)[1].casefold() or _guessed(found)] * found
 
 
-def _guessed(size: float) -> str:
+def _neither(name: str, cells: Sequence[Any], read: Sequence[float | datetime | None]) -> InputError:
+    """Return what is said of the first cell that is no number or date, or another of them than the first one."""
+    i = next(i for i, time in enumerate(read) if time is None or type(time) is not type(read[0]))
+    accepted = "numbers, or dates as 2026-05-31T12:00:00"
+    return InputError(f"column '{name}', row {i + 1}", f"'{cells[i]}'", accepted)
+
+
+def _guessed(times: Array) -> str:
+    size = np.abs(times).max(initial=0.0)
     return next((unit for least, unit in SINCE_1970 if size >= least), "s")
 
 
@@ -71,25 +81,21 @@ def _split(name: str) -> tuple[str, str]:
     return name.strip(), ""
 
 
-def _number(cell: Any) -> bool:
+def _read(cell: Any) -> float | datetime | None:
+    """Return a cell's finite number or date; None where it is neither."""
+    if isinstance(cell, datetime):
+        return cell
     try:
-        float(cell)
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
-def _second(name: str, row: int, cell: Any) -> float:
-    """Return a cell's number, or the seconds since 1970 of its date."""
-    value = float("nan")
-    if _number(cell):
         value = float(cell)
-    else:
-        try:
-            when = cell if isinstance(cell, datetime) else datetime.fromisoformat(str(cell).strip())
-            value = when.replace(tzinfo=when.tzinfo or UTC).timestamp()
-        except ValueError:
-            pass
+    except (TypeError, ValueError):
+        return _date(cell)
     if not np.isfinite(value):
-        raise InputError(f"column '{name}', row {row + 1}", f"'{cell}'", "a number, or a date as 2026-05-31T12:00:00")
+        return None
     return value
+
+
+def _date(cell: Any) -> datetime | None:
+    try:
+        return datetime.fromisoformat(str(cell).strip())
+    except ValueError:
+        return None

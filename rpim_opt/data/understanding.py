@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,11 +20,13 @@ from rpim_opt.data.orientations import from_vectors, quaternion_columns
 from rpim_opt.data.spelling import split
 from rpim_opt.robot.mdh import Robot
 
-_OF = {"x": "x", "y": "y", "z": "z", "rx": "roll", "ry": "pitch", "rz": "yaw", "distance": "distance",
-       "u": "pixel, to the right", "v": "pixel, downwards"}  # fmt: skip
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
          "to_marker": "reflector of the second point", "point": "point that was touched or seen",
-         "plane": "plane that was touched"}  # fmt: skip
+         "plane": "plane that was touched", "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw",
+         "u": "measured pixel, to the right", "v": "measured pixel, downwards"}  # fmt: skip
+NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
+            r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
+SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
 
 
 class Meant(NamedTuple):
@@ -189,22 +192,32 @@ def _turned(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
 
 def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Columns, list[int], list[str]]:
     """Return the columns without rows that have no values, the rows that are left, and what was left out."""
-    stems = {name: split_unit(name)[0] for name in columns}
-    joints = {f"q{i}" for i in range(1, robot.dof + 1)}
-    measured = {*kind.columns, *(stem for form, _ in kind.forms for stem in form)}
     out: set[int] = set()
     notes = []
-    for what, of in (("measured", measured), ("joint", joints)):
-        rows = missing_rows(columns, [name for name, stem in stems.items() if stem in of])
+    for what, stems in row_stems(robot, kind).items():
+        rows = missing_rows(columns, [name for name in columns if split_unit(name)[0] in stems])
         notes += _without(columns, rows, what)
         out |= set(rows)
     count = len(next(iter(columns.values()), ()))
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
-    if not out:
-        return columns, kept, notes
     return {name: [cells[i] for i in kept] for name, cells in columns.items()}, kept, notes
+
+
+def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
+    """Return the names of measured and of joint values without units: a row needs both.
+
+    >>> import numpy as np
+    >>> from rpim_opt.data.models import position
+    >>> from rpim_opt.data.understanding import row_stems
+    >>> from rpim_opt.robot import Robot
+    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    >>> {what: sorted(stems) for what, stems in row_stems(arm, position).items()}
+    {'measured': ['x', 'y', 'z'], 'joint': ['q1', 'q2']}
+    """
+    forms = [stem for form, _ in kind.forms for stem in form]
+    return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
 def _without(columns: Columns, rows: Sequence[int], what: str) -> list[str]:
@@ -218,15 +231,19 @@ def _without(columns: Columns, rows: Sequence[int], what: str) -> list[str]:
 def _labelled(columns: Columns) -> tuple[Columns, list[str]]:
     """Return the columns with unique labels, of point and reflector where a point is there with several."""
     labels = [str(cell).strip() for cell in columns.get("label", ())]
-    if not labels or (len(set(labels)) == len(labels) and all(labels)):
+    if _unique(labels):
         return columns, []
     if "marker" in columns:
         both = [f"{label}/{marker}" for label, marker in zip(labels, columns["marker"], strict=True)]
-        if len(set(both)) == len(both):
+        if _unique(both):
             return {"configuration": labels, **columns, "label": both}, ["labels are those of point and reflector."]
     again = next((label for label in labels if labels.count(label) > 1), "")
     others = {name: cells for name, cells in columns.items() if name != "label"}
     return others, [f"labels are not unique ('{again}'): rows are numbered."]
+
+
+def _unique(labels: Sequence[str]) -> bool:
+    return all(labels) and len(set(labels)) == len(labels)
 
 
 def _meant(raw: RawTable, found: Renamed, vectors: Sequence[str]) -> tuple[Meant, ...]:
@@ -256,17 +273,14 @@ def meaning(stem: str) -> str:
         return NAMES[stem]
     if stem.startswith("to_"):
         return f"second point: {meaning(stem.removeprefix('to_'))}"
-    for prefix, word in (("q", "joint"), ("tau", "torque of joint")):
-        if stem.removeprefix(prefix).isdigit():
-            return f"{word} {stem.removeprefix(prefix)}"
-    for prefix, word in (("u95", "U95"), ("sigma", "standard deviation"), ("cov", "covariance")):
+    for prefix, word in SPREAD.items():
         if stem.startswith(prefix):
             return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
-    if stem in ("qw", "qx", "qy", "qz"):
-        return f"quaternion {stem[1]}"
-    if len(stem) == 3 and stem.startswith("r") and stem[1:].isdigit():
-        return f"rotation matrix {stem[1]},{stem[2]}"
-    return f"measured {_OF.get(stem, stem)}"
+    for pattern, words in NUMBERED.items():
+        match = re.fullmatch(pattern, stem)
+        if match:
+            return words.format(*match.groups())
+    return f"measured {stem}"
 
 
 def meant_rows(tables: Sequence[Understood]) -> list[dict[str, Any]]:
