@@ -20,7 +20,7 @@ from rpim_opt.calibration.diagnosis import Flag, Held
 from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
 from rpim_opt.calibration.learned import Learned
 from rpim_opt.calibration.prices import Price, prices
-from rpim_opt.calibration.ranges import Outside, measured_ranges, outside
+from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
 from rpim_opt.calibration.spread import Spread
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
@@ -292,11 +292,20 @@ class Outcome:
         >>> result.outside(instance.validation).rows
         ()
         """
-        return outside(self._ranges, data)
+        return outside(self.ranges, data)
 
     @cached_property
-    def _ranges(self) -> Mapping[str, Array]:
-        return measured_ranges(self.problem)
+    def ranges(self) -> Mapping[str, Array]:
+        """The least and largest measured value of every joint (2, dof) [rad or m], by robot, ``""`` for the only one.
+
+        Also of the calibrations that this one carries on: what they measured checked the model, too.
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).ranges[""].shape
+        (2, 6)
+        """
+        earlier = [(robot, np.array(r)) for each in self.record.earlier for robot, r in each.ranges.items()]
+        return widest([*measured_ranges(self.problem).items(), *earlier])
 
     def _at(
         self,

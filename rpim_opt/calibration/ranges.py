@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -59,15 +59,22 @@ def measured_ranges(problem: Source) -> dict[str, Array]:
 
     By robot, ``""`` for the only one.
     """
-    parts: dict[str, list[Array]] = {}
-    for part in problem.rows():
-        for block in part.data.blocks:
-            parts.setdefault(block.robot, []).append(block.q.reshape(-1, block.q.shape[2]))
-    found = {}
-    for robot, measured in parts.items():
-        low = np.min([q.min(axis=0) for q in measured], axis=0)
-        high = np.max([q.max(axis=0) for q in measured], axis=0)
-        found[robot] = np.array([low, high])
+    blocks = (block for part in problem.rows() for block in part.data.blocks)
+    return widest((block.robot, np.stack([block.q.min(axis=(0, 1)), block.q.max(axis=(0, 1))])) for block in blocks)
+
+
+def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
+    """Return the ranges (2, dof) that hold all of some, by robot.
+
+    >>> import numpy as np
+    >>> from rpim_opt.calibration.ranges import widest
+    >>> widest([("", np.array([[-1.0], [0.5]])), ("", np.array([[0.0], [2.0]]))])[""].tolist()
+    [[-1.0], [2.0]]
+    """
+    found: dict[str, Array] = {}
+    for robot, (low, high) in ranges:
+        least, most = found.get(robot, (low, high))
+        found[robot] = np.stack([np.minimum(least, low), np.maximum(most, high)])
     return found
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.ranges import measured_ranges
 from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.identified import Machine, identified_of, require_robot
@@ -118,7 +117,7 @@ def region_of(result: Outcome, requirement: Requirement) -> Region:
     problem = result.problem
     if len(problem.arms) > 1 or "" not in problem.arms:
         raise InputError("acceptance", "several robots in one calibration", "a calibration of one robot")
-    low, high = measured_ranges(problem)[""]
+    low, high = result.ranges[""]
     limits = np.column_stack([low, np.maximum(high, low + LEAST)])
     for joint, side in requirement.joints:
         if not 1 <= joint <= len(limits):

@@ -19,14 +19,16 @@ PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 class Earlier(NamedTuple):
     """The calibration that another one carries on, and how.
 
-    Its title, when it was made, the digest of its file and its number of rows; the factor on its standard deviations;
-    parameters that were let go, and rows of the new data that were left out.
+    Its title, when it was made, the digest of its file and its number of rows; the least and the largest value of every
+    joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were let go, and
+    rows of the new data that were left out.
     """
 
     title: str
     made: str
     digest: str
     rows: int
+    ranges: Mapping[str, list[list[float]]]
     inflate: float = 1.0
     let_go: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.held_out import HeldOut
 from rpim_opt.data.record import Earlier, Record
 from rpim_opt.data.requirement import Requirement, Side
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.parts import finite
 from rpim_opt.store.schema import EarlierPart, HeldOutPart, RecordPart, RequirementPart
 
@@ -31,8 +34,10 @@ def record_part(record: Record) -> dict[str, Any]:
     }
 
 
-def record_of(title: str, stated: RecordPart, validation: Dataset | None, digest: str) -> Record:
-    """Return the record that a file with a digest states."""
+def record_of(
+    title: str, stated: RecordPart, validation: Dataset | None, digest: str, arms: Mapping[str, Robot]
+) -> Record:
+    """Return the record that a file with a digest states of some robots."""
     return Record(
         title=title,
         source=stated.source,
@@ -45,7 +50,7 @@ def record_of(title: str, stated: RecordPart, validation: Dataset | None, digest
         details=stated.details,
         requirement=_requirement(stated.requirement),
         held_out=_held_out(stated.held_out),
-        earlier=tuple(_earlier(each) for each in stated.earlier),
+        earlier=tuple(_earlier(each, arms) for each in stated.earlier),
         digest=digest,
     )
 
@@ -59,9 +64,13 @@ def _earlier_part(record: Record) -> dict[str, Any]:
     return {"earlier": listed}
 
 
-def _earlier(part: EarlierPart) -> Earlier:
+def _earlier(part: EarlierPart, arms: Mapping[str, Robot]) -> Earlier:
+    for name, ranges in part.ranges.items():
+        if name not in arms or np.shape(ranges) != (2, arms[name].dof):
+            accepted = "the least and the largest value of every joint, of the file's robots"
+            raise InputError("key record.earlier", f"ranges of shape {np.shape(ranges)} of robot '{name}'", accepted)
     lists = {"let_go": tuple(part.let_go), "left_out": tuple(part.left_out)}
-    return Earlier(part.title, part.made, part.digest, part.rows, part.inflate, **lists)
+    return Earlier(part.title, part.made, part.digest, part.rows, part.ranges, part.inflate, **lists)
 
 
 def _requirement_part(requirement: Requirement | None) -> dict[str, Any] | None:

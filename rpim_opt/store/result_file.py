@@ -177,7 +177,7 @@ def _calibration(file: File, known: Mapping[str, Measurement], model: Models) ->
         program=program,
         certificate=_certificate(file),
         asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
-        record=record_of(file.title, file.record, _validation(file, problem, known), file.digest),
+        record=record_of(file.title, file.record, _validation(file, problem, known), file.digest, problem.arms),
         kept=None if formulation.solvable else _kept(file, program),
         learned=learned_of(file.learned),
     )

@@ -210,6 +210,7 @@ class EarlierPart(Part):
     made: str
     digest: str
     rows: int
+    ranges: dict[str, list[list[float]]] = Field(default_factory=dict)
     inflate: float
     let_go: list[str]
     left_out: list[str]

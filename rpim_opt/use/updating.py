@@ -162,7 +162,16 @@ def _record(result: Calibration, inflate: float, let_go: Sequence[str], left_out
     old = result.record
     digest = old.digest or content(result)["digest"]
     title = old.title or " and ".join(robot.name for robot in result.problem.arms.values())
-    last = Earlier(title, old.made, digest, len(result.problem.labels), inflate, tuple(let_go), tuple(left_out))
+    last = Earlier(
+        title,
+        old.made,
+        digest,
+        len(result.problem.labels),
+        {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
+        inflate,
+        tuple(let_go),
+        tuple(left_out),
+    )
     return Record(
         old.title,
         old.source,

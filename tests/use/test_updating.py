@@ -12,6 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
+from rpim_opt.store.content import digest
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -161,6 +162,23 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     assert len(third.result.record.earlier) == 2
     ro.show.write_report(second, tmp_path / "report.html")
     assert last.digest in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
+    q = np.concatenate([crashed.before.q, crashed.after.q])
+    np.testing.assert_array_equal(updated.result.ranges[""], [q.min(axis=0), q.max(axis=0)])
+    alone = ro.calibrate(crashed.problem.on(crashed.after))
+    assert alone.outside(crashed.before).rows
+    assert not updated.result.outside(crashed.before).rows
+    path = tmp_path / "result.json"
+    ro.store.save_result(updated.result, path)
+    np.testing.assert_array_equal(ro.load_result(path).ranges[""], updated.result.ranges[""])
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    for side in stored["record"]["earlier"][0]["ranges"][""]:
+        side.pop()
+    path.write_text(json.dumps({**stored, "digest": digest(stored)}), encoding="utf-8")
+    with pytest.raises(InputError, match="every joint"):
+        ro.load_result(path)
 
 
 def test_the_command(monkeypatch, capsys, tmp_path, crashed: Robot, first) -> None:
