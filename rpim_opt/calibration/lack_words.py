@@ -32,10 +32,11 @@ def sentences(found: LeftOver) -> list[str]:
     """Return the paragraph, sentence by sentence."""
     left = f"Left: {_size(found, found.left)} RMS"
     if not found.instrument:
-        count = max(found.spare, 0.0)
-        return [
-            f"{left}; {count:.0f} equations are left over, too few to tell what it is. Measure more configurations."
-        ]
+        count = max(round(found.spare), 0)
+        are = f"{count} equations are"
+        if count == 1:
+            are = "1 equation is"
+        return [f"{left}; {are} left over, too few to tell what it is. Measure more configurations."]
     lines = [f"{left}; {_division(found)}."]
     lines += _present(found)
     lines += _missing(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +45,10 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     verdict, *rest = str(found).splitlines()
     lead = tag("p", verdict, class_="lead alarm" if found.drifts else "lead")
     figures = [_misses(found, place, axis), _sums(found, place, _times(found)[1])]
-    rows = [[str(cell) for cell in row.values()] for row in found.content()["rows"]]
-    table = data_table("Checks in the order of time", list(found.content()["rows"][0]), rows)
     parts = [
         *section("Verdict", lead, *(tag("p", line) for line in rest)),
         *section("Over time", tag("div", *figures, class_="figures")),
-        *section("Every check", table),
+        *section("Every check", _table(found)),
     ]
     name = title or "Checks"
     write_text(Path(path), page(f"Checks: {name}", "Checks of a calibrated robot", name, parts))
@@ -85,6 +84,21 @@ def _times(found: Monitoring) -> tuple[Array, Axis]:
     return place, Axis(f"{name} since the first check", (0.0, float(place[-1])))
 
 
+def _table(found: Monitoring) -> Element:
+    """Return every check; figures beyond their limits say so."""
+    sigmas = [f"{value:.1f}" for value in found.sigmas]
+    for i in found.beyond:
+        sigmas[i] = f"beyond {sigmas[i]}"
+    sums = [f"{value:.1f}" for value in found.sums]
+    if found.alarm is not None:
+        sums[found.alarm] = f"alarm {sums[found.alarm]}"
+    columns: dict[str, Sequence[str]] = {"check": found.label}
+    if found.times:
+        columns["time"] = found.times
+    columns |= {"error [mm]": [mm(1e3 * error) for error in found.error], "sigmas": sigmas, "sum": sums}
+    return data_table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
+
+
 def _misses(found: Monitoring, place: Array, axis: Axis) -> Element:
     """Draw what every check misses, in standard deviations of a new reading, and what one of all may."""
     high = float(max(found.sigmas.max(), found.allowed.max()))
@@ -97,7 +111,12 @@ def _misses(found: Monitoring, place: Array, axis: Axis) -> Element:
     beyond = np.isin(np.arange(len(place)), found.beyond)
     for which, class_ in ((~beyond, "after"), (beyond, "mark")):
         chart.dots(place[which], found.sigmas[which], class_, [hints[i] for i in np.flatnonzero(which)])
-    return figure(chart, "Each alone, beyond the checks before it.", ("after", "check"), ("mark", "limit, beyond it"))
+    return figure(
+        chart,
+        "Each alone, by what the checks before it leave open.",
+        ("after", "check"),
+        ("mark", "limit, checks beyond it"),
+    )
 
 
 def _sums(found: Monitoring, place: Array, axis: Axis) -> Element:

@@ -19,9 +19,12 @@ def identifiability_section(result: Calibration) -> list[Element]:
     n = len(found.names)
     text = f"{found.configurations} configurations, {result.program.model.equations} equations for {n} parameters, "
     text += f"of which the data determine {found.rank} combinations at nominal."
-    if found.rank < n:
-        text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."
     told = [f"No measurement changes along {combination(each)} [mm, mrad]." for each in found.redundant]
+    if result.record.earlier:
+        text += " Of the others the calibrations that this one carries on say what they can."
+        told = []
+    elif found.rank < n:
+        text += " What follows cannot be told apart: the penalty shares it out, and predictions do not depend on it."
     if found.unseen:
         told.insert(0, f"No measurement depends on {', '.join(found.unseen)}.")
     indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())

@@ -9,6 +9,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.text import joined
 from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -78,7 +79,16 @@ def _sentence(result: Calibration, name: str, before: dict[str, Any], after: dic
     sentence = f"{where}, the mean {quantity(result)} {moves} {means}{times}."
     if not result.converged:
         return f"This calibration did not converge and should not be used. {sentence}"
-    return sentence + _from_all(result)
+    return sentence + _from_all(result) + _carried_on(result)
+
+
+def _carried_on(result: Calibration) -> str:
+    """Say what the parameters come from besides, and which of them changed since."""
+    if not result.record.earlier:
+        return ""
+    last = result.record.earlier[-1]
+    changed = joined(last.let_go) or "nothing that these measurements show"
+    return f" It carries on a calibration of {last.rows} rows; changed since: {changed}."
 
 
 def _from_all(result: Calibration) -> str:

@@ -46,6 +46,8 @@ class Path(NamedTuple):
 def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Element]:
     """Return how the weight was chosen; what the page's slider needs goes into ``embedded``."""
     said = tag("p", result.weight_sentence())
+    if result.record.earlier:  # weight 1 joins two sets of data: no other weight means anything
+        return section("What was known before", said)
     formulation = result.formulation
     if formulation.penalty is None or not formulation.solvable or result.weight <= 0:
         return section(TITLE, said)

@@ -161,7 +161,10 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     third = ro.use.update(second, crashed.now.take(np.arange(6)))
     assert len(third.result.record.earlier) == 2
     ro.show.write_report(second, tmp_path / "report.html")
-    assert last.digest in (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert last.digest in page
+    assert "changed since: theta4" in page
+    assert "What each selector takes" not in page  # weight 1 joins both sets of data, no other one does
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
