@@ -30,21 +30,6 @@ WEAK = 1e-9
 """Part of the largest eigenvalue below which readings do not see a direction of a change."""
 
 
-class Cause(NamedTuple):
-    """A change that may be why readings miss their predictions.
-
-    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
-    chi-squared falls with it, the probability of that where nothing changed, and how much it is believed afterwards.
-    """
-
-    name: str
-    kind: str
-    members: tuple[str, ...]
-    gain: float = 0.0
-    chance: float = 1.0
-    believed: float = 0.0
-
-
 class Fit(NamedTuple):
     """Chi-squared of readings about what a prior expects of them, over how many equations, and its probability."""
 
@@ -63,6 +48,21 @@ class Reading(NamedTuple):
 
     labels: tuple[str, ...]
     equations: np.ndarray
+
+
+class Cause(NamedTuple):
+    """A change that may be why readings miss their predictions.
+
+    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
+    chi-squared falls with it, the probability of that where nothing changed, and how much it is believed afterwards.
+    """
+
+    name: str
+    kind: str
+    members: tuple[str, ...]
+    gain: float = 0.0
+    chance: float = 1.0
+    believed: float = 0.0
 
 
 class Missed:

@@ -41,7 +41,7 @@ class Drift(NamedTuple):
         return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": change}
 
 
-def likeliest(carried: Carried, problem: CalibrationProblem, order: np.ndarray, rare: float) -> Drift | None:
+def likeliest(carried: Carried, problem: CalibrationProblem, rare: float) -> Drift | None:
     """Return the change that explains checks best; None where chance does, over all changes that were tried.
 
     Parameters
@@ -49,9 +49,7 @@ def likeliest(carried: Carried, problem: CalibrationProblem, order: np.ndarray, 
     carried
         The result.
     problem
-        Its problem with the checks.
-    order
-        (N,) their rows in the order of time.
+        Its problem with the checks in the order of time.
     rare
         Probability of a change where nothing moved.
     """
@@ -60,13 +58,11 @@ def likeliest(carried: Carried, problem: CalibrationProblem, order: np.ndarray, 
     penalty = carried.formulation(problem, ()).penalty
     form: Quadratic = getattr(penalty, "quadratic", None) or identity(len(result.x))
     missed = carried.missed(model, form)
-    place = np.empty(len(order), dtype=int)
-    place[order] = np.arange(len(order))
     # rows of one configuration were read together: the first of them says when
-    at = {int(c): int(place[problem.data.configuration == c].min()) for c in np.unique(problem.data.configuration)}
-    when = np.array([at[int(c)] for c in model.group])
+    numbers, first = np.unique(problem.data.configuration, return_index=True)
+    when = first[np.searchsorted(numbers, model.group)]
     free = problem.parameters.free
-    tried = list(_tried(missed, possible(free, np.ones(len(free), dtype=bool)), when, len(order)))
+    tried = list(_tried(missed, possible(free, np.ones(len(free), dtype=bool)), when, len(problem.data)))
     best = min(tried, key=lambda drift: (drift.cause.chance, -drift.cause.gain))
     if best.cause.chance * len(tried) >= rare:
         return None

@@ -38,7 +38,7 @@ class Innovations:
     deviate: Array
 
 
-def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndarray, rare: float = 0.0) -> Innovations:
+def innovations(result: Calibration, problem: CalibrationProblem, rare: float = 0.0) -> Innovations:
     """Return what checks say one after the other, each after all before it.
 
     What is not known of the robot bends all predictions alike. A Kalman filter takes that away as checks show it, so
@@ -51,9 +51,7 @@ def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndar
     result
         The calibration.
     problem
-        Its problem with the checks.
-    order
-        (N,) their rows in the order of time.
+        Its problem with the checks in the order of time.
     rare
         A check less probable than this is beyond what a reading may be: nothing is learned from it.
 
@@ -71,10 +69,10 @@ def innovations(result: Calibration, problem: CalibrationProblem, order: np.ndar
     m = np.zeros(len(C))
     rows = _rows(result, problem)
     freedom = max(result.freedom, 1.0)
-    sigmas = np.zeros(len(order))
-    chance = np.ones(len(order))
-    for t, row in enumerate(order):
-        r, J, V = rows[row]
+    sigmas = np.zeros(len(rows))
+    chance = np.ones(len(rows))
+    for t in range(len(rows)):
+        r, J, V = rows[t]
         S = J @ C @ J.T + V
         e = r - J @ m
         gain = np.linalg.solve(S, J @ C).T

@@ -90,18 +90,22 @@ class Monitoring:
         >>> found["drifts"], found["checks"], list(found["rows"][0])
         (False, 40, ['label', 'error_mm', 'sigmas', 'allowed_sigmas', 'sum'])
         """
-        alarm = self.alarm
+        alarm = None
         began = None
-        if alarm is not None:
-            began = self.label[since(self.sums, alarm)]
+        moved = None
+        if self.alarm is not None:
+            alarm = self.label[self.alarm]
+            began = self.label[since(self.sums, self.alarm)]
+        if self.drift is not None:
+            moved = {**self.drift.content(), "label": self.label[self.drift.first]}
         return {
             "drifts": self.drifts,
             "checks": len(self.label),
             "beyond": [self.label[i] for i in self.beyond],
-            "alarm": None if alarm is None else self.label[alarm],
+            "alarm": alarm,
             "since": began,
             "limit": self.limit,
-            "moved": None if self.drift is None else {**self.drift.content(), "label": self.label[self.drift.first]},
+            "moved": moved,
             "rows": self._rows(),
         }
 
@@ -132,8 +136,8 @@ class Monitoring:
     def _alarms(self) -> list[str]:
         lines = []
         if self.beyond:
-            named = [f"{self._named(i)} ({1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
-            lines.append(f"Beyond the interval of a new reading: {listed(named)}.")
+            named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
+            lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")
         alarm = self.alarm
         if alarm is not None:
             began = since(self.sums, alarm)

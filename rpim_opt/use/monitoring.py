@@ -55,7 +55,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     Raises
     ------
     InputError
-        For a result without covariance (lasso), and times that are not one a check.
+        For times that are not one a check; a result that has no covariance (lasso).
 
     Examples
     --------
@@ -66,30 +66,32 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     (False, None, 40)
     """
     count = len(data)
-    order = np.arange(count)
     if when is not None:
-        if np.shape(when) != (count,) or not np.isfinite(when).all():
-            raise InputError("monitor, when", f"shape {np.shape(when)}", f"{count} finite times [s], one a check")
+        when = np.asarray(when, dtype=float)
+        if when.shape != (count,) or not np.isfinite(when).all():
+            raise InputError("monitor, when", f"shape {when.shape}", f"{count} finite times [s], one a check")
         order = np.argsort(when, kind="stable")
+        data = data.take(order)
+        when = when[order]
+        if times:
+            times = tuple(times[i] for i in order)
     carried = Carried(result)
     problem = carried.problem(replace(data, configuration=_visits(data, when)))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
     rare = RARE / TESTS
-    allowed = np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - rare / count))
-    found = innovations(result, problem, order, rare / count)
-    sums = cumulative(found.deviate)
+    found = innovations(result, problem, rare / count)
     return Monitoring(
-        label=tuple(data.label[i] for i in order),
-        times=tuple(times[i] for i in order) if times else (),
-        when=None if when is None else np.asarray(when, dtype=float)[order],
-        error=result.errors(data)[order],
+        label=data.label,
+        times=times,
+        when=when,
+        error=result.errors(data),
         sigmas=found.sigmas,
-        allowed=allowed[order],
-        sums=sums,
+        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - rare / count)),
+        sums=cumulative(found.deviate),
         limit=limit(count, rare),
-        drift=likeliest(carried, problem, order, rare),
+        drift=likeliest(carried, problem, rare),
     )
 
 

@@ -77,10 +77,13 @@ def update(
     problem = asking.problem(data)
     let_go = _named(problem, anew)
     say("comparing with the last calibration")
-    # a frame that was set up anew may be anywhere: then the start is looked for
-    found = asking.calibrated(problem, let_go, None if let_go else result.x)
-    causes, before = _asked(asking, found, let_go)
-    first, after = causes, before
+    start = None  # a frame that was set up anew may be anywhere: then it is looked for
+    if not let_go:
+        start = result.x
+    found = asking.calibrated(problem, let_go, start)
+    first, before = _asked(asking, found, let_go)
+    causes = first
+    after = before
     changes: list[Cause] = []
     while (cause := most_believed(causes)) is not None and _may(changes, cause, len(data)):
         say(f"letting {cause.name} go")
