@@ -12,7 +12,7 @@ from rpim_opt.problem.linear import LinearModel
 
 WIDE = 30.0
 """Times what deviations are believed to be, so that no prior alone accuses. Chosen on 300 simulated arms with ten good
-configurations, of which 7 have a row accused then, and 40 without this test; on 300 others 7, too. Meant are 3."""
+configurations, of which 7 have a row accused then, and 40 without this test; on 300 others 7 and 41. Meant are 3."""
 LOOSE = 1e-9
 """Part of what equations say of all deviations, below which a direction is one that the others do not decide."""
 
