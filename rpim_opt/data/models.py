@@ -144,6 +144,11 @@ class Measurement(Brief):
     def _short(self) -> str:
         return f"'{self.name}': {', '.join(self.components)}"
 
+    @property
+    def by_camera(self) -> bool:
+        """Whether a row is where a camera sees a point of a board."""
+        return "pixel" in self.components.values()
+
     def __post_init__(self) -> None:
         require_columns(self.extra, f"measurement {self.name}")
         for name in self.sees:

@@ -185,7 +185,7 @@ def simulated_table(
     if kind.touching:
         return touched_table(stated.robot, shape.markers, truth.parameters, truth.x, truth.plan, noise, rng, noisy), []
     count = len(random) // 2
-    if kind.metres is not None:
+    if kind.by_camera:
         return seen_table(stated, kind, truth.parameters, truth.x, truth.plan, count, noise, rng, noisy), []
     draft = Draft(stated.robot, shape, _rows(shape, count, rng))
     draft.name(count)

@@ -218,7 +218,7 @@ def read_table(result: Calibration, source: Any, measurement: str | None, units:
     try:
         columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
         board = board_of(result.problem.sample().data)
-        if kinds[name].metres is not None and board and not any(column.startswith("target_") for column in columns):
+        if kinds[name].by_camera and board and not any(column.startswith("target_") for column in columns):
             columns = on_board(columns, board)
         data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:
