@@ -6,7 +6,7 @@ calibrated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,20 +113,25 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
     blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
     if sum(len(block.row) for block in blocks) < FEWEST_ROWS:
         return None
+    whole = _together(blocks, own)
     number = {label: i for i, label in enumerate(problem.data.label)}
+    row = np.array([number[data.label[i]] for i in whole.row])
+    count = len(row)
+    evenly = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return replace(whole, row=row, seen=data is not problem.data).take(np.argsort(row, kind="stable")[evenly])
+
+
+def _together(blocks: Sequence[Block], own: Mapping[str, float]) -> Points:
+    """Return the points of all blocks, reflectors where the parameters' values by name put them."""
     markers = list(dict.fromkeys(block.markers[0] for block in blocks))
-    whole = Points(
+    return Points(
         q=np.concatenate([block.q[:, 0] for block in blocks]),
         y=np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
         tools=np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers]),
         turns=_turns(blocks, markers),
-        row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
-        seen=data is not problem.data,
+        row=np.concatenate([block.row for block in blocks]),
     )
-    count = len(whole.row)
-    evenly = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-    return whole.take(np.argsort(whole.row, kind="stable")[evenly])
 
 
 def _turns(blocks: Sequence[Block], markers: Sequence[str]) -> Array | None:
