@@ -146,7 +146,12 @@ class Measurement(Brief):
 
     @property
     def by_camera(self) -> bool:
-        """Whether a row is where a camera sees a point of a board."""
+        """Whether a row is where a camera sees a point of a board.
+
+        >>> from rpim_opt.data.models import eye_in_hand, position
+        >>> eye_in_hand.by_camera, position.by_camera
+        (True, False)
+        """
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:

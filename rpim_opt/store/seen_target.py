@@ -76,10 +76,10 @@ def which_camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
     """
     misfit = {name: _misfit(arm, columns, kind) for name, kind in CAMERAS.items()}
     best, other = sorted(misfit, key=lambda name: misfit[name])
-    said = f"{1e3 * misfit[best]:.3g} mm, {other} {1e3 * misfit[other]:.3g} mm"
+    said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CLEARLY * misfit[best]:
         raise InputError("the camera", f"no clear place ({best} leaves {said})", f"--measurement {best} or {other}")
-    return CAMERAS[best], f"guessed: poses of the board fit the nominal robot to {said}"
+    return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
 
 
 def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:

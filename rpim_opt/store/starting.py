@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rpim_opt.basics.exceptions import InputError
@@ -40,7 +40,8 @@ class Started:
     def __str__(self) -> str:
         """Return the files and the sentences."""
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
-        return "\n".join([f"Made: {self.folder}", *lines, *self.notes])
+        then = f"Look at {self.folder / 'problem.toml'}, then: rpim-opt inspect {self.folder}"
+        return "\n".join([f"Made: {self.folder}", *lines, *self.notes, then])
 
 
 def new_problem(
@@ -139,7 +140,8 @@ def new_problem(
         raise error.within(found.file) from None
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    return Started(folder, counts, (*parts.notes, *guessed), found)
+    notes = (*parts.notes, f"Measurement {kind.name}: {how}.", *guessed)
+    return Started(folder, counts, notes, replace(found, kind=kind))
 
 
 def _require_target(found: Understanding, seen: SeenTarget) -> None:
@@ -164,7 +166,8 @@ def _kind(arm: Described, found: Understanding, seen: SeenTarget, measurement: s
     if not kind.touching:
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
     column = next(name for name in TOUCHED if name in found.columns)
-    return kind, f"guessed: rows with the same {column} touched it, and nothing else is measured"
+    count = len(set(found.columns[column]))
+    return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
 
 
 def _require_new(folder: Path, validation: str | Path | None, hold_out: float | None) -> None:

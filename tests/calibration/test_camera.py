@@ -158,7 +158,9 @@ def test_new_makes_a_folder_from_corners(place: str, tmp_path: Path) -> None:
     (tmp_path / "corners.csv").write_text("\n".join([",".join(head), *rows]))
     with pytest.raises(ro.InputError, match="--target"):
         ro.store.new_problem(tmp_path / "cell", "ur5e", tmp_path / "corners.csv")
-    ro.store.new_problem(tmp_path / "cell", "ur5e", tmp_path / "corners.csv", hold_out=0.2, target="5x4,40mm")
+    made = ro.store.new_problem(tmp_path / "cell", "ur5e", tmp_path / "corners.csv", hold_out=0.2, target="5x4,40mm")
+    assert made.understood.content()["measurement"] == STUDY.PLACES[place][0]
+    assert f"Measurement {STUDY.PLACES[place][0]}: guessed" in str(made)
     instance = ro.load(tmp_path / "cell")
     assert instance.problem.data.blocks[0].measurement.name == STUDY.PLACES[place][0]
     assert {"camera_fx", "camera_k1", "base_rz", "tool_rx"} <= set(instance.problem.parameters.free.names)
