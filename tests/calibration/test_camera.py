@@ -92,7 +92,7 @@ def test_intervals_hold(place: str, known: str) -> None:
     found = [STUDY.run(place, known, 500 + seed) for seed in range(20)]
     assert all(row["converged"] and row["learned: improves"] and row["learned: did improve"] for row in found)
     assert 0.92 < np.mean([row["directions held"] for row in found]) < 0.99
-    # the 60 coordinates of a robot err together: of the study's 125 robots of a kind the share held spreads by 7 to 11 %
+    # the 60 coordinates of a robot err together: of the study's 125 robots of a kind the share spreads by 7 to 11 %
     # about 94 to 96 %, so the mean of 20 by 1.5 to 2.4 %: one in a thousand is below 0.86 to 0.90, or above 0.99
     assert np.mean([row["positions held"] for row in found]) > 0.87
 
