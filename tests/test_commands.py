@@ -142,6 +142,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     assert rms_mm(later[:, :3] - urdf_points(cell / "arm.urdf", later[:, 3:])) > 1.0
 
 
+@pytest.mark.slow  # the same commands as above, on data that other tools were compared on
 @pytest.mark.skipif(not BENCH.is_dir(), reason="the peers' benchmark ../shared/bench is not here")
 def test_four_commands_on_the_peers_benchmark(monkeypatch, tmp_path) -> None:
     data, robot = BENCH / "clean52", str(BENCH / "robot.urdf")

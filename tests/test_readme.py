@@ -82,7 +82,11 @@ def runs(line: str) -> bool:
     return "rpim-opt" in line.split("#")[0] or "dev.py run" in line
 
 
-@pytest.mark.parametrize("block", [b for _, b in SHELL if any(map(runs, b))], ids=lambda block: block[0][:40])
+RUNNING = {frozenset(filter(runs, block)): block for _, block in SHELL}
+"""Blocks with the same commands run once."""
+
+
+@pytest.mark.parametrize("block", [b for each, b in RUNNING.items() if each], ids=lambda block: block[0][:40])
 def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     write_cell(tmp_path)  # what the reader has: arm.urdf and measured.csv, and later new.csv and checks.csv
     header, *later = (tmp_path / "later.csv").read_text().splitlines(keepends=True)

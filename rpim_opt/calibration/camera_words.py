@@ -16,7 +16,7 @@ def camera_remarks(result: Calibration) -> list[str]:
     >>> from rpim_opt.calibration.camera_words import camera_remarks
     >>> camera_remarks(ro.load("paper_arm").calibrate())
     []
-    >>> said = camera_remarks(ro.load("camera").calibrate())
+    >>> said = camera_remarks(ro.load("camera").calibrate(weight=1.0))
     >>> said[1].split(",")[0]
     'Expected position error of the flange over its joint ranges'
     """

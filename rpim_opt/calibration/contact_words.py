@@ -1,8 +1,102 @@
-"""What errors mean where points or planes were touched, in words."""
+"""What errors mean where points or planes were touched, in words and point by point."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import listed
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+
+MOST = 20
+"""Points of a table; of others one row says how many there are."""
+HEADER = ["touches by point [mm]", "touches", "RMS before", "RMS after", "largest after"]
+
+
+class Scatter(NamedTuple):
+    """How far the touches of a point or plane are from it: RMS before and after calibration, and the largest [m]."""
+
+    name: str
+    touches: int
+    nominal: float
+    identified: float
+    largest: float
+
+    def content(self) -> dict[str, Any]:
+        """Return the figures [mm]."""
+        lengths = {"nominal_rms_mm": self.nominal, "rms_mm": self.identified, "max_mm": self.largest}
+        return {"name": self.name, "count": self.touches, **{key: 1e3 * value for key, value in lengths.items()}}
+
+
+def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
+    """Return the scatter of every point or plane that rows touched, the worst first; nothing where none did.
+
+    Parameters
+    ----------
+    data
+        The measurements.
+    nominal, error
+        (N,) errors before and after calibration [m].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.calibration.contact_words import scatter
+    >>> data = ro.data.touches(np.zeros((4, 6)), ["A", "B", "A", "B"], sigma=1e-4)
+    >>> [each.name for each in scatter(data, np.zeros(4), np.array([1e-4, 3e-4, 2e-4, 3e-4]))]
+    ['B', 'A']
+    """
+    found = []
+    for name, rows in _touched(data):
+        before = float(np.sqrt(np.mean(nominal[rows] ** 2)))
+        after = float(np.sqrt(np.mean(error[rows] ** 2)))
+        found.append(Scatter(name, len(rows), before, after, float(error[rows].max())))
+    return tuple(sorted(found, key=lambda each: -each.identified))
+
+
+def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield every point or plane by name, with the rows that touched it."""
+    for block in data.blocks:
+        if block.measurement.touching and block.touched is not None:
+            names = block.touched[:, 0]
+            for name in dict.fromkeys(names.tolist()):
+                yield name, block.row[names == name]
+
+
+def scatter_rows(found: Sequence[Scatter]) -> list[list[str]]:
+    """Return the rows of a table [mm] under `HEADER`: the worst points, and how many others there are."""
+    rows = []
+    for each in found[:MOST]:
+        lengths = (each.nominal, each.identified, each.largest)
+        rows.append([each.name, str(each.touches), *(f"{1e3 * value:.3f}" for value in lengths)])
+    others = found[MOST:]
+    if others:
+        largest = max(each.largest for each in others)
+        rows.append(
+            [f"{len(others)} others", str(sum(each.touches for each in others)), "", "", f"{1e3 * largest:.3f}"]
+        )
+    return rows
+
+
+def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
+    """Say of which points that rows touched the calibration has touches of its own: those are not held back.
+
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.calibration.contact_words import known_points
+    >>> instance = ro.load("contact")
+    >>> known_points(instance.problem, instance.validation)  # four sockets elsewhere
+    []
+    """
+    known = {name for name, _ in _touched(problem.data)}
+    both = [name for name, _ in _touched(data) if name in known]
+    if not both:
+        return []
+    return [f"Not held back: the calibration has touches of {listed(both)}, too."]
 
 
 def contact_remarks(problem: CalibrationProblem) -> list[str]:

@@ -37,10 +37,10 @@ def violation(posed: Posed, z: Array) -> float:
         return float(np.max(np.abs(nearest(posed, z) - z)))
     with _LOCK:
         posed.z.save_value(z)
-        return max(_missed(constraint, posed.z) for constraint in every)
+        return max(_missed(constraint, posed.z, posed.speeds) for constraint in every)
 
 
-def _missed(constraint: Any, z: cp.Variable) -> float:
+def _missed(constraint: Any, z: cp.Variable, constant: dict[int, Array]) -> float:
     """Return by how much a constraint is missed at the value of z, over how fast it changes with z."""
     with np.errstate(all="ignore"):
         missed = np.ravel(np.asarray(constraint.violation(), dtype=float))
@@ -48,13 +48,22 @@ def _missed(constraint: Any, z: cp.Variable) -> float:
         return float("inf")
     if not np.any(missed > 0):
         return 0.0
-    if isinstance(constraint, nonpos.Inequality | zero.Equality):
-        speed = _speeds(constraint.args[0] - constraint.args[1], z)
-        if len(speed) != len(missed):
-            speed = np.full(len(missed), np.max(speed, initial=0.0))
-    else:
-        speed = np.full(len(missed), max((float(np.max(_speeds(arg, z))) for arg in constraint.args), default=0.0))
+    speed = constant.get(constraint.id)
+    if speed is None:
+        speed = _changes(constraint, z, len(missed))
+    if all(arg.is_affine() for arg in constraint.args) and not constraint.parameters():
+        constant[constraint.id] = speed  # CVXPY takes milliseconds for a gradient
     return float(np.max(np.divide(missed, speed, out=missed.copy(), where=speed > 0)))
+
+
+def _changes(constraint: Any, z: cp.Variable, count: int) -> Array:
+    """Return how fast each of a constraint's components (count,) changes with z at its value."""
+    if not isinstance(constraint, nonpos.Inequality | zero.Equality):
+        return np.full(count, max((float(np.max(_speeds(arg, z))) for arg in constraint.args), default=0.0))
+    speed = _speeds(constraint.args[0] - constraint.args[1], z)
+    if len(speed) != count:
+        return np.full(count, np.max(speed, initial=0.0))
+    return speed
 
 
 def _speeds(expression: Any, z: cp.Variable) -> Array:

@@ -83,6 +83,7 @@ class Posed:
         self._lock = threading.RLock()
         self._answers: Asked | None = None
         self._known = declared(formulation)
+        self.speeds: dict[int, Array] = {}  # of constraints whose gradient is the same everywhere, by their id
         if self._known:
             self.box  # noqa: B018 - limits that do not fit the parameters are refused now
         else:  # what a user's functions say may be another thing later

@@ -11,8 +11,9 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
-from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
+from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split_unit
+from rpim_opt.data.columns import quantities_of, require_unique
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import CAMERAS
 from rpim_opt.data.projection import TARGET
@@ -83,22 +84,12 @@ def _points(table: Columns) -> dict[str, Array]:
     names = texts(table.get("point", ()), "point")
     if not names:
         raise InputError("the header", f"no column point among {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
-    places = {axis: np.zeros(len(names)) for axis in "xyz"}
-    given = set()
-    for name, cells in table.items():
-        stem, unit = split_unit(name)
-        if name == "point":
-            continue
-        if stem not in places or unit is None or unit.dimension != "length" or stem in given:
-            raise InputError("the header", f"column '{name}'", "point, x_mm, y_mm, perhaps z_mm, once each")
-        given.add(stem)
-        places[stem] = unit.si * numbers(cells, names, name)
-    if not given >= {"x", "y"}:
+    require_unique(names, "point")
+    places = quantities_of(table, {axis: ["length"] for axis in "xyz"}, ["point"], names)
+    flat = {("z", ""): np.zeros(len(names)), **places}
+    if ("x", "") not in flat or ("y", "") not in flat:
         raise InputError("the header", f"columns {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
-    again = next((name for name in names if names.count(name) > 1 or not name), None)
-    if again is not None:
-        raise InputError("column point", f"'{again}' twice" if again else "''", "a name for every point")
-    return dict(zip(names, np.column_stack(list(places.values())), strict=True))
+    return dict(zip(names, np.column_stack([flat[axis, ""] for axis in "xyz"]), strict=True))
 
 
 def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: str = "eye_in_hand") -> Dataset:
@@ -198,7 +189,7 @@ def board_of(data: Dataset) -> dict[str, Array]:
     """
     found = {}
     for block in data.blocks:
-        if block.measurement.metres is None or block.point is None:
+        if not block.measurement.by_camera or block.point is None:
             continue
         places = np.column_stack([block.columns[stem] for stem in TARGET])
         found |= {str(name): place for name, place in zip(block.point[:, 0], places, strict=True)}

@@ -28,7 +28,7 @@ def text_columns(kind: Measurement) -> list[str]:
         names.append("to_marker")
     if kind.touching:
         names += ["point", "plane"]
-    if kind.metres is not None:
+    if kind.by_camera:
         names.append("point")
     return names
 
@@ -68,11 +68,7 @@ def _spread_columns(kind: Measurement) -> dict[str, list[str]]:
 def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str]) -> Numbers:
     """Return the columns of numbers [SI]; refuse those that are unknown, in two units, or missing."""
     known = number_columns(robot, kind)
-    names = text_columns(kind)
-    columns: Numbers = {}
-    for name in table:
-        if name not in names:
-            _add(columns, name, table[name], known, names, label)
+    columns = quantities_of(table, known, text_columns(kind), label)
     for stem in _required(columns, robot, kind):
         if (stem, "") not in columns:
             if stem in TARGET:
@@ -82,6 +78,17 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
                 raise InputError("the target", "nothing", accepted)
             accepted = " or ".join(with_unit(stem, known[stem][0]))
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
+    return columns
+
+
+def quantities_of(
+    table: Columns, known: Mapping[str, Sequence[str]], names: Sequence[str], label: Sequence[str]
+) -> Numbers:
+    """Return all columns but those of names in SI; refuse those that are not known, stem to its dimensions."""
+    columns: Numbers = {}
+    for name in table:
+        if name not in names:
+            _add(columns, name, table[name], known, names, label)
     return columns
 
 
@@ -169,7 +176,7 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
         label = tuple(str(i) for i in range(1, N + 1))
     else:
         label = texts(table["label"], "label")
-        _require_unique(label)
+        require_unique(label, "label")
     for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane"):
         for i, name in enumerate(texts(table.get(column, ()), column)):
             if not name:
@@ -177,9 +184,10 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
     return label
 
 
-def _require_unique(label: Sequence[str]) -> None:
+def require_unique(names: Sequence[str], column: str) -> None:
+    """Refuse a row without a name, or with one that an earlier row has."""
     seen: set[str] = set()
-    for i, name in enumerate(label, start=1):
+    for i, name in enumerate(names, start=1):
         if not name or name in seen:
-            raise InputError(f"row {i}, column label", f"'{name}'", "a label that no other row has")
+            raise InputError(f"row {i}, column {column}", f"'{name}'", f"a {column} that no other row has")
         seen.add(name)

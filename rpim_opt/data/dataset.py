@@ -71,7 +71,7 @@ class Block(Brief):
     @property
     def touched(self) -> np.ndarray | None:
         """(N, p) names of the points that were touched; None for what a camera has seen."""
-        if self.measurement.metres is not None:
+        if self.measurement.by_camera:
             return None
         return self.point
 

@@ -144,6 +144,16 @@ class Measurement(Brief):
     def _short(self) -> str:
         return f"'{self.name}': {', '.join(self.components)}"
 
+    @property
+    def by_camera(self) -> bool:
+        """Whether a row is where a camera sees a point of a board.
+
+        >>> from rpim_opt.data.models import eye_in_hand, position
+        >>> eye_in_hand.by_camera, position.by_camera
+        (True, False)
+        """
+        return "pixel" in self.components.values()
+
     def __post_init__(self) -> None:
         require_columns(self.extra, f"measurement {self.name}")
         for name in self.sees:

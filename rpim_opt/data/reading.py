@@ -105,7 +105,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
 
 def _touched(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
     """Return the names (N, 1) of the points that were touched, or that a camera has seen, as far as they have some."""
-    if kind.metres is not None and "point" in table:
+    if kind.by_camera and "point" in table:
         return np.array(_names(table, ["point"], N), dtype=object)[:, None]
     if not kind.touching:
         return None

@@ -68,24 +68,20 @@ def starting_parameters(
     array([ 1.8 , -0.7 ,  0.35])
     """
     tools = tools or {"": (0.0,) * 6}
-    place: Place = (0.0,) * 6 if base is None else base
     _require_reflectors(data, tools)
-    places: dict[str, Place] = dict(tools)
     own = {**(own or {}), **starting_cameras(data, own or {})}
+    places = tools
     if base is None:
-        place, located, _ = locate(robot, posed(data, own), tools)
-        places |= {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
+        base, located, _ = locate(robot, posed(data, own), tools)
         # a board or a camera that is turned otherwise is not in sight
-        turned = {block.markers[0] for block in camera_blocks(data)}
-        places |= {marker: located[marker] for marker in turned}
-        tools = {marker: places[marker] if marker in turned else tools[marker] for marker in tools}
+        tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
+        places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
     for block in data.blocks:
-        kind = block.measurement
-        given = _own_values(robot, block, place, places[block.markers[0]], own or {})
-        for name, dimension in kind.parameters.items():
+        given = _own_values(robot, block, base, places[block.markers[0]], own)
+        for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    return model_parameters(robot, place, tools, entries, own_frames(data))
+    return model_parameters(robot, base, tools, entries, own_frames(data))
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:

@@ -6,16 +6,17 @@ calibrated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block
 from rpim_opt.problem.placing import NOMINAL_ERROR, TOOL_ERROR, hand_eye, transforms
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.views import camera_blocks, posed
+from rpim_opt.problem.views import posed
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
@@ -103,40 +104,41 @@ class Placed:
 
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
     """Return the measured points of positions, poses and a camera's views; None where there are too few."""
-    seen = bool(camera_blocks(problem.data))
-    data = problem.data
-    if seen:
-        own = dict(zip(problem.parameters.names, problem.parameters.nominal.tolist(), strict=True))
-        try:
-            data = posed(data, own)
-        except InputError:
-            return None
-    number = {label: i for i, label in enumerate(problem.data.label)}
-    first = np.array([number[label] for label in data.label], dtype=int)
-    blocks = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
-    if sum(len(b.row) for b in blocks) < FEWEST_ROWS:
-        return None
-    markers = list(dict.fromkeys(b.markers[0] for b in blocks))
     p = problem.parameters
-    index = {name: i for i, name in enumerate(p.names)}
-    tools = np.array([[p.nominal[index[tool_prefix(m) + c]] for c in FRAME[:3]] for m in markers])
-    turns = None
-    if all(b.measurement.name == "pose" for b in blocks) and len(markers) == 1:
-        turns = np.concatenate([transforms(b.y)[:, :3, :3] for b in blocks])
-    marker = np.array([markers.index(b.markers[0]) for b in blocks])
-    whole = Points(
-        np.concatenate([b.q[:, 0] for b in blocks]),
-        np.concatenate([b.y[:, :3] for b in blocks]),
-        np.repeat(marker, [len(b.row) for b in blocks]),
-        tools,
-        turns,
-        first[np.concatenate([b.row for b in blocks])],
-        seen,
+    own = dict(zip(p.names, p.nominal.tolist(), strict=True))
+    try:
+        data = posed(problem.data, own)
+    except InputError:
+        return None
+    blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
+    if sum(len(block.row) for block in blocks) < FEWEST_ROWS:
+        return None
+    whole = _together(blocks, own)
+    number = {label: i for i, label in enumerate(problem.data.label)}
+    row = np.array([number[data.label[i]] for i in whole.row])
+    count = len(row)
+    evenly = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return replace(whole, row=row, seen=data is not problem.data).take(np.argsort(row, kind="stable")[evenly])
+
+
+def _together(blocks: Sequence[Block], own: Mapping[str, float]) -> Points:
+    """Return the points of all blocks, reflectors where the parameters' values by name put them."""
+    markers = list(dict.fromkeys(block.markers[0] for block in blocks))
+    return Points(
+        q=np.concatenate([block.q[:, 0] for block in blocks]),
+        y=np.concatenate([block.y[:, :3] for block in blocks]),
+        marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
+        tools=np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers]),
+        turns=_turns(blocks, markers),
+        row=np.concatenate([block.row for block in blocks]),
     )
-    whole = whole.take(np.argsort(whole.row, kind="stable"))
-    if len(whole.row) > most:
-        whole = whole.take(np.linspace(0, len(whole.row) - 1, most).round().astype(int))
-    return whole
+
+
+def _turns(blocks: Sequence[Block], markers: Sequence[str]) -> Array | None:
+    """Return the measured orientations (N, 3, 3), where all rows are poses of one reflector."""
+    if len(markers) > 1 or any(block.measurement.name != "pose" for block in blocks):
+        return None
+    return np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
 
 
 def placed(robot: Robot, points: Points) -> Placed:

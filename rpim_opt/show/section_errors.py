@@ -10,6 +10,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.calibration.contact_words import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.show.pieces import BEFORE_AFTER, figure, mm, sets
@@ -27,10 +28,12 @@ def errors_section(result: Calibration) -> list[Element]:
     rows: list[list[str]] = []
     angles: list[list[str]] = []
     blocks: list[Element] = []
+    touched: list[Element] = []
     for name, data in sets(result).items():
         lengths, labels = _lengths(result, data)
         rows += [[f"{name}, {when}", *_figures(errors)] for when, errors in lengths.items()]
         angles += _angles(result, name, data)
+        touched += _by_point(result, name, data)
         figures = [_bars(result, name, labels, lengths), _histogram(name, lengths), *_axes(result, name, data)]
         blocks += [tag("h3", f"{name.capitalize()} rows"), tag("div", *figures, class_="figures")]
     rows += _held_out(result)
@@ -38,7 +41,7 @@ def errors_section(result: Calibration) -> list[Element]:
     if angles:
         head = ["data", "rows", "mean", "RMS", "largest"]
         tables.append(data_table("Orientation error [mrad]", head, angles))
-    return section("Errors before and after", tag("p", _note(result)), *tables, *blocks)
+    return section("Errors before and after", tag("p", _note(result)), *tables, *touched, *blocks)
 
 
 def _note(result: Calibration) -> str:
@@ -88,6 +91,14 @@ def _angles(result: Calibration, name: str, data: Dataset) -> list[list[str]]:
             spread = (mrad.mean(), np.sqrt(np.mean(mrad**2)), mrad.max())
             rows.append([f"{name}, {when}", str(len(mrad)), *(f"{value:.3f}" for value in spread)])
     return rows
+
+
+def _by_point(result: Calibration, name: str, data: Dataset) -> list[Element]:
+    """Return how far touches are from their points; nothing where no row touched one."""
+    found = scatter(data, result.nominal_errors(data), result.errors(data))
+    if not found:
+        return []
+    return [data_table(f"{name.capitalize()}, distance of touches from their point [mm]", HEADER, scatter_rows(found))]
 
 
 def _bars(result: Calibration, name: str, labels: Sequence[str], lengths: Mapping[str, Array]) -> Element:

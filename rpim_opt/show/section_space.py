@@ -33,9 +33,12 @@ def space_section(result: Calibration, embedded: dict[str, Any]) -> list[Element
     }
     ends = zip("xyz", P.min(axis=0), P.max(axis=0), strict=True)
     span = ", ".join(f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in ends)
+    what = "measured positions in the instrument's frame"
+    if result.problem.sample().touches is not None:
+        what = "touches"
     text = (
-        f"{len(P)} measured positions in the instrument's frame, {span}; a line from each shows which way and "
-        "how far the measurement lies off the model. Turn with the mouse, a finger or the arrow keys."
+        f"{len(P)} {what}, {span}; a line from each shows which way and how far it lies off the model. "
+        "Turn with the mouse, a finger or the arrow keys."
     )
     if len(drawn) < len(P):
         text += f" {len(drawn)} of them are drawn."

@@ -11,6 +11,7 @@ from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.camera_words import camera_remarks
+from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.show.pieces import mm, quantity, repeated, sets
@@ -106,6 +107,9 @@ def _notes(result: Calibration, name: str) -> list[str]:
     notes = []
     if result.record.simulated:
         notes.append("The measurements are simulated.")
+    notes += contact_remarks(result.problem.sample())
+    if result.record.validation is not None:
+        notes += known_points(result.problem.sample(), result.record.validation)
     notes += camera_remarks(result)
     notes += [line for line in result.remarks() if line != result.message or not result.converged]
     if name == "identification":

@@ -82,7 +82,10 @@ class Understanding:
                 text = f"{each.file}\n{text}"
             parts.append("\n".join([text, *(f"{each.file}: {note}" for note in each.notes)]))
         count = len(next(iter(self.columns.values())))
-        return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{count} rows, measurement {self.kind.name}."])
+        what = f"measurement {self.kind.name}"
+        if self.kind.by_camera:  # on the flange or beside the robot: only what they fit tells
+            what = "pixels of a camera"
+        return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{count} rows, {what}."])
 
     @property
     def sentences(self) -> tuple[str, ...]:

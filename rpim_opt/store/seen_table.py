@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.data.board import on_board
@@ -16,51 +14,21 @@ from rpim_opt.data.models import Measurement
 from rpim_opt.data.reading import read_data
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.sight import postures_in_sight
-from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.problem_file import Stated
+from rpim_opt.store.simulated_world import Draws, Truth
 
 
-class Plan(Protocol):
-    """What is simulated of a camera."""
-
-    @property
-    def joint_share(self) -> float:
-        """Part of every joint's range."""
-        ...
-
-    @property
-    def image_px(self) -> list[int]:
-        """Width and height of the image."""
-        ...
-
-
-def seen_table(
-    stated: Stated,
-    kind: Measurement,
-    parameters: Parameters,
-    x: Array,
-    plan: Plan,
-    count: int,
-    noise: Mapping[str, Any],
-    rng: np.random.Generator,
-    noisy: bool,
-) -> dict[str, list[str]]:
+def seen_table(stated: Stated, kind: Measurement, truth: Truth, count: int, draws: Draws) -> dict[str, list[str]]:
     """Return the columns of a table as text.
 
     Parameters
     ----------
     stated, kind
         The problem and the measurement.
-    parameters, x
-        The world: parameters and their true deviations (n,) [SI].
-    plan, count
-        How it is simulated, and how many views there are.
-    noise
-        What the table states of its noise.
-    rng
-        The draws.
-    noisy
-        Whether pixels have noise.
+    truth, count
+        The world, and how many views of it there are.
+    draws
+        How the table is drawn.
 
     Raises
     ------
@@ -72,27 +40,24 @@ def seen_table(
     names = list(stated.board)
     points = np.array([stated.board[name] for name in names])
     units = joint_columns(stated.robot.joint_dimensions)
-    one = {"point": names[:1], "u_px": ["0"], "v_px": ["0"], **{name: ["0"] for name in units}}
-    world = CalibrationProblem(stated.robot, parameters, _read(stated, kind, one, noise))
-    width, height = _size(plan.image_px, stated)
-    q = postures_in_sight(world, points, count, rng, x, plan.joint_share, (width, height))
+    one = {"point": names[:1], **{name: ["0"] for name in ("u_px", "v_px", *units)}}
+    world = CalibrationProblem(stated.robot, truth.parameters, _read(stated, kind, one, draws))
+    plan = truth.plan
+    q = postures_in_sight(world, points, count, draws.rng, truth.x, plan.joint_share, _size(plan.image_px, stated))
     table: dict[str, list[str]] = {
         "label": [f"v{k}/{name}" for k in range(count) for name in names],
         "point": names * count,
     }
     for (name, si), column in zip(units.items(), q.T, strict=True):
         table[name] = [f"{v:.5f}" for v in np.repeat(column / si, len(names))]
-    empty = {"u_px": ["0"] * len(table["label"]), "v_px": ["0"] * len(table["label"])}
-    data = _read(stated, kind, {**table, **empty}, noise)
-    exact = world.on(data).modelled(x)[0]
-    covariance = np.broadcast_to(data.blocks[0].covariance, (len(exact), 2, 2))
-    e = (np.linalg.cholesky(covariance) @ rng.normal(size=(len(exact), 2, 1)))[:, :, 0]
-    y = exact + noisy * e
+    empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
+    data = _read(stated, kind, {**table, **empty}, draws)
+    y = world.on(data).modelled(truth.x)[0] + draws.errors(data.blocks[0])
     return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
 
 
-def _read(stated: Stated, kind: Measurement, table: Mapping[str, list[str]], noise: Mapping[str, Any]) -> Dataset:
-    return read_data(on_board(dict(table), stated.board or {}), stated.robot, noise, kind)
+def _read(stated: Stated, kind: Measurement, table: Mapping[str, list[str]], draws: Draws) -> Dataset:
+    return read_data(on_board(dict(table), stated.board or {}), stated.robot, draws.noise, kind)
 
 
 def _size(image: list[int], stated: Stated) -> tuple[int, int]:

@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.units import UNITS
-from rpim_opt.data.board import Board, grid_board, read_board
+from rpim_opt.data.board import Board, grid_board, on_board, read_board
 from rpim_opt.data.models import CAMERAS, Measurement
 from rpim_opt.data.reading import read_data
 from rpim_opt.problem.frames import starting_cameras
@@ -34,9 +34,15 @@ class SeenTarget:
     stated: str
     table: Columns
 
+    def under(self, columns: Columns) -> Columns:
+        """Return the columns of a table of corners with where their points are; as they are without a board."""
+        if not self.board:
+            return columns
+        return on_board(columns, self.board)
 
-def seen_target(text: str) -> SeenTarget | None:
-    """Return the board that ``--target`` states: a table, or columns, rows and spacing of a grid; None for nothing.
+
+def seen_target(text: str) -> SeenTarget:
+    """Return the board that ``--target`` states: a table, or columns, rows and spacing of a grid; empty for nothing.
 
     Examples
     --------
@@ -45,7 +51,7 @@ def seen_target(text: str) -> SeenTarget | None:
     'target = { columns = 7, rows = 5, spacing_mm = 30 }'
     """
     if not text:
-        return None
+        return SeenTarget({}, "", {})
     match = GRID.fullmatch(text.strip())
     if match:
         columns, rows, spacing, unit = match.groups()
@@ -70,10 +76,10 @@ def which_camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
     """
     misfit = {name: _misfit(arm, columns, kind) for name, kind in CAMERAS.items()}
     best, other = sorted(misfit, key=lambda name: misfit[name])
-    said = f"{1e3 * misfit[best]:.3g} mm, {other} {1e3 * misfit[other]:.3g} mm"
+    said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CLEARLY * misfit[best]:
         raise InputError("the camera", f"no clear place ({best} leaves {said})", f"--measurement {best} or {other}")
-    return CAMERAS[best], f"guessed: poses of the board fit the nominal robot to {said}"
+    return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
 
 
 def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:

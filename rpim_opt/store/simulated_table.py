@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import Length, Table
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.reading import read_data
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.problem_file import Stated
 from rpim_opt.store.seen_table import seen_table
+from rpim_opt.store.simulated_world import Draws, Simulation, Truth
 from rpim_opt.store.touched_table import touched_table
 from rpim_opt.store.touching import touching_poses
 
 TORQUE = 20.0
 """Simulated joint torques are uniform up to this [Nm]."""
-MOST = 1_000_000
-"""Configurations of a table."""
 
 
 @dataclass(frozen=True)
@@ -50,56 +44,6 @@ class Shape:
         tables = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
         nested = [key for table in tables for key, value in table.items() if isinstance(value, dict)]
         return cls(kind, markers, tuple(dict.fromkeys(nested)) or ("",))
-
-
-class PlaneTable(Table):
-    """A square of a plane that is touched, in the robot's base frame."""
-
-    at_mm: list[float]
-    normal: list[float]
-    size: Length
-
-
-class Simulation(Table):
-    """The keys of ``[simulation]``."""
-
-    seed: int = Field(ge=0)
-    configurations: int = Field(gt=0, le=MOST)
-    validation: int = Field(default=0, ge=0, le=MOST)
-    spread: float = Field(default=1.0, ge=0)
-    joint_share: float = Field(default=0.9, gt=0, le=1)
-    blunders: int = Field(default=0, ge=0)
-    blunder: Length = 0.0
-    markers: dict[str, list[str]] = Field(default_factory=dict)
-    torques: Literal["measured", "gravity"] = "measured"
-    points_mm: dict[str, list[float]] = Field(default_factory=dict)
-    validation_points_mm: dict[str, list[float]] = Field(default_factory=dict)
-    planes: dict[str, PlaneTable] = Field(default_factory=dict)
-    validation_planes: dict[str, PlaneTable] = Field(default_factory=dict)
-    image_px: list[int] = Field(default=[1280, 960])
-    truth: dict[str, Any] = Field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """The world that is simulated: the parameters, their true deviations (n,) [SI], and what happens to tables."""
-
-    parameters: Parameters
-    x: Array
-    plan: Simulation
-
-    @property
-    def with_torques(self) -> bool:
-        """Whether joints give way to torques that tables state, and not to those of gravity."""
-        return self.plan.torques == "measured" and any(
-            name.startswith("compliance") for name in self.parameters.free.names
-        )
-
-    def by_name(self) -> dict[str, tuple[str, float]]:
-        """Return dimension and deviation [SI] by parameter."""
-        free = self.parameters.free
-        named = zip(free.names, free.dimensions, self.x, strict=True)
-        return {name: (dimension, float(value)) for name, dimension, value in named}
 
 
 @dataclass
@@ -158,13 +102,7 @@ class Draft:
 
 
 def simulated_table(
-    stated: Stated,
-    shape: Shape,
-    truth: Truth,
-    random: Array,
-    noise: Mapping[str, Any],
-    rng: np.random.Generator,
-    noisy: bool,
+    stated: Stated, shape: Shape, truth: Truth, random: Array, draws: Draws
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return the columns of one table as text, and the labels of its blunders.
 
@@ -174,40 +112,36 @@ def simulated_table(
         The problem, the observation, and the world.
     random
         (2 count, dof) joint values, of which the second half are for second points.
-    noise
-        What the table states of its noise.
-    rng
-        The draws: their order is that of the table's making.
-    noisy
-        Whether measurements have noise and blunders.
+    draws
+        How the table is drawn.
     """
     kind = shape.kind
     if kind.touching:
-        return touched_table(stated.robot, shape.markers, truth.parameters, truth.x, truth.plan, noise, rng, noisy), []
+        return touched_table(stated.robot, shape.markers, truth, draws), []
     count = len(random) // 2
-    if kind.metres is not None:
-        return seen_table(stated, kind, truth.parameters, truth.x, truth.plan, count, noise, rng, noisy), []
-    draft = Draft(stated.robot, shape, _rows(shape, count, rng))
+    if kind.by_camera:
+        return seen_table(stated, kind, truth, count, draws), []
+    draft = Draft(stated.robot, shape, _rows(shape, count, draws.rng))
     draft.name(count)
     q = np.array([[random[k], random[count + k]][: kind.points] for k, _, _ in draft.rows])
     torque = None
     if truth.with_torques:
-        torque = rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
+        torque = draws.rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
     constraint = not kind.columns
     draft.write_joints(q, torque, 9 if constraint else 4)
-    data = read_data(draft.written(_placeholder(kind, len(draft.rows))), stated.robot, noise, kind)
+    data = read_data(draft.written(_placeholder(kind, len(draft.rows))), stated.robot, draws.noise, kind)
     problem = CalibrationProblem(stated.robot, truth.parameters, data)
     if constraint:
-        touching = _touching(problem, truth, rng, noisy, stated)
+        touching = _touching(problem, truth, draws, stated)
         draft.write_joints(touching[:, None], None, 9)
         return draft.columns, []
     exact = _modelled(problem, truth.x)
     # covariances at the true values: a tracker's depend on them
-    data = read_data(draft.written(exact), stated.robot, noise, kind)
-    y = _read(data, exact, rng, noisy)
+    data = read_data(draft.written(exact), stated.robot, draws.noise, kind)
+    y = _read(data, exact, draws)
     wrong: list[int] = []
-    if noisy and truth.plan.blunders:
-        wrong = _blunders(y, kind, truth.plan, rng)
+    if draws.noisy and truth.plan.blunders:
+        wrong = _blunders(y, kind, truth.plan, draws.rng)
     return draft.written(y), [draft.columns["label"][i] for i in wrong]
 
 
@@ -226,15 +160,13 @@ def _rows(shape: Shape, count: int, rng: np.random.Generator) -> list[tuple[int,
     return [(k, tuple(rng.choice(shape.markers, points)), f) for k in range(count) for f in shape.fixtures]
 
 
-def _touching(
-    problem: CalibrationProblem, truth: Truth, rng: np.random.Generator, noisy: bool, stated: Stated
-) -> Array:
+def _touching(problem: CalibrationProblem, truth: Truth, draws: Draws, stated: Stated) -> Array:
     """Return joint values (N, dof) at which the robot touches, but for the declared noise."""
-    data = problem.data
-    sigma = np.sqrt(data.blocks[0].covariance[0, 0, 0])
-    errors = sigma * rng.normal(size=len(data)) * noisy
+    block = problem.data.blocks[0]
+    sigma = np.sqrt(block.covariance[0, 0, 0])
+    errors = sigma * draws.rng.normal(size=len(problem.data)) * draws.noisy
     try:
-        return touching_poses(problem, truth.x, errors, rng, truth.plan.joint_share)
+        return touching_poses(problem, truth.x, errors, draws.rng, truth.plan.joint_share)
     except InputError as error:
         raise error.within(stated.path) from None
 
@@ -246,16 +178,13 @@ def _modelled(problem: CalibrationProblem, x: Array) -> Array:
     return modelled
 
 
-def _read(data: Dataset, exact: Array, rng: np.random.Generator, noisy: bool) -> Array:
-    """Return what the instrument reads, (N, c) [SI]; its draws are made without noise, too."""
+def _read(data: Dataset, exact: Array, draws: Draws) -> Array:
+    """Return what the instrument reads, (N, c) [SI]."""
     y = exact.copy()
     for block in data.blocks:
-        kind = block.measurement
-        k = len(kind.components)
-        L = np.linalg.cholesky(np.broadcast_to(block.covariance, (len(block.row), k, k)))
-        e = (L @ rng.normal(size=(len(block.row), k, 1)))[:, :, 0]
-        if noisy:
-            y[block.row] = kind.plus(block.y, e)
+        e = draws.errors(block)
+        if draws.noisy:
+            y[block.row] = block.measurement.plus(block.y, e)
     return y
 
 

@@ -22,7 +22,8 @@ from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.problem_file import Observation, Stated, read_problem
-from rpim_opt.store.simulated_table import Shape, Simulation, Truth, simulated_table
+from rpim_opt.store.simulated_table import Shape, simulated_table
+from rpim_opt.store.simulated_world import Draws, Simulation, Truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +71,8 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
         # drawn where no table of that role is, too: other tables of the same seed stay as they are
         q = random_candidates(stated.robot, 2 * count, rng, plan.joint_share)
         for shape, each in _to_make(stated, shapes, role, count):
-            noise = each.noise or stated.table.noise
-            noisy = role == "identification"
-            tables[getattr(each, role)], wrong = simulated_table(stated, shape, truth, q, noise, rng, noisy)
+            draws = Draws(each.noise or stated.table.noise, rng, noisy=role == "identification")
+            tables[getattr(each, role)], wrong = simulated_table(stated, shape, truth, q, draws)
             blunders += wrong
     return Simulated(tables, truth.by_name(), tuple(blunders))
 

@@ -4,26 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import read_text
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
-from rpim_opt.data.board import on_board
-from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.naming import TOUCHED
-from rpim_opt.data.reading import read_data
 from rpim_opt.data.spelling import parse_units
 from rpim_opt.data.understanding import Asked
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.plain import toml, write_robot
 from rpim_opt.store.drawing import Source, find_source
+from rpim_opt.store.kept_apart import Reading, beside, held_out, whole_table
 from rpim_opt.store.raw import Understanding, understand_of
 from rpim_opt.store.seen_target import TARGET_FILE, SeenTarget, seen_target, which_camera
 from rpim_opt.store.template import problem_text
@@ -44,7 +40,8 @@ class Started:
     def __str__(self) -> str:
         """Return the files and the sentences."""
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
-        return "\n".join([f"Made: {self.folder}", *lines, *self.notes])
+        then = f"Look at {self.folder / 'problem.toml'}, then: rpim-opt inspect {self.folder}"
+        return "\n".join([f"Made: {self.folder}", *lines, *self.notes, then])
 
 
 def new_problem(
@@ -110,79 +107,67 @@ def new_problem(
     _require_new(folder, validation, hold_out)
     source = find_source(robot)
     arm = read_arm(source.file, urdf_base, urdf_tip)
-    asked = asked or Asked(units=parse_units(units))
     paths = [data] if isinstance(data, str | Path) else data
-    found = understand_of(arm, paths, measurement, asked)
+    found = understand_of(arm, paths, measurement, asked or Asked(units=parse_units(units)))
     if understood is not None:
         understood(found)
     seen = seen_target(target)
     _require_target(found, seen)
-    kind = found.kind
-    guess = ""
-    if kind.metres is not None and measurement is None:
-        kind, guess = which_camera(arm, _on(found.columns, seen))
+    kind, how = _kind(arm, found, seen, measurement)
     noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
-    rows = _read(found.file, _on(found.columns, seen), arm, noise, kind)
-    columns = _labelled(found.columns, rows)
-    notes = found.sentences
-    tables = {"identification.csv": columns}
-    apart = '# validation = "validation.csv"   # a table that no choice may see; none was given'
+    reading = Reading(arm, kind, noise, seen)
     if validation is not None:
-        other = understand_of(arm, [validation], kind.name, found.asked)
-        _read(validation, _on(other.columns, seen), arm, noise, kind)
-        tables["validation.csv"] = other.columns
-        notes = (*notes, *other.sentences)
-        apart = f'validation = "validation.csv"\n# from {Path(validation).name}; no choice sees it'
+        parts = beside(reading, found, validation)
     elif hold_out is not None:
-        held = _drawn(rows, hold_out, seed)
-        tables = {"identification.csv": _taken(columns, ~held), "validation.csv": _taken(columns, held)}
-        apart = f'validation = "validation.csv"\n# configurations drawn with seed {seed}; no choice sees them'
-        rows = rows.take(np.flatnonzero(~held))
-    if seen is not None and seen.table:
-        tables[TARGET_FILE] = seen.table
+        parts = held_out(reading, found, hold_out, seed)
+    else:
+        parts = whole_table(reading, found)
+    tables = parts.tables
+    if seen.table:
+        tables = {**tables, TARGET_FILE: seen.table}
     said = {
-        "target": seen.stated if seen is not None else "",
+        "target": seen.stated,
         "robot": toml(source.stated),
         "drawing": source.drawing,
-        "columns": "as you said" if measurement else guess or _guessed(kind, columns),
+        "columns": how,
         "data": Path(found.file).name,
-        "count": str(len(rows)),
-        "validation": apart,
+        "count": str(len(parts.rows)),
+        "validation": parts.said,
     }
     try:
-        text, guessed = problem_text(arm, kind, rows, noise, said)
+        text, guessed = problem_text(arm, kind, parts.rows, noise, said)
     except InputError as error:
         raise error.within(found.file) from None
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    return Started(folder, counts, (*notes, *guessed), found)
+    notes = (*parts.notes, f"Measurement {kind.name}: {how}.", *guessed)
+    return Started(folder, counts, notes, replace(found, kind=kind))
 
 
-def _on(columns: Columns, seen: SeenTarget | None) -> Columns:
-    """Return the columns with where their points are on the board, where there is one."""
-    if seen is None:
-        return columns
-    return on_board(columns, seen.board)
-
-
-def _require_target(found: Understanding, seen: SeenTarget | None) -> None:
+def _require_target(found: Understanding, seen: SeenTarget) -> None:
     """Refuse pixels without a board, and a board without pixels."""
-    if found.kind.metres is None and seen is not None:
+    if seen.board and not found.kind.by_camera:
         raise InputError(
             "--target", "a board", f"none: measurement {found.kind.name} sees no points of one", found.file
         )
     stated = any(name.startswith("target_x") for name in found.columns)
-    if found.kind.metres is not None and seen is None and not stated:
+    if found.kind.by_camera and not seen.board and not stated:
         accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
         raise InputError("the target", "nothing", accepted, found.file)
 
 
-def _guessed(kind: Measurement, columns: Columns) -> str:
-    """Say what the kind of measurement was guessed from."""
+def _kind(arm: Described, found: Understanding, seen: SeenTarget, measurement: str | None) -> tuple[Measurement, str]:
+    """Return the kind of measurement, and how it is known."""
+    kind = found.kind
+    if measurement is not None:
+        return kind, "as you said"
+    if kind.by_camera:
+        return which_camera(arm, seen.under(found.columns))
     if not kind.touching:
-        return f"guessed from the columns {', '.join(kind.columns)}"
-    column = next(name for name in TOUCHED if name in columns)
-    return f"guessed: rows with the same {column} touched it, and nothing else is measured"
+        return kind, f"guessed from the columns {', '.join(kind.columns)}"
+    column = next(name for name in TOUCHED if name in found.columns)
+    count = len(set(found.columns[column]))
+    return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
 
 
 def _require_new(folder: Path, validation: str | Path | None, hold_out: float | None) -> None:
@@ -211,28 +196,3 @@ def _write_robot(file: Path, arm: Described, target: Path) -> None:
         write_text(target, read_text(file))  # with its comments
     else:
         write_robot(arm.robot, target)
-
-
-def _read(file: str | Path, columns: Columns, arm: Described, noise: Mapping[str, float], kind: Measurement) -> Dataset:
-    try:
-        return read_data(columns, arm.robot, noise, kind)
-    except InputError as error:
-        raise error.within(file) from None
-
-
-def _labelled(columns: Columns, rows: Dataset) -> Columns:
-    """Return the columns with labels: a row keeps its number where rows are drawn."""
-    return columns if "label" in columns else {"label": rows.label, **columns}
-
-
-def _drawn(rows: Dataset, share: float, seed: int) -> np.ndarray:
-    """Return which rows (N,) are held out: a share of the configurations, at least one."""
-    known = len(np.unique(rows.configuration))
-    if not 0 < share < 1 or known < 2:
-        raise InputError("--hold-out", f"{share:g} of {known} configurations", "a part between 0 and 1 of two or more")
-    drawn = rows.configurations(min(max(round(share * known), 1), known - 1), seed)
-    return np.isin(rows.configuration, drawn.configuration)
-
-
-def _taken(columns: Columns, rows: np.ndarray) -> Columns:
-    return {name: [cells[i] for i in np.flatnonzero(rows).tolist()] for name, cells in columns.items()}

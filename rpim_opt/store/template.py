@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,12 +44,12 @@ formulation = "tikhonov"        # "robust" where rows may be wrong; "bounded" ke
 model = "auto"                  # adds what geometry lacks (gravity, gears) where the data want it; or "geometry"
 # selector = "learned"          # sizes of deviations and noise; or one weight over [scale]: reml, l_curve, ...
 {auto}
-# Standard deviation of a measured value, for rows that state none (column sigma_mm). Guessed: a laser tracker, and a
-# robot that repeats well. reml finds the level itself; what counts is how kinds and rows compare.
+# Standard deviation of a measured value, for rows that state none (column {sigma}). Guessed: {noise_of}.
+# The level itself is found from the data; what counts is how kinds and rows compare.
 [noise]
 {noise}
 
-# Expected size of deviations (prior standard deviation). Guessed: a machined arm, a reflector measured roughly.
+# Expected size of deviations (prior standard deviation). Guessed: a machined arm, {thing} measured roughly.
 # Single parameters by name: d5_mm, theta3_mrad; joint_offset_mrad for every theta, which is otherwise expected to be
 # three times as large, because joint offsets are set at assembly.
 [scale]
@@ -64,7 +65,7 @@ base_mrad = {scale}
 length_mm = 5.0
 angle_mrad = 10.0
 {base}
-# {reflector} in the flange frame: {known}.
+# {thing_at} in the flange frame: {known}.
 {tools}
 {camera}{known_of}
 # How far the robot may miss where, for a verdict in result and report; who measured, when, with what:
@@ -75,14 +76,14 @@ angle_mrad = 10.0
 
 # Rows to leave out, label = reason:
 # [exclude]
-# {label} = "the reflector was bumped"
+# {label} = "{wrong}"
 """
 
 KNOWN_OF = """
-# What a drawing or a certificate knows of the points that were touched: without a distance, contact does not tell how
-# large the robot is. Of planes also [[known_angle]] with deg = 0 (parallel) or 90 (square) and sigma_mrad.
+# What a drawing or a certificate knows of what was touched: without a distance, contact does not tell how large the
+# robot is. Of planes also [[known_angle]] with deg = 0 (parallel) or 90 (square) and sigma_mrad.
 # [[known_distance]]
-# between = ["A", "B"]
+# between = BETWEEN
 # distance_mm = 300.0
 # sigma_mm = 0.01
 """
@@ -93,11 +94,32 @@ TARGET_TEXT = """
 {target}
 """
 """What it says of a board."""
-REFLECTOR = {
-    "eye_in_hand": "The camera (z forwards, x right, y down in the image)",
-    "eye_to_hand": "The board",
+
+
+class Words(NamedTuple):
+    """How a kind of measurement is spoken of."""
+
+    thing: str = "a reflector"
+    thing_at: str = "The reflector"
+    frame: str = "so the instrument has a frame of its own"
+    noise_of: str = "a laser tracker, and a robot that repeats well"
+    wrong: str = "the reflector was bumped"
+
+
+CAMERA = Words(
+    frame="in the frame of the board", noise_of="corners found to a fifth of a pixel", wrong="a wrong corner"
+)
+WORDS = {
+    "eye_in_hand": CAMERA._replace(thing="a camera", thing_at="The camera (z forwards, x right, y down in the image)"),
+    "eye_to_hand": CAMERA._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
+    "revisit": Words(
+        thing="a tip",
+        thing_at="The tip that touches, a ball's middle,",
+        noise_of="a good robot, a tight fit",
+        wrong="the tip slipped",
+    ),
 }
-"""What is on the flange, where it is no reflector."""
+"""Of what is on the flange, where it is no reflector."""
 
 
 def problem_text(
@@ -106,7 +128,8 @@ def problem_text(
     """Return the text of ``problem.toml``, and what was guessed in sentences."""
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
-    base, how = _base(arm, rows, tools)
+    words = WORDS.get(kind.name, Words())
+    base, how = _base(arm, rows, tools, words)
     parameters = starting_parameters(arm.robot, rows, base, tools)
     seen = camera_blocks(rows)
     text = TEMPLATE.format(
@@ -121,11 +144,21 @@ def problem_text(
         known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
         tools="\n".join(_tool_tables(markers, arm.tool)),
         label=_key(rows.label[0]),
-        known_of=KNOWN_OF * kind.touching,
+        known_of=KNOWN_OF.replace("BETWEEN", _two_things(rows)) * kind.touching,
         camera=_camera_tables(rows) if seen else "",
-        reflector=REFLECTOR.get(kind.name, "The reflector"),
+        sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
+        thing=words.thing,
+        thing_at=words.thing_at,
+        noise_of=words.noise_of,
+        wrong=words.wrong,
     )
     return text, [how]
+
+
+def _two_things(rows: Dataset) -> str:
+    """Return the first two points or planes that rows touched, as a list."""
+    names = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
+    return toml(list(dict.fromkeys(names))[:2])
 
 
 def _base_table(base: Array | None, how: str) -> str:
@@ -157,17 +190,17 @@ def _tool_tables(markers: Sequence[str], place: Array) -> list[str]:
     return lines
 
 
-def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array]) -> tuple[Array | None, str]:
+def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], words: Words) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
     if not {block.measurement.name for block in rows.blocks} & {"position", "pose"}:
-        return arm.base, "As the robot's file has it: these measurements do not depend on it."
+        return arm.base, "The base is as the robot's file has it: these measurements do not depend on it."
     found, _, verdict = locate(arm.robot, rows, tools)
     if same_place(found, arm.base):
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
-    how = f"Guessed: the data put the base at {placed(found)}, so the instrument has a frame of its own ({verdict})."
+    how = f"Guessed: the data put the base at {placed(found)}, {words.frame} ({verdict})."
     return None, how
 
 

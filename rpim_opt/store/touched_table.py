@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,124 +15,53 @@ from rpim_opt.data.reading import read_data
 from rpim_opt.problem.postures import postures_at
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.store.simulated_world import Draws, PlaneTable, Simulation, Truth
 
 DIGITS = 9
 """Of joint values in degrees or millimetres: the noise is in them, and none may come from rounding."""
 
 
-class Square(Protocol):
-    """A square of a plane, in the robot's base frame: its middle [mm], its normal, its side [m]."""
-
-    @property
-    def at_mm(self) -> list[float]:
-        """Its middle."""
-        ...
-
-    @property
-    def normal(self) -> list[float]:
-        """Its normal."""
-        ...
-
-    @property
-    def size(self) -> float:
-        """Its side."""
-        ...
-
-
-class Plan(Protocol):
-    """What is touched, in the robot's base frame."""
-
-    @property
-    def configurations(self) -> int:
-        """Touches of each for the identification."""
-        ...
-
-    @property
-    def validation(self) -> int:
-        """Touches of each for the validation."""
-        ...
-
-    @property
-    def joint_share(self) -> float:
-        """Part of every joint's range."""
-        ...
-
-    @property
-    def points_mm(self) -> Mapping[str, list[float]]:
-        """Points for the identification."""
-        ...
-
-    @property
-    def validation_points_mm(self) -> Mapping[str, list[float]]:
-        """Points for the validation."""
-        ...
-
-    @property
-    def planes(self) -> Mapping[str, Square]:
-        """Planes for the identification."""
-        ...
-
-    @property
-    def validation_planes(self) -> Mapping[str, Square]:
-        """Planes for the validation."""
-        ...
-
-
-def touched_table(
-    robot: Robot,
-    markers: Sequence[str],
-    parameters: Parameters,
-    x: Array,
-    plan: Plan,
-    noise: Mapping[str, Any],
-    rng: np.random.Generator,
-    noisy: bool,
-) -> dict[str, list[str]]:
+def touched_table(robot: Robot, markers: Sequence[str], truth: Truth, draws: Draws) -> dict[str, list[str]]:
     """Return the columns of a table as text.
 
     Parameters
     ----------
     robot, markers
         The nominal robot and its tools, which take turns.
-    parameters, x
-        The world: parameters and their true deviations (n,) [SI].
-    plan
-        What is touched, and how often.
-    noise
-        What the table states of its noise.
-    rng
-        The draws.
-    noisy
-        Whether it identifies, with noise; it validates otherwise.
+    truth, draws
+        The world, and how the table is drawn.
     """
-    points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
-    if noisy:
-        points, planes, each = plan.points_mm, plan.planes, plan.configurations
-    if bool(points) == bool(planes):
-        raise InputError("table simulation", "points_mm and planes", "one of them, for either table")
-    names = np.repeat(list(points or planes), each)
-    targets = np.concatenate([np.tile(_vector(place), (each, 1)) / 1e3 for place in points.values()] or [[]])
-    if planes:
-        targets = np.concatenate([_on(square, each, rng) for square in planes.values()])
-    column = "point"
-    if planes:
-        column = "plane"
-    labels = [f"{name}_{i % each}" for i, name in enumerate(names)]
-    table = {"label": labels, column: names.tolist()}
+    column, things = _things(truth.plan, draws)
+    names = [name for name, places in things.items() for _ in places]
+    table = {"label": [f"{name}_{i}" for name, places in things.items() for i in range(len(places))], column: names}
+    turn = np.arange(len(names)) % len(markers)
     if len(markers) > 1:
-        table["marker"] = [markers[i % len(markers)] for i in range(len(names))]
-    covariance = _covariance(table, robot, noise)
-    errors = rng.normal(size=targets.shape) @ np.linalg.cholesky(covariance).T
-    problem = CalibrationProblem(robot, parameters, touches(np.zeros((1, robot.dof)), ["any"], 1.0))
+        table["marker"] = [markers[k] for k in turn.tolist()]
+    units = joint_columns(robot.joint_dimensions)
+    still = {**table, **{name: ["0"] * len(names) for name in units}}
+    declared = read_data(still, robot, draws.noise, revisit).blocks[0].covariance[0]
+    errors = draws.rng.normal(size=(len(names), 3)) @ np.linalg.cholesky(declared).T
+    targets = np.concatenate(list(things.values())) + draws.noisy * errors
+    problem = CalibrationProblem(robot, truth.parameters, touches(np.zeros((1, robot.dof)), ["any"], 1.0))
     q = np.empty((len(names), robot.dof))
     for k, marker in enumerate(markers):
-        mine = np.arange(len(names)) % len(markers) == k
-        q[mine] = postures_at(problem, (targets + noisy * errors)[mine], rng, x, plan.joint_share, marker)
-    units = joint_columns(robot.joint_dimensions)
+        mine = turn == k
+        q[mine] = postures_at(problem, targets[mine], draws.rng, truth.x, truth.plan.joint_share, marker)
     for (name, si), values in zip(units.items(), q.T, strict=True):
         table[name] = [f"{v:.{DIGITS}f}" for v in values / si]
     return table
+
+
+def _things(plan: Simulation, draws: Draws) -> tuple[str, dict[str, Array]]:
+    """Return the column that names what is touched, and by name where (K, 3) [m]."""
+    points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
+    if draws.noisy:
+        points, planes, each = plan.points_mm, plan.planes, plan.configurations
+    if bool(points) == bool(planes):
+        raise InputError("table simulation", "points_mm and planes", "one of them, for either table")
+    if planes:
+        return "plane", {name: _on(square, each, draws.rng) for name, square in planes.items()}
+    return "point", {name: np.tile(_vector(place) / 1e3, (each, 1)) for name, place in points.items()}
 
 
 def _vector(values: Sequence[float]) -> Array:
@@ -142,7 +70,7 @@ def _vector(values: Sequence[float]) -> Array:
     return np.array(values, dtype=float)
 
 
-def _on(square: Square, count: int, rng: np.random.Generator) -> Array:
+def _on(square: PlaneTable, count: int, rng: np.random.Generator) -> Array:
     """Return points (count, 3) [m] of a square, uniform."""
     normal = _vector(square.normal)
     normal = normal / np.sqrt(np.sum(normal**2))
@@ -152,9 +80,3 @@ def _on(square: Square, count: int, rng: np.random.Generator) -> Array:
     second = np.cross(normal, first)
     places = square.size * (rng.uniform(size=(count, 2)) - 0.5)
     return _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
-
-
-def _covariance(table: Mapping[str, list[str]], robot: Robot, noise: Mapping[str, Any]) -> Array:
-    """Return the covariance (3, 3) [m^2] of a touch that a table declares."""
-    still = {name: ["0"] * len(table["label"]) for name in joint_columns(robot.joint_dimensions)}
-    return np.asarray(read_data({**table, **still}, robot, noise, revisit).blocks[0].covariance[0])

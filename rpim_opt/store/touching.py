@@ -66,10 +66,11 @@ def touching_poses(
     >>> import rpim_opt as ro
     >>> from rpim_opt.data.models import plane
     >>> from rpim_opt.store.touching import touching_poses
-    >>> problem = ro.load("plane").problem
+    >>> whole = ro.load("plane").problem
+    >>> problem = whole.on(whole.data.take(range(8)))
     >>> nominal = np.zeros(len(problem.parameters.free))
-    >>> q = touching_poses(problem, nominal, np.full(80, 1e-3), np.random.default_rng(0))
-    >>> touching = problem.on(ro.Dataset.of(q, np.empty((80, 0)), 1e-5, measurement=plane))
+    >>> q = touching_poses(problem, nominal, np.full(8, 1e-3), np.random.default_rng(0))
+    >>> touching = problem.on(ro.Dataset.of(q, np.empty((8, 0)), 1e-5, measurement=plane))
     >>> bool(np.abs(touching.residual(nominal) - 1e-3).max() < 1e-14)
     True
     """

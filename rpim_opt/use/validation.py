@@ -15,12 +15,13 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.calibration.contact_words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.unseen import judged
 from rpim_opt.data.board import board_of, on_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.models import KNOWN, Measurement
 from rpim_opt.data.naming import rename
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.spelling import parse_units
@@ -51,6 +52,10 @@ class Validation:
         Share of the lengths that lie in the interval of a new reading at a confidence of 0.95; None without covariance.
     outside
         Rows beyond the joint ranges that the calibration measured.
+    touched
+        How far touches are from their points and planes, the worst first.
+    remarks
+        What a reader of errors of touches has to know.
 
     Examples
     --------
@@ -72,6 +77,8 @@ class Validation:
     allowed: Array
     coverage: float | None = None
     outside: Outside = field(default_factory=Outside)
+    touched: tuple[Scatter, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def largest(self) -> float:
@@ -96,6 +103,8 @@ class Validation:
             "beyond": [self.label[i] for i in self.beyond],
             "coverage95": self.coverage,
             "outside": [self.label[i] for i in self.outside.rows],
+            "touched": [each.content() for each in self.touched],
+            "remarks": self.remarks,
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
         }  # fmt: skip
@@ -118,8 +127,10 @@ class Validation:
         if turn["count"]:
             figures = [f"{turn[k]:.4f}" for k in ("mean_mrad", "rms_mrad", "max_mrad")]
             rows.append(["orientation, identified [mrad]", str(turn["count"]), *figures])
-        errors = table(["error [mm]", "rows", "mean", "RMS", "max"], rows)
-        return "\n".join([errors, self._judgement(), *self.outside.sentences()])
+        tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
+        if self.touched:
+            tables.append(table(HEADER, scatter_rows(self.touched)))
+        return "\n".join([*tables, self._judgement(), *self.outside.sentences(), *self.remarks])
 
     def _judgement(self) -> str:
         if not np.isfinite(self.sigmas).any():
@@ -162,9 +173,16 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     >>> f"{1e3 * found.error.mean():.3f} mm"
     '0.032 mm'
     """
+    problem = result.problem.sample()
+    nominal = result.nominal_errors(data)
+    error = result.errors(data)
+    touched = scatter(data, nominal, error)
+    remarks: list[str] = []
+    if touched:
+        remarks = [*contact_remarks(problem), *known_points(problem, data)]
     return Validation(
-        data.label, result.nominal_errors(data), result.errors(data), result.error_vectors(data),
-        result.errors(data, "angle"), *judged(result, data), result.outside(data),
+        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"),
+        *judged(result, data), result.outside(data), touched, tuple(remarks),
     )  # fmt: skip
 
 
@@ -210,7 +228,8 @@ class Read(NamedTuple):
 
 def read_table(result: Calibration, source: Any, measurement: str | None, units: str) -> Read:
     """Return what a table says; arguments as for `read_measurements`."""
-    kinds = {block.measurement.name: block.measurement for block in result.problem.data.blocks}
+    blocks = result.problem.data.blocks
+    kinds = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
     name = measurement or (next(iter(kinds)) if len(kinds) == 1 else "")
     if name not in kinds:
         raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
@@ -218,7 +237,7 @@ def read_table(result: Calibration, source: Any, measurement: str | None, units:
     try:
         columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
         board = board_of(result.problem.sample().data)
-        if kinds[name].metres is not None and board and not any(column.startswith("target_") for column in columns):
+        if kinds[name].by_camera and board and not any(column.startswith("target_") for column in columns):
             columns = on_board(columns, board)
         data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
     except InputError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import product
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.show.report import write_report
 from rpim_opt.store.known import UNSTATED
 from rpim_opt.study.grid import load_study
 from tests import SHARED
@@ -92,4 +94,37 @@ def test_new_recognises_what_was_touched(tmp_path: Path) -> None:
     assert made.rows == {"identification.csv": 48, "validation.csv": 12}  # whole points
     instance = ro.load(tmp_path / "cell")
     assert [block.measurement.name for block in instance.problem.data.blocks] == ["revisit"]
-    assert "[[known_distance]]" in (tmp_path / "cell" / "problem.toml").read_text()
+    assert "revisit: guessed: rows with the same point touched it, 10 in all" in str(made)
+    text = (tmp_path / "cell" / "problem.toml").read_text()
+    named = re.search(r'between = \["(\w+)", "(\w+)"\]', text)
+    assert named is not None
+    assert set(named.groups()) <= {str(name) for name in instance.problem.data.blocks[0].touched[:, 0]}
+
+
+@pytest.mark.parametrize("problem", ["contact", "datum_cube"])
+def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path) -> None:
+    """A table needs no word of what a drawing knows, and the scatter is about the mean of a point's own touches."""
+    instance = ro.load(problem)
+    result = instance.calibrate(weight=1.0)
+    folder = Path(__file__).parents[2] / "problems" / problem
+    data, _ = ro.read_measurements(result, folder / "validation.csv")
+    found = ro.use.validate(result, data)
+    assert [each.identified for each in found.touched] == sorted((e.identified for e in found.touched), reverse=True)
+    names = data.blocks[0].touched[:, 0]
+    for each in found.touched:
+        mine = names == each.name
+        assert each.touches == mine.sum()
+        assert each.identified == pytest.approx(np.sqrt(np.mean(result.errors(data)[mine] ** 2)))
+        if problem == "contact":
+            reached = result.forward(data.q[mine])[:, :3, 3]
+            away = np.linalg.norm(reached - reached.mean(axis=0), axis=1)
+            # touches count in units of how far all of them spread on the nominal robot
+            assert each.largest == pytest.approx(away.max(), rel=0.01)
+    assert "Error of a touch" in str(found)
+    assert "Not held back" not in str(found)
+    again = ro.use.validate(result, instance.problem.data)
+    assert "Not held back: the calibration has touches of" in str(again)
+    write_report(result, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "Validation, distance of touches" in page
+    assert "Error of a touch" in page

@@ -26,8 +26,8 @@ def identified(problem: ro.CalibrationProblem, formulation: ro.Formulation, weig
     "name",
     [
         "CVaR + squares",
-        "Tikhonov, slack of a box",
-        "bias of all equations + squares",
+        pytest.param("Tikhonov, slack of a box", marks=pytest.mark.slow),
+        pytest.param("bias of all equations + squares", marks=pytest.mark.slow),
         "parameters in the loss",
         "parameters in the penalty and a constraint, Huber",
         "Huber of norms, a ball a link",

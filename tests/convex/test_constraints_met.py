@@ -106,12 +106,12 @@ def spread(count: int) -> list[tuple[str, str, float, str]]:
         for k in range(count):
             problem = PROBLEMS[(k + 3 * i) % len(PROBLEMS)]
             radius = RADII[(k + i) % len(RADII)]
-            loss = list(LOSSES)[(k // len(RADII) + i) % len(LOSSES)]
+            loss = list(LOSSES)[(k // len(LOSSES) + i) % len(LOSSES)]
             some.append((kind, problem, radius, loss))
     return some
 
 
-SPREAD = spread(8)
+SPREAD = spread(len(RADII))
 
 
 @lru_cache

@@ -230,7 +230,7 @@ def test_a_table_says_which_point_of_which_board(kind: str) -> None:
     [
         ({"x_mm": [0]}, "no column point"),
         ({"point": ["a"], "x_mm": [0]}, "perhaps z_mm"),
-        ({"point": ["a", "a"], "x_mm": [0, 1], "y_mm": [0, 1]}, "'a' twice"),
+        ({"point": ["a", "a"], "x_mm": [0, 1], "y_mm": [0, 1]}, "row 2, column point.*'a'"),
         ({"point": ["a"], "x_mm": [0], "y_mm": [0], "w_mm": [0]}, "column 'w_mm'"),
         ({"point": ["a"], "x_deg": [0], "y_mm": [0]}, "column 'x_deg'"),
         ({"point": ["a"], "x_mm": ["far"], "y_mm": [0]}, "row a, column x_mm"),

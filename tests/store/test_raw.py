@@ -214,16 +214,24 @@ def test_more_than_forty_shapes() -> None:
     assert len(RAW) >= 40
 
 
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory, arm: Path) -> tuple[Path, Path]:
+    """A clean table, and the result of its calibration."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    clean = folder / "clean.csv"
+    clean.write_text(text([HEAD], ROWS))
+    with pytest.MonkeyPatch.context() as patch:
+        assert new(patch, arm, folder / "cell", clean) == 0
+        run(patch, "calibrate", str(folder / "cell"), "--select", "1", "--out", str(folder / "out"))
+    return clean, folder / "out"
+
+
 @pytest.mark.parametrize(
     "shape", ["semicolon and decimal comma", "SpatialAnalyzer", "merged header", "UTF-16", "Excel"]
 )
-def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_path, arm, shape) -> None:
+def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_path, calibrated, shape) -> None:
     """Also by the commands that take tables later: validate and compensate."""
-    clean = tmp_path / "clean.csv"
-    clean.write_text(text([HEAD], ROWS))
-    assert new(monkeypatch, arm, tmp_path / "cell", clean) == 0
-    out = tmp_path / "out"
-    run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--select", "1", "--out", str(out))
+    clean, out = calibrated
     write = RAW[shape][0]
     raw = str(write(tmp_path))
     documents = []
@@ -231,7 +239,7 @@ def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_pat
         capsys.readouterr()
         assert run(monkeypatch, "validate", str(out), path, "--units", "deg,mm", "--json") == 0
         documents.append(json.loads(capsys.readouterr().out)["identified"])
-        assert run(monkeypatch, "compensate", str(out), path, "--units", "deg,mm", "--json") in (0, 1)
+    assert run(monkeypatch, "compensate", str(out), raw, "--units", "deg,mm", "--json") in (0, 1)
     assert documents[0] == pytest.approx(documents[1])
 
 
