@@ -7,6 +7,7 @@ import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from types import ModuleType
 
@@ -62,6 +63,7 @@ MODULES = {
 }
 
 
+@cache
 def tree(module: str) -> ast.Module:
     return ast.parse(MODULES[module].read_text(encoding="utf-8"))
 
@@ -80,6 +82,7 @@ def imported(module: str) -> Iterator[str]:
             yield from modules or [name]
 
 
+@cache
 def ours(module: str) -> set[str]:
     names = [name.partition(".") for name in imported(module)]
     found = {rest for top, _, rest in names if top == "rpim_opt"}

@@ -80,14 +80,15 @@ def touching_poses(
     missing = np.ones(len(wanted), dtype=bool)
     for _ in range(DRAWS):
         # for all rows, also those that have their pose: a row's draws do not depend on another row's luck
-        q = random_candidates(problem.robot, len(wanted), draws, share)
+        q = random_candidates(problem.robot, len(wanted), draws, share)[missing]
+        rows = np.flatnonzero(missing)
+        rest = problem.on(problem.data.take(rows))
         for _ in range(STEPS):
-            q = q + _step(problem, x, wanted, q)
+            q = q + _step(rest, x, wanted[rows], q)
         inside = ((q >= limits[:, 0]) & (q <= limits[:, 1])).all(axis=1)
-        touching = np.abs(_residual(problem, x, q) - wanted) < TOUCHING
-        take = missing & inside & touching
-        poses[take] = q[take]
-        missing &= ~take
+        take = inside & (np.abs(_residual(rest, x, q) - wanted[rows]) < TOUCHING)
+        poses[rows[take]] = q[take]
+        missing[rows[take]] = False
         if not missing.any():
             return poses
     raise InputError("table simulation", "a plane or sphere out of reach", "one that the robot can touch")

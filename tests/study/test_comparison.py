@@ -395,8 +395,8 @@ def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     assert sorted(path.name for path in out.iterdir()) == [
         "comparison.png", "comparison.svg", "index.html", "replicates.csv",
     ]  # fmt: skip
-    assert run(monkeypatch, *asked[:-2], "--splits", "4", "--seeds", "2", "--json") == 0
+    assert run(monkeypatch, *asked[:-2], "--splits", "2", "--seeds", "2", "--json") == 0
     document = json.loads(capsys.readouterr().out)
-    assert len(document["replicates"]) == 4 * 4 * 2
+    assert len(document["replicates"]) == 4 * 2 * 2
     assert run(monkeypatch, "compare", "position", "--formulations", "robsut") == 2
     assert "did you mean robust?" in capsys.readouterr().err
