@@ -17,13 +17,14 @@ import random
 import resource
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import CodeType, FrameType
 from typing import Any, NamedTuple
+
+import coverage
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 CORE = [
@@ -164,43 +165,60 @@ def _tree(file: str) -> ast.Module:
     return ast.parse((ROOT / "rpim_opt" / file).read_text(encoding="utf-8"))
 
 
-class Calls:
-    """A plugin of pytest that writes down what functions of the package each test calls."""
+class Contexts:
+    """A plugin of pytest that tells coverage whose lines run, and writes down how long each test took.
+
+    What a fixture of several tests runs counts for each of them.
+    """
 
     def __init__(self, target: Path):
         self.target = target
         self.found: dict[str, dict[str, Any]] = {}
-        self.codes: set[CodeType] = set()
+        self.item = ""
 
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        entry = self.found.setdefault(report.nodeid, {"seconds": 0.0, "calls": []})
-        entry["seconds"] += report.duration
+    def _switch(self, context: str) -> None:
+        if measured := coverage.Coverage.current():
+            measured.switch_context(context)
 
     def pytest_runtest_protocol(self, item: Any) -> None:
-        self.codes = set()
         self.item = item.nodeid
-        sys.settrace(self._call)
-        threading.settrace(self._call)
+        self._switch(item.nodeid)
+        shared = {
+            _fixture(kinds[-1])
+            for kinds in item._fixtureinfo.name2fixturedefs.values()
+            if kinds[-1].scope != "function"
+        }
+        item.user_properties.append(("contexts", [item.nodeid, *sorted(shared)]))
 
-    def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        sys.settrace(None)
-        calls = {f"{code.co_filename.split('rpim_opt/')[-1]}:{code.co_name}" for code in self.codes}
-        self.found[nodeid]["calls"] = sorted(calls)
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Any:
+        if fixturedef.scope == "function":
+            return (yield)
+        self._switch(_fixture(fixturedef))
+        try:
+            return (yield)
+        finally:
+            self._switch(self.item)
 
-    def pytest_sessionfinish(self) -> None:
-        known = json.loads(self.target.read_text()) if self.target.exists() else {}
-        self.target.write_text(json.dumps(known | self.found))
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        entry = self.found.setdefault(report.nodeid, {"seconds": 0.0})
+        entry["seconds"] += report.duration
+        entry |= report.user_properties
 
-    def _call(self, frame: FrameType, event: str, argument: Any) -> None:
-        if "/rpim_opt/" in frame.f_code.co_filename:
-            self.codes.add(frame.f_code)
+    def pytest_sessionfinish(self, session: Any) -> None:
+        if not hasattr(session.config, "workerinput"):
+            self.target.write_text(json.dumps(self.found))
+
+
+def _fixture(kind: Any) -> str:
+    return f"{kind.baseid}::{kind.argname}"
 
 
 def pytest_configure(config: Any) -> None:
-    """Take part where a place for the calls is named."""
-    target = os.environ.get("MUTANTS_CALLS")
+    """Take part where a place for the times is named."""
+    target = os.environ.get("MUTANTS_TESTS")
     if target:
-        config.pluginmanager.register(Calls(Path(target)))
+        config.pluginmanager.register(Contexts(Path(target)))
 
 
 class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -243,8 +261,6 @@ def survives(mutant: Mutant, tests: list[str]) -> str:
 
 
 def _test(mutant: Mutant, tests: list[str]) -> None:
-    import pytest
-
     resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
