@@ -305,6 +305,12 @@ class Known:
         return taken
 
 
+def _fails_unchanged(file: str, number: int, known: Known) -> bool:
+    same = mutant(file, number)._replace(source=(ROOT / "rpim_opt" / file).read_text(encoding="utf-8"))
+    tests = known.chosen(same)
+    return bool(tests) and survives(same, tests) != "survives"
+
+
 def main(arguments: list[str]) -> int:
     """Draw mutants, run their tests, and say how many were found."""
     count, folder, *files = [*arguments, *("300", "measured")[len(arguments) :]]
@@ -318,6 +324,9 @@ def main(arguments: list[str]) -> int:
     for name in THIRD:
         __import__(name)
     places_drawn = drawn(int(count), files or CORE)
+    if _fails_unchanged(*places_drawn[0], known):
+        print("the tests fail without a change, too")
+        return 2
     for file, number in places_drawn:
         if (file, number) in answers:
             continue
