@@ -14,6 +14,7 @@ import hashlib
 import os
 import subprocess
 import sys
+import tempfile
 import venv
 from pathlib import Path
 
@@ -23,6 +24,9 @@ PROGRAMS = "Scripts" if os.name == "nt" else "bin"
 BIN = ENVIRONMENT / PROGRAMS
 GALLERY = ROOT / "studies" / "gallery"
 JUPYTER = ROOT / "studies" / ".environments" / "notebooks"
+MEASURED = ROOT / "measured"
+KERNELS = ("Nehalem", "Sandybridge", "Haswell", "SkylakeX")
+"""Of OpenBLAS, which every x86 processor of today has; Zen is Haswell in what NumPy and SciPy bring."""
 CHECKS = {
     "format": ["ruff", "format", "--check", "."],
     "lint": ["ruff", "check", "."],
@@ -65,15 +69,59 @@ def notebooks(folder: str = "notebooks", *pages: str) -> int:
     return subprocess.run(command, check=False).returncode
 
 
+def coverage(folder: str | Path = MEASURED) -> int:
+    """Run the default suite once, and say which lines and branches it runs; ``mutants`` goes on from there."""
+    folder = Path(folder).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    os.environ["COVERAGE_FILE"] = str(folder / "coverage")
+    os.environ["MUTANTS_TESTS"] = str(folder / "tests.json")
+    failed = run("coverage", "run", "-m", "pytest", "-n", "auto", "-p", "tests.mutants")
+    run("coverage", "combine", "--quiet")
+    run("coverage", "report", "--skip-covered", "--show-missing", "--precision=1")
+    return failed
+
+
+def versions(*pythons: str) -> int:
+    """Run the README's first two commands with other Pythons, in fresh environments and with every kernel.
+
+    A digest of what is printed stands for each, so that machines can be compared; more than one is a failure.
+    """
+    said = {}
+    for python in pythons:
+        with tempfile.TemporaryDirectory() as scratch:
+            programs = Path(scratch, "environment", PROGRAMS)
+            subprocess.run([python, "-m", "venv", programs.parent], check=True)
+            install = [programs / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+            subprocess.run([*install, f"{ROOT}[tables,plots]"], check=True)
+            version = subprocess.check_output([programs / "python", "--version"], text=True).strip()
+            for kernel in KERNELS:
+                said[version, kernel] = _readme(programs / "rpim-opt", Path(scratch, kernel))
+                print(version, kernel, said[version, kernel], flush=True)
+    return len(set(said.values())) - 1
+
+
+def _readme(program: Path, folder: Path) -> str:
+    """Return a digest of what two commands print in an empty folder with an empty cache."""
+    folder.mkdir()
+    places = {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache"), "OPENBLAS_CORETYPE": folder.name}
+    printed = hashlib.sha256()
+    for command in (["calibrate", "position", "--out", "results"], ["report", "results"]):
+        printed.update(subprocess.check_output([program, *command], cwd=folder, env={**os.environ, **places}))
+    return printed.hexdigest()[:16]
+
+
 def main(arguments: list[str]) -> int:
     """Carry out one command line."""
     what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check", "docs", "pictures", "notebooks", "mutants"):
+    if what not in ("run", "test", "check", "docs", "pictures", "notebooks", "coverage", "mutants", "versions"):
         print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
-        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures | mutants [COUNT] [FOLDER]")
+        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures")
+        print("       | coverage [FOLDER] | mutants [COUNT] [FOLDER] | versions PYTHON...")
         return 2
     if what == "notebooks":
         return notebooks(*rest)
+    if what == "versions":
+        return versions(*rest)
     environment()
     if what == "run":
         return run("rpim-opt", *rest)
@@ -84,6 +132,8 @@ def main(arguments: list[str]) -> int:
         return docs(*rest)
     if what == "pictures":
         return run("python", GALLERY / "pages.py")
+    if what == "coverage":
+        return coverage(*rest)
     if what == "mutants":
         return run("python", "-m", "tests.mutants", *rest)
     failed = [name for name, command in CHECKS.items() if run(*command)]

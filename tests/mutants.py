@@ -1,8 +1,9 @@
 """Mutation score of the numerical core: ``python3 dev.py mutants [COUNT] [FOLDER] [FILE...]``.
 
-First the tests run once, and what functions each calls is written down (``FOLDER/calls.json``; a file that is there is
-used). Then mutants are drawn at random, one change each in the code of the core; the tests that call the changed
-function run, the quickest first, until one fails. Those that no test fails for are listed: ``FOLDER/mutants.json``.
+``python3 dev.py coverage [FOLDER]`` goes before: it writes down which test runs which line. Then mutants are drawn at
+random, one change each in the code of the core; the tests that run the changed line are tried, the quickest first,
+until one fails. Each answer is a line of ``FOLDER/mutants.jsonl``; what stands there is not tried again. Those that no
+test fails for are printed.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ import json
 import os
 import random
 import resource
-import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import CodeType, FrameType
 from typing import Any, NamedTuple
+
+import coverage
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 CORE = [
@@ -38,7 +39,6 @@ CORE = [
     "robot/kinematics.py", "robot/chain.py", "robot/deflection.py", "robot/gravity.py", "robot/parameters.py",
     "calibration/intervals.py", "calibration/uncertainty.py", "calibration/spread.py", "calibration/loop.py",
 ]  # fmt: skip
-TESTS = ["tests/convex", "tests/robot", "tests/problem", "tests/calibration", "tests/use", "tests/test_hostile.py"]
 SECONDS = 40.0
 """Of tests (as long as they took once) that are run for a mutant."""
 PATIENCE = 10 * SECONDS
@@ -64,35 +64,48 @@ class Mutant(NamedTuple):
 
     file: str
     line: int
-    function: str
+    run: range
+    """Lines of the statement; those of its function for a default; none for what stands in no function."""
     before: str
     after: str
     source: str
 
 
-def places(tree: ast.Module) -> Iterator[tuple[ast.AST, str, ast.AST]]:
-    """Yield nodes that can be changed, with the functions they stand in and what may replace them."""
-    yield from _within(tree, "")
+class Place(NamedTuple):
+    """A node that can be changed, what may replace it, and the lines that run with it."""
+
+    node: ast.AST
+    other: ast.AST
+    run: range
 
 
-def _within(node: ast.AST, function: str) -> Iterator[tuple[ast.AST, str, ast.AST]]:
+def places(tree: ast.Module) -> Iterator[Place]:
+    """Yield every change of a file."""
+    yield from _within(tree, range(0))
+
+
+def _within(node: ast.AST, run: range) -> Iterator[Place]:
+    parts = list(ast.iter_child_nodes(node))
     if isinstance(node, ast.FunctionDef):
         if node.name in PROSE:
             return
-        function = node.name
-        parts: list[ast.AST] = [*node.body, *node.args.defaults, *(d for d in node.args.kw_defaults if d)]
+        run = range(node.body[0].lineno, (node.end_lineno or 0) + 1)
+        parts = [*node.body, *node.args.defaults, *(d for d in node.args.kw_defaults if d)]
     elif isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr):
         return
     elif isinstance(node, ast.AnnAssign):
         parts = [node.value] if node.value else []
     elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return
-    else:
-        parts = list(ast.iter_child_nodes(node))
+    if run and isinstance(node, ast.stmt) and not isinstance(node, ast.FunctionDef):
+        end = (node.end_lineno or 0) + 1
+        if body := getattr(node, "body", None):
+            end = max(body[0].lineno, node.lineno + 1)
+        run = range(node.lineno, end)
     for other in _others(node):
-        yield node, function, other
+        yield Place(node, other, run)
     for part in parts:
-        yield from _within(part, function)
+        yield from _within(part, run)
 
 
 def _others(node: ast.AST) -> Iterator[ast.AST]:
@@ -126,81 +139,90 @@ def _others(node: ast.AST) -> Iterator[ast.AST]:
         yield changed
 
 
-def mutants(file: str) -> list[Mutant]:
-    """Return every mutant of a file of the core."""
+def mutant(file: str, number: int) -> Mutant:
+    """Return one of a file's mutants."""
     text = (ROOT / "rpim_opt" / file).read_text(encoding="utf-8")
     tree = ast.parse(text)
-    made = []
-    for node, function, other in places(tree):
-        line = getattr(node, "lineno", 0)
-        before = text.splitlines()[line - 1].strip()
-        ast.copy_location(other, node)
-        source = _with(tree, node, other)
-        after = ast.unparse(ast.fix_missing_locations(other)).split("\n")[0]
-        made.append(Mutant(file, line, function, before, after, source))
-    return made
+    node, other, run = list(places(tree))[number]
+    line = getattr(node, "lineno", 0)
+    before = text.splitlines()[line - 1].strip()
+    after = ast.unparse(ast.fix_missing_locations(ast.copy_location(other, node))).split("\n")[0]
 
-
-def _with(tree: ast.Module, node: ast.AST, other: ast.AST) -> str:
     class Put(ast.NodeTransformer):
         def visit(self, each: ast.AST) -> Any:
             return other if each is node else self.generic_visit(each)
 
-    number = next(i for i, each in enumerate(ast.walk(tree)) if each is node)
-    twin = copy.deepcopy(tree)
-    node = list(ast.walk(twin))[number]
-    return ast.unparse(ast.fix_missing_locations(Put().visit(twin)))
+    source = ast.unparse(ast.fix_missing_locations(Put().visit(tree)))
+    return Mutant(file, line, run, before, after, source)
 
 
-def drawn(count: int, files: Sequence[str] = CORE, seed: int = 19) -> list[Mutant]:
-    """Draw mutants at random, each place of the files as likely."""
+def drawn(count: int, files: Sequence[str] = CORE, seed: int = 19) -> list[tuple[str, int]]:
+    """Draw places at random, each as likely; the first of many are those of few."""
     known = [(file, i) for file in files for i, _ in enumerate(list(places(_tree(file))))]
-    taken = random.Random(seed).sample(known, count)
-    by_file: dict[str, list[Mutant]] = {file: mutants(file) for file in dict.fromkeys(file for file, _ in taken)}
-    return [by_file[file][i] for file, i in taken]
+    random.Random(seed).shuffle(known)
+    return known[:count]
 
 
 def _tree(file: str) -> ast.Module:
     return ast.parse((ROOT / "rpim_opt" / file).read_text(encoding="utf-8"))
 
 
-class Calls:
-    """A plugin of pytest that writes down what functions of the package each test calls."""
+class Contexts:
+    """A plugin of pytest that tells coverage whose lines run, and writes down how long each test took.
+
+    What a fixture of several tests runs counts for each of them.
+    """
 
     def __init__(self, target: Path):
         self.target = target
         self.found: dict[str, dict[str, Any]] = {}
-        self.codes: set[CodeType] = set()
+        self.item = ""
 
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        entry = self.found.setdefault(report.nodeid, {"seconds": 0.0, "calls": []})
-        entry["seconds"] += report.duration
+    def _switch(self, context: str) -> None:
+        if measured := coverage.Coverage.current():
+            measured.switch_context(context)
 
     def pytest_runtest_protocol(self, item: Any) -> None:
-        self.codes = set()
         self.item = item.nodeid
-        sys.settrace(self._call)
-        threading.settrace(self._call)
+        self._switch(item.nodeid)
+        shared = {
+            _fixture(kinds[-1])
+            for kinds in item._fixtureinfo.name2fixturedefs.values()
+            if kinds[-1].scope != "function"
+        }
+        item.user_properties.append(("contexts", [item.nodeid, *sorted(shared)]))
 
-    def pytest_runtest_logfinish(self, nodeid: str) -> None:
-        sys.settrace(None)
-        calls = {f"{code.co_filename.split('rpim_opt/')[-1]}:{code.co_name}" for code in self.codes}
-        self.found[nodeid]["calls"] = sorted(calls)
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Any:
+        if fixturedef.scope == "function":
+            return (yield)
+        self._switch(_fixture(fixturedef))
+        try:
+            return (yield)
+        finally:
+            self._switch(self.item)
 
-    def pytest_sessionfinish(self) -> None:
-        known = json.loads(self.target.read_text()) if self.target.exists() else {}
-        self.target.write_text(json.dumps(known | self.found))
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        entry = self.found.setdefault(report.nodeid, {"seconds": 0.0})
+        entry["seconds"] += report.duration
+        entry |= report.user_properties
+        if report.failed:
+            entry["contexts"] = []  # what fails without a change says nothing about one
 
-    def _call(self, frame: FrameType, event: str, argument: Any) -> None:
-        if "/rpim_opt/" in frame.f_code.co_filename:
-            self.codes.add(frame.f_code)
+    def pytest_sessionfinish(self, session: Any) -> None:
+        if not hasattr(session.config, "workerinput"):
+            self.target.write_text(json.dumps(self.found))
+
+
+def _fixture(kind: Any) -> str:
+    return f"{kind.baseid}::{kind.argname}"
 
 
 def pytest_configure(config: Any) -> None:
-    """Take part where a place for the calls is named."""
-    target = os.environ.get("MUTANTS_CALLS")
+    """Take part where a place for the times is named."""
+    target = os.environ.get("MUTANTS_TESTS")
     if target:
-        config.pluginmanager.register(Calls(Path(target)))
+        config.pluginmanager.register(Contexts(Path(target)))
 
 
 class Loader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -243,8 +265,6 @@ def survives(mutant: Mutant, tests: list[str]) -> str:
 
 
 def _test(mutant: Mutant, tests: list[str]) -> None:
-    import pytest
-
     resource.setrlimit(resource.RLIMIT_CPU, (int(4 * SECONDS), int(4 * SECONDS)))
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
@@ -257,57 +277,74 @@ def _test(mutant: Mutant, tests: list[str]) -> None:
         os._exit(code)
 
 
-def chosen(mutant: Mutant, calls: dict[str, Any]) -> list[str]:
-    """Return the tests that call the changed function, or for what is in none any of its module's; quickest first."""
-    place = f"{mutant.file}:{mutant.function}" if mutant.function else f"{mutant.file}:"
-    fitting = [
-        (entry["seconds"], test)
-        for test, entry in calls.items()
-        if any(call == place or (not mutant.function and call.startswith(place)) for call in entry["calls"])
-    ]
-    taken = []
-    total = 0.0
-    for seconds, test in sorted(fitting):
-        total += seconds
-        if taken and total > SECONDS:
-            break
-        taken.append(test)
-    return taken
+class Known:
+    """Which tests run a line, and how long they take."""
+
+    def __init__(self, folder: Path):
+        self.lines = coverage.CoverageData(str(folder / "coverage"))
+        self.lines.read()
+        self.tests: dict[str, dict[str, Any]] = json.loads((folder / "tests.json").read_text())
+
+    def chosen(self, mutant: Mutant) -> list[str]:
+        """Return the tests that run a changed line (its module's where it stands in no function), quickest first."""
+        by_line = self.lines.contexts_by_lineno(str(ROOT / "rpim_opt" / mutant.file))
+        run = mutant.run or by_line
+        contexts = {context for line in run for context in by_line.get(line, ()) if context}
+        fitting = [
+            (entry["seconds"], test)
+            for test, entry in self.tests.items()
+            if not contexts.isdisjoint(entry.get("contexts", ()))
+        ]
+        taken = []
+        total = 0.0
+        for seconds, test in sorted(fitting):
+            total += seconds
+            if taken and total > SECONDS:
+                break
+            taken.append(test)
+        return taken
+
+
+def _fails_unchanged(file: str, number: int, known: Known) -> bool:
+    same = mutant(file, number)._replace(source=(ROOT / "rpim_opt" / file).read_text(encoding="utf-8"))
+    tests = known.chosen(same)
+    return bool(tests) and survives(same, tests) != "survives"
 
 
 def main(arguments: list[str]) -> int:
     """Draw mutants, run their tests, and say how many were found."""
-    count = int(arguments[0]) if arguments else 300
-    folder = Path(arguments[1]) if len(arguments) > 1 else ROOT / "mutants"
-    folder.mkdir(parents=True, exist_ok=True)
-    calls_file = folder / "calls.json"
-    os.chdir(ROOT)
+    count, folder, *files = [*arguments, *("300", "measured")[len(arguments) :]]
+    folder = Path(folder).resolve()
     sys.path.insert(0, str(ROOT))
-    if not calls_file.exists():
-        environment = {**os.environ, "MUTANTS_CALLS": str(calls_file.resolve())}
-        command = [sys.executable, "-m", "pytest", "-p", "tests.mutants", "-p", "no:xdist", *TESTS]
-        subprocess.run(command, env=environment, check=True)
-    calls = json.loads(calls_file.read_text())
+    known = Known(folder)
+    journal = folder / "mutants.jsonl"
+    journal.touch()
+    rows = [json.loads(line) for line in journal.read_text().splitlines()]
+    answers = {(row["file"], row["number"]): row["answer"] for row in rows}
     for name in THIRD:
         __import__(name)
-    mutants_drawn = drawn(count, arguments[2:] or CORE)
-    first = next(mutant for mutant in mutants_drawn if chosen(mutant, calls))
-    unchanged = first._replace(source=(ROOT / "rpim_opt" / first.file).read_text(encoding="utf-8"))
-    if survives(unchanged, chosen(first, calls)) != "survives":
+    places_drawn = drawn(int(count), files or CORE)
+    if _fails_unchanged(*places_drawn[0], known):
         print("the tests fail without a change, too")
         return 2
-    results: list[dict[str, Any]] = []
-    counts: Counter[str] = Counter()
-    for mutant in mutants_drawn:
-        tests = chosen(mutant, calls)
-        answer = survives(mutant, tests) if tests else "untested"
-        counts[answer] += 1
-        results.append({**mutant._asdict(), "source": "", "answer": answer, "tests": len(tests)})
-        (folder / "mutants.json").write_text(json.dumps(results, indent=1))
+    for file, number in places_drawn:
+        if (file, number) in answers:
+            continue
+        tried = mutant(file, number)
+        tests = known.chosen(tried)
+        answer = "untested"
+        if tests:
+            answer = survives(tried, tests)
+        answers[file, number] = answer
+        row = {"file": file, "number": number, "answer": answer, "tests": len(tests), "line": tried.line}
+        row |= {"before": tried.before, "after": tried.after}
+        with journal.open("a") as lines:
+            lines.write(json.dumps(row) + "\n")
         if answer in ("survives", "untested"):
-            print(f"{answer}: {mutant.file}:{mutant.line}: {mutant.before}  ->  {mutant.after}", flush=True)
+            print(f"{answer}: {file}:{tried.line}: {tried.before}  ->  {tried.after}", flush=True)
+    counts = Counter(answers[place] for place in places_drawn)
     found = counts["killed"] + counts["timeout"]
-    print(f"{found} of {count} mutants are found ({found / count:.1%}); {dict(counts)}")
+    print(f"{found} of {len(places_drawn)} mutants are found ({found / len(places_drawn):.1%}); {dict(counts)}")
     return 0
 
 

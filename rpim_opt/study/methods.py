@@ -154,12 +154,12 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
         For an unknown name, or one that occurs twice.
     """
     found: list[Method] = []
-    weights = dict(_selectors(selectors))
+    weights = _selectors(selectors)
     for label, formulation in _formulations(formulations):
         if formulation is not None and formulation.penalty is None:
             found.append(Calibrating(label, NONE, formulation, 0.0, options))
         else:
-            found += [Calibrating(label, name, formulation, weight, options) for name, weight in weights.items()]
+            found += [Calibrating(label, name, formulation, weight, options) for name, weight in weights]
     found += [Foreign(label, function) for label, function in _functions(functions)]
     labels = [method.label for method in found]
     for label in labels:

@@ -51,6 +51,17 @@ def test_bounded_solutions_are_those_of_an_active_set_method(condition: float, w
     assert np.abs(z - want).max() < 1e-8
 
 
+def test_a_box_has_one_row_for_each_finite_side_and_one_for_an_equality() -> None:
+    lower = np.array([-np.inf, -1.0, 0.5, -np.inf])
+    upper = np.array([np.inf, 2.0, 0.5, 3.0])
+    box = ro.constraints.Box("sides", lambda parameters: (lower, upper))
+    z = cp.Variable(4)
+    made = box(z, random_model(0, 1.0, n=4).parameters)
+    assert sum(constraint.size for constraint in made) == 4  # two of the second, one of the third and of the fourth
+    z.value = np.array([1e9, 0.0, 0.5, -1e9])
+    assert all(constraint.value() for constraint in made)
+
+
 def test_multipliers_are_the_slopes_of_the_optimum() -> None:
     model = random_model(3, 1e2)
     program = ro.convex.pose(ro.bounded, model)

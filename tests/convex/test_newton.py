@@ -15,7 +15,7 @@ from rpim_opt.convex.gap import duality_gap
 from rpim_opt.convex.interior import interior
 from rpim_opt.convex.objective import Damping
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.tree import rows_of
+from rpim_opt.convex.tree import largest_of, rows_of
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0).scaled(np.geomspace(0.3, 30.0, 30))
@@ -28,6 +28,15 @@ EQUATIONS: dict[str, Any] = {
     "weighed": lambda r: cp.sum(cp.multiply(np.linspace(1, 2, r.size), cp.huber(r))) / 3,
     "one-sided": lambda r: cp.sum(cp.square(cp.pos(r))) + 0.1 * cp.sum(cp.abs(r)),
 }
+WRITTEN: dict[str, Any] = EQUATIONS | {
+    "even power": lambda r: cp.sum(cp.power(r - 1, 4)),
+    "minus minus": lambda r: 2 - cp.sum(-cp.huber(r)),
+    "minus minus of each": lambda r: cp.sum(3 - (-cp.huber(r))),
+    "in another shape": lambda r: cp.reshape(cp.sum(cp.abs(2 * r - 1)) / 4, (), order="F"),
+    "squares by a number": lambda r: cp.quad_over_lin(r + 1, 2.0) + 0.5 * cp.sum(r),
+    "exponentials": lambda r: cp.sum(cp.multiply(np.arange(1, 10), cp.exp(r))),
+}
+"""Sums over nine rows, as people may write them."""
 NORMS: dict[str, Any] = {
     "huber": ro.huber(1.0),
     "norms": cp.sum,
@@ -166,10 +175,10 @@ def test_what_is_no_sum_or_has_kinks_elsewhere_is_left_to_the_interior_point(los
     assert program.solve(1.0).iterations > 0
 
 
-@pytest.mark.parametrize("name", EQUATIONS)
+@pytest.mark.parametrize("name", WRITTEN)
 def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) -> None:
     r = cp.Variable(9)
-    expression = EQUATIONS[name](r)
+    expression = WRITTEN[name](r)
     rows = rows_of(expression, r)
     assert rows is not None
     v = np.random.default_rng(2).normal(size=9)
@@ -183,6 +192,57 @@ def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) ->
     h = 1e-5
     bend = (rows.both(v + h)[1] - rows.both(v - h)[1]) / (2 * h)
     assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
+
+
+NO_SUMS: dict[str, Any] = {
+    "norms with a kink": lambda r: cp.sum(cp.norm(cp.vstack([r, 2 * r]), axis=0)),
+    "of all": lambda r: cp.norm2(r) + cp.sum(cp.huber(r)),
+    "of some": lambda r: cp.sum(cp.huber(r[:4])),
+    "of neighbours": lambda r: cp.sum(cp.abs(cp.diff(r))),
+    "mixed": lambda r: cp.sum(cp.huber(np.eye(9)[::-1] @ r)),
+    "norms of few": lambda r: cp.sum(cp.norm(cp.vstack([r[:4], r[4:8]]), axis=0)),
+}
+
+
+@pytest.mark.parametrize("name", NO_SUMS)
+def test_what_is_no_sum_over_rows_is_not_taken_for_one(name: str) -> None:
+    r = cp.Variable(9)
+    assert rows_of(NO_SUMS[name](r), r) is None
+
+
+LARGEST: dict[str, Any] = {
+    "largest": cp.max,
+    "absolute": lambda r: cp.max(cp.abs(2 * r - 1)),
+    "scaled": lambda r: 3 * (cp.norm_inf(r) / 2 + 1) - 0.5,
+    "in another shape": lambda r: cp.reshape(cp.max(r), (), order="F") + 1,
+}
+NOT_LARGEST: dict[str, Any] = {
+    "two": lambda r: cp.max(r) + cp.norm_inf(r),
+    "smallest": lambda r: -cp.max(r),
+    "of some": lambda r: cp.max(r[:3]),
+    "of squares": lambda r: cp.max(cp.square(r)),
+    "of rows": lambda r: cp.sum(cp.max(cp.vstack([r, -r]), axis=0)),
+}
+
+
+@pytest.mark.parametrize("name", LARGEST)
+def test_the_largest_row_has_the_value_of_the_expression(name: str) -> None:
+    r = cp.Variable(9)
+    expression = LARGEST[name](r)
+    found = largest_of(expression, r)
+    assert found is not None
+    for v in np.random.default_rng(4).normal(size=(5, 9)):
+        r.value = v
+        line = found.of.a * v + found.of.c
+        if found.absolute:
+            line = np.abs(line)
+        assert found.factor * line.max() + found.constant == pytest.approx(expression.value, rel=1e-14)
+
+
+@pytest.mark.parametrize("name", NOT_LARGEST)
+def test_what_is_no_largest_row_is_not_taken_for_one(name: str) -> None:
+    r = cp.Variable(9)
+    assert largest_of(NOT_LARGEST[name](r), r) is None
 
 
 SMOOTH = [
