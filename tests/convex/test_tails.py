@@ -1,4 +1,4 @@
-"""What heavy tails add to covariances: against quadrature, the limits of much and of no data, and where tails are normal."""
+"""What heavy tails add to covariances: against quadrature, without data and with many, and normal tails."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rpim_opt.convex.tails import WIDEST, added
 def field(H: Array, h: Array, size: Array, tails: float) -> tuple[Array, Array, Array]:
     """Return mean, covariance and local variances of the mean field, by its plain iteration."""
     v = size**2
-    for _ in range(3000):
+    for _ in range(400):
         C = np.linalg.inv(H + np.diag(1 / v))
         z = C @ h
         v = (tails * size**2 + z**2 + np.diag(C)) / (tails + 1)
