@@ -61,8 +61,8 @@ class Learned(Brief):
     stated
         (n,) the scales that were stated for what is identified [SI].
     drift
-        (n, s) by what the deviations move where the sizes are others [SI]: D, with D D' what that adds to their
-        covariance.
+        (n, s + h) by what the deviations move where the sizes are others, and where tails let them [SI]: D, with D D'
+        what that adds to the covariance that ordinary Tikhonov has at the learned scales. Deviations are the same.
     added
         Parameters of families that were added to those that were to be identified.
     notes

@@ -244,10 +244,11 @@ def _variance(evidence: Evidence, point: Point) -> float:
 
 
 def _drift(fit: Fit, covariance: Array, slopes: Array) -> Array:
-    """Return by what the deviations move (n, s) [SI] where sizes are others: D with D D' what that adds to theirs."""
+    """Return by what the deviations move (n, s + h) [SI] where sizes are others, and their own scales."""
     unit = fit.laid.parameters.free.scale / np.sqrt(fit.point.v)
     variance, U = np.linalg.eigh(covariance)
-    return (unit[:, None] * slopes) @ (U * np.sqrt(np.maximum(variance, 0.0)))
+    by_sizes = slopes @ (U * np.sqrt(np.maximum(variance, 0.0)))
+    return unit[:, None] * np.column_stack([by_sizes, fit.evidence.tails(fit.point)])
 
 
 def _freedom(growth: Array, covariance: Array) -> float:

@@ -28,7 +28,7 @@ class Spread:
     factor
         By how much a robust loss weighs the equations, against squared residuals in sigmas.
     drift
-        (n, s) what sizes that were learned add: D with D D' a covariance of the deviations [SI]; None for nothing.
+        (n, k) what learned sizes and heavy tails add: D with D D' a covariance of the deviations [SI], or None.
     level
         The noise's variance where it was learned with the scatter, in units of the equations'; None: the residuals say.
     """

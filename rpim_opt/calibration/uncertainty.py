@@ -29,6 +29,9 @@ class Uncertainty(Tabled):
         prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            what the penalty holds back: its bias, in the mean
         total      noise + prior = sigma^2 S (A'A + w)^-1 S          if deviations are as large as the penalty expects
 
+    Where sizes were learned, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), and by how much
+    Student's tails are wider than the normals that stand for them (`Learned.drift`).
+
     It holds for a squared loss, or for what a robust loss trusts, and a squared penalty. A parameter at an active
     bound is not known better for it: such parameters are listed in ``at_bound``, and their intervals are those
     without the bound. Other penalties (lasso) have no such covariance and are refused.

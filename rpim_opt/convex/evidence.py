@@ -12,6 +12,7 @@ from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.late import optimize
+from rpim_opt.convex.tails import added
 from rpim_opt.problem.scatter import Scatter, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
@@ -188,6 +189,13 @@ class Evidence:
         gradient[: len(b.names)] += self._by_size(e2, size2, v)
         gradient[len(b.names) :] += self._by_noise(logs, whitened, z, C)
         return Point(value + float(off @ off), gradient, z, C, v, logs)
+
+    def tails(self, point: Point) -> Array:
+        """Return by what deviations move (p, h) beside `Point.C`: D, with D D' what Student's tails add to it."""
+        b = self.believed
+        heavy = np.flatnonzero(b.heavy & ~b.replaced)
+        size = np.sqrt(self._size2(point.logs)[heavy])
+        return added(point.z, point.C, point.v, heavy, size, b.tails)
 
     def _whiten(self, scatter: Scatter) -> list[_Whitened]:
         p = self.data.X.shape[1]

@@ -26,12 +26,17 @@ class Table(Protocol):
         ...
 
 
-class Robust(Protocol):
-    """What knows how a robust loss weighs the equations that it trusts."""
+class Spread(Protocol):
+    """What the covariance of a result has besides its equations and its penalty."""
 
     @property
     def factor(self) -> float:
-        """Against squared residuals in sigmas; 1 for a squared loss."""
+        """How a robust loss weighs the equations, against squared residuals in sigmas; 1 for a squared loss."""
+        ...
+
+    @property
+    def drift(self) -> Array | None:
+        """(n, k) D with D D' what learned sizes and heavy tails add to the covariance [SI], or None."""
         ...
 
 
@@ -69,7 +74,7 @@ class Result(Protocol):
         ...
 
     @cached_property
-    def spread(self) -> Robust:
+    def spread(self) -> Spread:
         """What the covariance rests on; InputError where there is none."""
         ...
 
@@ -87,7 +92,10 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     if form is not None and weight > 0:
         parts.append(np.sqrt(weight / _variance(result, noise)) * form.matrix)
     kept = _kept(free, without)
-    rows, _ = marginal(_triangle(np.vstack(parts)), np.zeros(len(free)), kept)
+    R = _triangle(np.vstack(parts))
+    if result.spread.drift is not None:
+        R = _widened(R, result.spread.drift / free.scale[:, None])
+    rows, _ = marginal(R, np.zeros(len(free)), kept)
     rows = _triangle(rows) / (free.scale[kept] * inflate)
     return Statement(
         names=tuple(free.names[i] for i in kept),
@@ -133,6 +141,13 @@ def _variance(result: Result, noise: float | None) -> float:
     if noise is not None:
         return noise**2 * factor
     return result.noise_variance * factor
+
+
+def _widened(R: Array, D: Array) -> Array:
+    """Return rows (n, n) of the precision that belongs to (R'R)^-1 + D D'."""
+    moved = R @ D
+    L = np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T)
+    return np.asarray(np.linalg.solve(L, R), dtype=float)
 
 
 def _kept(free: Parameters, without: Sequence[str]) -> np.ndarray:

@@ -79,7 +79,8 @@ class Carried:
         asked = partial(calibrate, formulation=formulation, weight=1.0)
         learned = self.result.learned
         if learned is not None:
-            learned = replace(learned, left_out=(), notes=())
+            known = learned.drift[:, :0]  # the prior holds what was not known of the sizes
+            learned = replace(learned, left_out=(), notes=(), drift=known)
         return replace(found, learned=learned, asked=asked)
 
     def missed(self, model: LinearModel, penalty: Quadratic) -> Missed:

@@ -341,6 +341,34 @@ def test_a_suspect_that_the_model_explains_comes_back() -> None:
     assert kept == {POSITION.data.label[1]: 8.0}
 
 
+# --- how sure it is ----------------------------------------------------------------------------------------------
+
+
+def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_open() -> None:
+    """Kass and Steffey's J Cov(ln sizes) J', J by differences of another step; the rest is wider than Tikhonov's."""
+    few = POSITION.on(POSITION.data.configurations(12, 1))
+    result = ro.calibrate(few)
+    learned = result.learned
+    assert learned is not None
+    learning = Learning(ro.convex.Prior(), tuple(learned.noise))
+    fit = learning.fitted(
+        few, result.x, np.log([s.value for s in (*learned.sizes.values(), *learned.noise.values())]), 1
+    )
+    evidence, logs = fit.evidence, fit.point.logs
+    step = 0.01
+    ends = [[evidence.at(logs + side * e).z for side in (-1, 1)] for e in step * np.eye(len(logs))]
+    J = np.array([(ahead - behind) / (2 * step) for behind, ahead in ends]).T
+    J = J * (POSITION.parameters.free.scale * learning.stated(few).scale)[:, None]
+    followed, tails = np.split(learned.drift, [len(logs)], axis=1)
+    own = np.diag(J @ learned.covariance @ J.T)
+    assert np.sum(followed**2, axis=1) == pytest.approx(own, rel=0.1, abs=0.02 * np.diag(result.covariance).min())
+
+    plain = replace(ro.calibrate(result.problem, ro.tikhonov, 1.0).spread, level=1.0)
+    added = np.diag(result.covariance - plain.covariance)
+    assert added == pytest.approx(np.sum(followed**2, axis=1) + np.sum(tails**2, axis=1), rel=1e-3, abs=1e-12)
+    assert np.median(np.sqrt(np.diag(result.covariance) / np.diag(plain.covariance))) > 1.02
+
+
 # --- the search --------------------------------------------------------------------------------------------------
 
 

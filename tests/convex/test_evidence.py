@@ -287,4 +287,7 @@ def test_a_gibbs_sampler_agrees() -> None:
     # the mean field is an approximation: a fifth of a standard deviation is allowed beside the sampler's own error
     assert np.abs(found - z.mean(axis=0)).max() < np.max(4 * error + 0.35 * spread)
     stated_spread = np.sqrt(np.diag(result.covariance)) / unit
-    assert 0.75 < np.exp(np.mean(np.log(stated_spread / spread))) < 1.2
+    over = np.log(stated_spread / spread)
+    # of the normals that stand for the tails alone 0.77 of the sampler's, some 0.6
+    assert abs(np.mean(over)) < 0.06
+    assert np.abs(over).max() < 0.2

@@ -37,7 +37,7 @@ def result_of(formulation: ro.Formulation, linear: LinearModel, weight: float, n
     x = program.solve(weight).z * FREE.scale
     return SimpleNamespace(
         problem=PROBLEM, x=x, program=program, linear=linear, penalty_weight=weight, noise_variance=noise,
-        spread=SimpleNamespace(factor=1.0),
+        spread=SimpleNamespace(factor=1.0, drift=None),
     )  # fmt: skip
 
 
@@ -93,6 +93,16 @@ def test_noise_and_inflation_widen_it() -> None:
     inflated = Prior.from_result(result, inflate=6.0).stated(PROBLEM.parameters)
     assert np.abs(plain.rows) == pytest.approx(2 * np.abs(found.rows), rel=1e-9)
     assert np.abs(found.rows) == pytest.approx(6 * np.abs(inflated.rows), rel=1e-9)
+
+
+def test_it_is_as_wide_as_the_result_says() -> None:
+    """With learned sizes and heavy tails, too, which no penalty at the learned scales holds."""
+    result = ro.calibrate(PROBLEM.on(PROBLEM.data.configurations(8, 0)))
+    stated = Prior.from_result(result).stated(PROBLEM.parameters)
+    covariance = np.linalg.inv(stated.rows.T @ stated.rows) * np.outer(FREE.scale, FREE.scale)
+    assert np.diag(covariance) == pytest.approx(np.diag(result.covariance), rel=1e-5)
+    held = result.spread.noise + result.spread.form.prior(1.0) * np.outer(*2 * [result.problem.parameters.free.scale])
+    assert np.median(np.diag(covariance) / np.diag(held)) > 1.3  # eight configurations leave much to the tails
 
 
 def test_it_counts_from_the_nominal_values_that_it_was_found_with() -> None:
