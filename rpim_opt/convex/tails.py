@@ -44,7 +44,7 @@ def added(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, tails: f
     B = np.sqrt(1 / local - np.clip(precision, 1 / (WIDEST * local), 1 / local))
     own = C[np.ix_(heavy, heavy)]
     L = np.linalg.cholesky(np.eye(len(B)) - own * np.outer(B, B))
-    return np.linalg.solve(L, (C[:, heavy] * B).T).T
+    return np.asarray(np.linalg.solve(L, (C[:, heavy] * B).T).T, dtype=float)
 
 
 def _variance(precision: Array, moved: Array, tails: float) -> Array:
