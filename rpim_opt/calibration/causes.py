@@ -7,6 +7,7 @@ from typing import cast
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.readings import better_reading
@@ -30,7 +31,7 @@ LARGEST = {"length": 0.02, "angle": 0.05}
 
 NOTHING = (
     "No mistake that was tried explains it: another drawing, or a robot that bends and repeats worse than the "
-    "instrument measures?"
+    "instrument measures? Look at rpim-opt inspect."
 )
 
 
@@ -74,10 +75,7 @@ def likely_causes(result: Outcome) -> list[str]:
         return [head, *(f"Likely: {text}" for text in [*causes, *shared])]
     pixels = problem.errors(result.x, "pixel")
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
-        return [
-            head,
-            "No mistake that was tried explains it: look at rpim-opt inspect, the robot's drawing, the units.",
-        ]
+        return [head, NOTHING]
     return []
 
 
@@ -102,15 +100,19 @@ def _signs(result: Outcome, problem: CalibrationProblem, errors: Array) -> list[
     signs = []
     ratio = noise_ratio(problem, errors)
     if ratio > NOISY:
-        signs.append(f"its errors have an RMS of {1e3 * _rms(errors):.3g} mm, {ratio:.3g} times the stated noise")
+        signs.append(_large_errors(f"{three_digits(1e3 * _rms(errors))} mm", ratio))
     pixels = problem.errors(result.x, "pixel")
     ratio = noise_ratio(problem, pixels, "pixel")
     if ratio > NOISY:
-        signs.append(f"its errors have an RMS of {_rms(pixels):.3g} px, {ratio:.3g} times the stated noise")
+        signs.append(_large_errors(f"{three_digits(_rms(pixels))} px", ratio))
     if not result.converged:
         signs.append("it did not converge")
     signs += _large(result, problem)
     return signs
+
+
+def _large_errors(rms: str, ratio: float) -> str:
+    return f"its errors have an RMS of {rms}, {three_digits(ratio)} times the stated noise"
 
 
 def noise_ratio(problem: CalibrationProblem, errors: Array, dimension: str = "length") -> float:
@@ -142,5 +144,5 @@ def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:
         if abs(result.z[i]) > SCALES and share > most:
             most = share
             unit = "mm" if dimension == "length" else "mrad"
-            worst = f"{name} deviates by {1e3 * result.x[i]:+.3g} {unit}"
+            worst = f"{name} deviates by {three_digits(1e3 * result.x[i])} {unit}"
     return [worst] if worst else []

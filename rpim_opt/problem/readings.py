@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import three_digits
 from rpim_opt.problem.misfit import Points, misfit, misfits, points_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import READY, robots
@@ -53,8 +54,8 @@ class Better(NamedTuple):
     @property
     def sentence(self) -> str:
         """Say it with the figures."""
-        figures = f"{1e3 * self.left:.3g} mm instead of {1e3 * self.stated:.3g} mm"
-        return f"the data fit {self.ratio:.0f} times better, {figures}, with {self.what}: {self.remedy}."
+        figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
+        return f"the data fit {three_digits(self.ratio)} times better, {figures}, with {self.what}: {self.remedy}."
 
 
 def joint_readings(robot: Robot) -> Iterator[Reading]:
@@ -315,5 +316,5 @@ def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
                 best, name = size, each
     if not best < BETTER * stated:
         return None
-    other = Reading(f"the ready robot {name}", f'write robot = "{name}"', lambda points: points)
+    other = Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', lambda points: points)
     return _compared([other], points, stated, points, best)
