@@ -78,12 +78,18 @@ def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
         for i, row in enumerate(block.row):
             key = block.q[i].tobytes() + block.y[i].tobytes()
             if key in own and block.measurement.columns:
-                copies.append(f"{validation.label[row]} ({own[key]})")
+                copies.append(_alias(validation.label[row], own[key]))
     if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
             f"{listed(copies)}. Its error says less than it seems: draw them apart (rpim-opt new --hold-out)."
         )
+
+
+def _alias(label: str, other: str) -> str:
+    if label == other:
+        return label
+    return f"{label} ({other})"
 
 
 def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:

@@ -11,6 +11,7 @@ from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.camera_words import camera_remarks
+from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -104,7 +105,7 @@ def _from_all(result: Calibration) -> str:
 
 
 def _notes(result: Calibration, name: str) -> list[str]:
-    notes = []
+    notes = likely_causes(result)
     if result.record.simulated:
         notes.append("The measurements are simulated.")
     notes += contact_remarks(result.problem.sample())

@@ -91,9 +91,7 @@ def test_validation_rows_that_are_identification_rows_are_named() -> None:
         causes = likely_causes(validated(result, validation))
         assert len(causes) == (count > 0)
     found = inspect(problem, copies).warnings
-    assert any(
-        "2 of 2 rows of the validation set are identification rows as well: P4 (P4), P10 (P10)" in t for t in found
-    )
+    assert any("2 of 2 rows of the validation set are identification rows as well: P4, P10" in t for t in found)
     assert not inspect(problem, own).warnings
 
 
@@ -122,7 +120,9 @@ def test_inspection_names_the_same(monkeypatch, capsys, tmp_path) -> None:
 
 
 def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
-    """From a table with two columns exchanged: both commands name them."""
+    """From a table with two columns exchanged: every command names them, and calibrating ends with code 1."""
+    out = str(tmp_path / "out")
+    more = {"inspect": [], "calibrate": ["--out", out]}
     problem = exchanged(1, 2)(simulated_arm("ur5e"))
     (block,) = problem.data.blocks
     header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
@@ -132,6 +132,8 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
     ]
     (tmp_path / "raw.csv").write_text("\n".join([header, *rows]))
     assert run(monkeypatch, "new", str(tmp_path / "cell"), "--robot", "ur5e", "--data", str(tmp_path / "raw.csv")) == 0
-    for command in ("inspect", "calibrate"):
-        run(monkeypatch, command, str(tmp_path / "cell"))
+    for command, code in (("inspect", 0), ("calibrate", 1)):
+        assert run(monkeypatch, command, str(tmp_path / "cell"), *more[command]) == code
         assert "joints 2 and 3 exchanged" in capsys.readouterr().out
+    assert run(monkeypatch, "report", out) == 0
+    assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -25,8 +25,8 @@ TABLE = Path(__file__).with_name("raw_files.md")
 CLEAN = "comma"
 MOST = 1.1
 """The RMS error after a raw file over that after the clean table is no more than this."""
-SHOWN = 48
-"""Characters of a file's header in the table."""
+SHOWN = 36
+"""Characters of a file's header in the table, at its beginning and at its end."""
 
 
 class Judged(NamedTuple):
@@ -88,7 +88,10 @@ def _header(file: Path) -> str:
     elif b"\xdf" in content:
         encoding = "latin-1"
     first = content.decode(encoding).lstrip("\ufeff").splitlines()[0]
-    return f"`{first[:SHOWN].replace(chr(9), '→').replace('|', '¦')}`"
+    plain = first.replace("\t", "→").replace("|", "¦")
+    if len(plain) > 2 * SHOWN:
+        plain = f"{plain[:SHOWN]} ... {plain[-SHOWN:]}"
+    return f"`{plain}`"
 
 
 def main() -> None:
@@ -100,11 +103,12 @@ def main() -> None:
         options = each.options and f"`{each.options}`"
         rows.append([shape, each.header, options, f"{each.identified:.4f}", f"{each.identified / clean:.3f}"])
     worst = max(each.identified for each in found.values()) / clean
+    drawing = found[CLEAN].nominal
     lines = [
         "# Raw files, each from as it is to a calibrated robot",
         "",
         f"`python -m tests.store.raw_figures` makes {len(RAW)} files of one series of {COUNT} measurements of a "
-        f"simulated robot ({NOISE} mm of noise along each axis; RMS error by its drawing {found[CLEAN].nominal:.4f} mm), and "
+        f"simulated robot ({NOISE} mm of noise along each axis; RMS error by its drawing {drawing:.4f} mm), and "
         "carries out `rpim-opt new`, `calibrate` and `validate` with each. All are judged by the same "
         f"{APART} configurations that none has seen. The largest RMS error is {worst:.3f} times the clean table's.",
         "",

@@ -127,7 +127,7 @@ def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_
     path = write(tmp_path)
     assert new(monkeypatch, arm, tmp_path / "cell", path, *options(stated), "--dry-run") == 0
     said = capsys.readouterr().out
-    assert f"the quaternion's order is {right}: on the nominal robot it leaves 0.00 deg, {wrong} " in said
+    assert f"the quaternion's order is {right}: on the nominal robot it leaves 0.09 deg, {wrong} " in said
     assert f"order {right}" in said
     # a stated order is not checked here: it is the user's word
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--quaternion", wrong, "--dry-run") == 0
@@ -182,6 +182,19 @@ def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm,
     for part in expected:
         assert part in said, said
     assert not (tmp_path / "cell").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("arm.urdf.xacro", "command xacro"), ("arm.xml", "MuJoCo"), ("arm.mjcf", "MuJoCo"), ("arm.sdf", "SDF")],
+)
+def test_robots_of_other_programs_are_refused_by_name(monkeypatch, capsys, tmp_path, name, said) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_text(text([HEAD], ROWS))
+    assert new(monkeypatch, tmp_path / name, tmp_path / "cell", path) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert ".urdf" in error
 
 
 def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> None:
@@ -245,7 +258,7 @@ def test_a_raw_file_calibrates_as_well_as_the_clean_table(shape, after_the_clean
 def test_the_table_of_raw_files_is_of_these() -> None:
     """More than forty, and none that its table calls worse; ``python -m tests.store.raw_figures`` writes it anew."""
     lines = [line.split(" | ") for line in TABLE.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
-    over = {line[0].strip("| "): float(line[-1].strip("| ")) for line in lines[1:]}
+    over = {line[0].strip("| "): float(line[-1].strip("| ")) for line in lines[2:]}
     assert list(over) == list(RAW)
     assert len(over) >= 40
     assert max(over.values()) <= MOST
