@@ -36,8 +36,13 @@ def summary_section(result: Calibration) -> list[Element]:
         tag("div", tag("dt", label), tag("dd", mm(value), tag("small", " mm")), class_=kind)
         for label, value, kind in figures
     ]
+    causes = likely_causes(result)
+    look = "lead"
+    if causes or not result.converged:
+        look = "lead alarm"
     return [
-        tag("p", _sentence(result, name, before, after), class_="lead" if result.converged else "lead alarm"),
+        tag("p", _sentence(result, name, before, after), class_=look),
+        *bullets(causes, "notes"),
         tag("dl", *cards, class_="cards"),
         *_left(result),
         *bullets(_notes(result, name), "notes"),
@@ -105,7 +110,7 @@ def _from_all(result: Calibration) -> str:
 
 
 def _notes(result: Calibration, name: str) -> list[str]:
-    notes = likely_causes(result)
+    notes = []
     if result.record.simulated:
         notes.append("The measurements are simulated.")
     notes += contact_remarks(result.problem.sample())
