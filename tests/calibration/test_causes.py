@@ -7,6 +7,7 @@ import pytest
 
 from rpim_opt.calibration import likely_causes
 from rpim_opt.problem import inspect
+from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
     MISTAKES,
@@ -19,6 +20,7 @@ from tests.calibration.mistakes import (
     good,
     likely,
     reflectors_exchanged,
+    rows_set,
     simulated_arm,
     validated,
     values,
@@ -45,6 +47,29 @@ def test_a_mistake_is_named(robot: str, mistake: str) -> None:
 def test_every_mistake_is_named_on_three_robots(robot: str, mistake: str) -> None:
     causes, named = likely(robot, mistake)
     assert named, causes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_none_is_silent_where_sizes_are_learned(monkeypatch, robot: str, mistake: str) -> None:
+    """The default has room for large deviations, and leaves out single rows, which it names."""
+    monkeypatch.setattr(mistakes, "calibrated", ro.calibrate)
+    wrong, expected = MISTAKES[mistake]
+    result = wrong(robot)
+    causes = likely_causes(result)
+    left_out = [row.label for row in result.learned.left_out]
+    assert any(expected.format(other=OTHER[robot]) in text for text in causes) or ("row" in mistake and left_out)
+
+
+def test_rows_that_a_robust_loss_lets_go_do_not_make_a_fit_bad() -> None:
+    """They are named as they are; what else can be said of them is said without that."""
+    problem = simulated_arm("ur5e")
+    far = values(lambda y: y + 0.03 * (np.arange(COUNT) == 7)[:, None])(problem)
+    assert likely_causes(ro.calibrate(far, ro.robust, weight=1.0)) == []
+    zero = rows_set([7], 0.0)(problem)
+    (text,) = likely_causes(ro.calibrate(zero, ro.robust, weight=1.0))
+    assert text.startswith("Likely: row P8 has 0 for every measured coordinate")
 
 
 def test_the_table_of_mistakes_is_of_these() -> None:
