@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
 from rpim_opt.problem import inspect
 from tests.calibration import mistakes
