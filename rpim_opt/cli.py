@@ -25,8 +25,8 @@ HELP = """Robot calibration by convex optimization.
 
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
-Exit codes: 0 done; 1 a limit or gate failed, or a calibration did not converge; 2 unusable input; 3 no solution found;
-4 whether a limit is kept cannot be decided.
+Exit codes: 0 done; 1 a limit or gate failed, a calibration did not converge, or a mistake is likely; 2 unusable input;
+3 no solution found; 4 whether a limit is kept cannot be decided.
 """
 
 
@@ -200,7 +200,8 @@ def calibrate(
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if it did not converge, or a limit is not kept; 4 where that cannot be decided.
+    Exit code 1 if it did not converge, a likely mistake is named, or a limit is not kept; 4 where that cannot be
+    decided.
     """
     with progress() as say:
         from rpim_opt.basics.phases import clock
@@ -237,7 +238,7 @@ def calibrate(
     for file in written:
         text += f"\n\nWritten: {file}"
     show(text, {**found, "refitted_without": without, "written": written}, as_json)
-    if not result.converged:
+    if found["likely_causes"] or not result.converged:
         raise typer.Exit(1)
     _end_by(found["acceptance"])
 

@@ -49,6 +49,19 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def three_digits(value: float) -> str:
+    """Return a figure with three digits that count, and without an exponent where it is large.
+
+    >>> from rpim_opt.basics.text import three_digits
+    >>> three_digits(0.53712), three_digits(-44.26), three_digits(852677.3)
+    ('0.537', '-44.3', '853,000')
+    """
+    rounded = float(f"{value:.3g}")
+    if abs(rounded) < 1000:
+        return f"{rounded:g}"
+    return f"{rounded:,.0f}"
+
+
 def joined(parts: Sequence[str]) -> str:
     """Return parts as an English list: ``a, b and c``.
 

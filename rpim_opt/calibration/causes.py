@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import cast
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.readings import better_reading
@@ -30,16 +32,16 @@ LARGEST = {"length": 0.02, "angle": 0.05}
 
 NOTHING = (
     "No mistake that was tried explains it: another drawing, or a robot that bends and repeats worse than the "
-    "instrument measures?"
+    "instrument measures? Look at rpim-opt inspect."
 )
 
 
 def likely_causes(result: Outcome) -> list[str]:
     """Return what a bad fit likely comes from, a sentence each with its figure; nothing where the fit is good.
 
-    A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise, or deviates by
-    many scales. Then the table is read in other ways (`better_reading`), and rows without value, exchanged rows,
-    rounded joints and a base that moved are looked for.
+    A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
+    does not distrust, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
+    without value, exchanged rows, rounded joints and a base that moved are looked for.
 
     Parameters
     ----------
@@ -64,32 +66,53 @@ def likely_causes(result: Outcome) -> list[str]:
         return []
     problem = cast(CalibrationProblem, result.problem)
     shared = list(shared_rows(problem.data, result.record.validation))
-    errors = problem.errors(result.x)
-    signs = _signs(result, problem, errors)
-    if not signs:
-        return shared
-    causes = _causes(problem, result.x, errors)
-    head = f"The fit is bad: {'; '.join(signs)}."
+    distrusted = _distrusted(result)
+    errors, pixels = (_but(problem.errors(result.x, of), distrusted) for of in ("length", "pixel"))
+    signs = _signs(result, problem, errors, pixels)
+    head: list[str] = []
+    causes: list[str] = []
+    if signs:
+        head = [f"The fit is bad: {'; '.join(signs)}."]
+        causes = _causes(problem, result.x, errors)
+    elif distrusted.any():
+        causes = list(_of_rows(problem))
     if causes or shared:
-        return [head, *(f"Likely: {text}" for text in [*causes, *shared])]
-    pixels = problem.errors(result.x, "pixel")
+        return [*head, *(f"Likely: {text}" for text in causes), *shared]
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
-        return [
-            head,
-            "No mistake that was tried explains it: look at rpim-opt inspect, the robot's drawing, the units.",
-        ]
+        return [*head, NOTHING]
     return []
+
+
+def _distrusted(result: Outcome) -> np.ndarray:
+    """Return which rows (N,) the fit left out, or a robust loss lets go: they are named, and do not make a fit bad."""
+    labels: set[str] = set()
+    if result.learned is not None:
+        labels |= {row.label for row in result.learned.left_out}
+    if not result.squared_loss:
+        labels |= {flag.label for flag in result.flagged} - set(result.kept_together)
+    return np.isin(result.problem.labels, list(labels))
+
+
+def _but(errors: Array, rows: np.ndarray) -> Array:
+    """Return errors (N,) without those of some rows."""
+    return np.where(rows, np.nan, errors)
+
+
+def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which rows cannot be right, whatever the others are."""
+    yield from rows_without_values(problem)
+    if len(problem.arms) == 1:
+        yield from exchanged_rows(problem)
 
 
 def _causes(problem: CalibrationProblem, x: Array, errors: Array) -> list[str]:
     """Return what explains a bad fit: something of all rows, else of some."""
-    found = list(rows_without_values(problem))
     if len(problem.arms) > 1:  # a table is read anew with the drawing of one robot
-        return found
+        return list(_of_rows(problem))
     better = better_reading(problem)
     if better is not None:
-        return [*found, better.sentence]
-    found += exchanged_rows(problem)
+        return [*rows_without_values(problem), better.sentence]
+    found = list(_of_rows(problem))
     far = list(moved_far(problem)) or list(moved(problem, x))
     found += far
     if not found:
@@ -97,20 +120,23 @@ def _causes(problem: CalibrationProblem, x: Array, errors: Array) -> list[str]:
     return found
 
 
-def _signs(result: Outcome, problem: CalibrationProblem, errors: Array) -> list[str]:
+def _signs(result: Outcome, problem: CalibrationProblem, errors: Array, pixels: Array) -> list[str]:
     """Return how a fit shows that it is bad."""
     signs = []
     ratio = noise_ratio(problem, errors)
     if ratio > NOISY:
-        signs.append(f"its errors have an RMS of {1e3 * _rms(errors):.3g} mm, {ratio:.3g} times the stated noise")
-    pixels = problem.errors(result.x, "pixel")
+        signs.append(_large_errors(f"{three_digits(1e3 * _rms(errors))} mm", ratio))
     ratio = noise_ratio(problem, pixels, "pixel")
     if ratio > NOISY:
-        signs.append(f"its errors have an RMS of {_rms(pixels):.3g} px, {ratio:.3g} times the stated noise")
+        signs.append(_large_errors(f"{three_digits(_rms(pixels))} px", ratio))
     if not result.converged:
         signs.append("it did not converge")
     signs += _large(result, problem)
     return signs
+
+
+def _large_errors(rms: str, ratio: float) -> str:
+    return f"its errors have an RMS of {rms}, {three_digits(ratio)} times the stated noise"
 
 
 def noise_ratio(problem: CalibrationProblem, errors: Array, dimension: str = "length") -> float:
@@ -132,15 +158,14 @@ def _rms(errors: Array) -> float:
 def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:
     """Return the robot's parameter that deviates most, where no drawing is as wrong as that."""
     free = problem.parameters.free
-    frames = problem.parameters.of_frames[problem.parameters.identified]
-    worst = ""
-    most = 1.0
-    for i, (name, dimension) in enumerate(zip(free.names, free.dimensions, strict=True)):
-        if frames[i] or dimension not in LARGEST:
-            continue
-        share = abs(result.x[i]) / LARGEST[dimension]
-        if abs(result.z[i]) > SCALES and share > most:
-            most = share
-            unit = "mm" if dimension == "length" else "mrad"
-            worst = f"{name} deviates by {1e3 * result.x[i]:+.3g} {unit}"
-    return [worst] if worst else []
+    expected = free.scale
+    if result.learned is not None:  # what was learned to be large is not what was expected
+        expected = result.learned.stated
+    largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
+    share = np.abs(result.x) / np.maximum(largest, SCALES * expected)
+    share[problem.parameters.of_frames[problem.parameters.identified]] = 0.0
+    worst = int(np.argmax(share))
+    if share[worst] <= 1:
+        return []
+    unit = "mm" if free.dimensions[worst] == "length" else "mrad"
+    return [f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"]

@@ -80,7 +80,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
     std = "-"
     if row["std"] is not None:
         std = f"{row['std']:.4f}"
-    figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}", std]
+    figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}", std]
     return [row["name"], row["unit"], *figures]
 
 

@@ -33,6 +33,8 @@ TINY = 1e-13
 """Keeps normal equations regular where a direction is not seen."""
 AT_ONCE = 128
 """Readings that are fitted at once: more need memory, and are not faster."""
+LONGEST = 3.0
+"""A reflector farther from the flange [m] is none."""
 BEST = 0.75
 """The part of the rows, the best ones, whose errors are counted."""
 
@@ -128,7 +130,7 @@ def _together(blocks: Sequence[Block], own: Mapping[str, float]) -> Points:
         q=np.concatenate([block.q[:, 0] for block in blocks]),
         y=np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
-        tools=np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers]),
+        tools=_reflectors(markers, own),
         turns=_turns(blocks, markers),
         row=np.concatenate([block.row for block in blocks]),
     )
@@ -139,6 +141,13 @@ def _turns(blocks: Sequence[Block], markers: Sequence[str]) -> Array | None:
     if len(markers) > 1 or any(block.measurement.name != "pose" for block in blocks):
         return None
     return np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
+
+
+def _reflectors(markers: Sequence[str], own: Mapping[str, float]) -> Array:
+    """Return where reflectors are stated in the flange frame (M, 3) [m]; at the flange where that is none."""
+    tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers])
+    tools[np.linalg.norm(tools, axis=1) > LONGEST] = 0.0  # where a fit to lengths in another unit put them
+    return tools
 
 
 def placed(robot: Robot, points: Points) -> Placed:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import three_digits
 from rpim_opt.problem.misfit import Points, misfit, misfits, points_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.library import READY, robots
@@ -29,6 +30,8 @@ SAME = 1.05
 """Readings that leave within this factor the same cannot be told apart."""
 MISTAKES = {False: 3, True: 1}
 """Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
+EXACT = 1e-9
+"""A smaller error [m] is none."""
 BEAM = 8
 """First mistakes behind which a second one is looked for."""
 
@@ -42,19 +45,19 @@ class Reading(NamedTuple):
 
 
 class Better(NamedTuple):
-    """The best other reading: what and the remedies in words, the errors [m] of both, and the relative ones' ratio."""
+    """The best other reading: what and the remedies in words, and the errors [m] of both."""
 
     what: str
     remedy: str
     stated: float
     left: float
-    ratio: float
 
     @property
     def sentence(self) -> str:
         """Say it with the figures."""
-        figures = f"{1e3 * self.left:.3g} mm instead of {1e3 * self.stated:.3g} mm"
-        return f"the data fit {self.ratio:.0f} times better, {figures}, with {self.what}: {self.remedy}."
+        figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
+        times = three_digits(self.stated / max(self.left, EXACT))
+        return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}."
 
 
 def joint_readings(robot: Robot) -> Iterator[Reading]:
@@ -252,7 +255,7 @@ def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:
 def _compared(chain: list[Reading], points: Points, stated: float, changed: Points, left: float) -> Better:
     what = " and ".join(each.what for each in chain)
     remedy = "; ".join(each.remedy for each in chain)
-    return Better(what, remedy, stated * points.extent, left * changed.extent, stated / max(left, 1e-300))
+    return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
 def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Reading | None, float]:
@@ -315,5 +318,5 @@ def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
                 best, name = size, each
     if not best < BETTER * stated:
         return None
-    other = Reading(f"the ready robot {name}", f'write robot = "{name}"', lambda points: points)
+    other = Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', lambda points: points)
     return _compared([other], points, stated, points, best)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.text import listed
+from rpim_opt.basics.text import listed, three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.misfit import Placed, Points, lever_arms, misfit, placed, points_of
 from rpim_opt.problem.problem import CalibrationProblem
@@ -44,7 +44,7 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
     >>> y[3] = 0.0
     >>> wrong = problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
     >>> print(*rows_without_values(wrong))
-    rows c3 have 0 for every measured coordinate: no measurement? leave them out ([exclude]).
+    row c3 has 0 for every measured coordinate: no measurement? Leave out what is none ([exclude]).
     """
     data = problem.data
     for block in data.blocks:
@@ -54,8 +54,15 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
         same = (y == y[:, :1]).all(axis=1)
         for value in np.unique(y[same, 0]):
             labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
-            what = f"rows {listed(labels)} have {value:g} for every measured coordinate"
-            yield f"{what}: no measurement? leave them out ([exclude])."
+            what = f"{_rows(labels, 'has', 'have')} {value:g} for every measured coordinate"
+            yield f"{what}: no measurement? Leave out what is none ([exclude])."
+
+
+def _rows(labels: list[str], of_one: str, of_several: str) -> str:
+    """Name rows before their verb."""
+    if len(labels) == 1:
+        return f"row {labels[0]} {of_one}"
+    return f"rows {listed(labels)} {of_several}"
 
 
 def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
@@ -71,12 +78,18 @@ def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
         for i, row in enumerate(block.row):
             key = block.q[i].tobytes() + block.y[i].tobytes()
             if key in own and block.measurement.columns:
-                copies.append(f"{validation.label[row]} ({own[key]})")
+                copies.append(_alias(validation.label[row], own[key]))
     if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
             f"{listed(copies)}. Its error says less than it seems: draw them apart (rpim-opt new --hold-out)."
         )
+
+
+def _alias(label: str, other: str) -> str:
+    if label == other:
+        return label
+    return f"{label} ({other})"
 
 
 def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
@@ -94,7 +107,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     markers = _other_markers(problem.robot, points, found, far)
     if markers:
         yield (
-            f"rows {listed([label[i] for i in markers])} fit another reflector than their own "
+            f"{_rows([label[i] for i in markers], 'fits', 'fit')} another reflector than the stated one "
             "(column marker): reflectors swapped?"
         )
 
@@ -144,8 +157,9 @@ def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
         made = step / np.sqrt(12) * float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
-                f"joint values have {decimals} decimals ({10.0**-decimals:g} {unit}): rounding alone makes "
-                f"{1e3 * made:.3g} mm, the fit is off by {1e3 * error:.3g} mm: export them with more decimals."
+                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone makes "
+                f"{three_digits(1e3 * made)} mm, the fit is off by {three_digits(1e3 * error)} mm: "
+                "export them with more decimals."
             )
             return
 
@@ -180,8 +194,8 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         second = placed(problem.robot, points.take(rows[place:]))
         far = 1e3 * _apart(first, second)
         yield (
-            f"from row {label} on the points fit another base, {far:.3g} mm away: the instrument or the robot's foot "
-            "moved; calibrate the two parts apart, or register the second one anew."
+            f"from row {label} on the points fit another base, {three_digits(far)} mm away: the instrument or the "
+            "robot's foot moved; calibrate the two parts apart, or register the second one anew."
         )
 
 
@@ -246,7 +260,7 @@ def _moved_text(problem: CalibrationProblem, x: Array, base: list[int], place: i
     vectors = change.reshape(-1, len(components))[problem.data.blocks[0].row >= place][:, lengths]
     far = 1e3 * float(np.linalg.norm(vectors, axis=1).mean())
     return (
-        f"from row {problem.data.label[place]} on the points are {far:.3g} mm from where the others put them, and fit "
-        f"a base that moved (that leaves {100 * left:.0f} % of the residuals): did the instrument or the robot's foot "
-        "move? Calibrate the two parts apart."
+        f"from row {problem.data.label[place]} on the points are {three_digits(far)} mm from where the others put "
+        f"them, and fit a base that moved (that leaves {100 * left:.0f} % of the residuals): did the instrument or the "
+        "robot's foot move? Calibrate the two parts apart."
     )

@@ -16,6 +16,13 @@ READY = Path(__file__).resolve().parent / "ready"
 
 
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
+OF_OTHERS = {
+    ".xacro": "a xacro file, which the command xacro expands to URDF",
+    ".xml": "an XML file, of MuJoCo or others",
+    ".mjcf": "a model of MuJoCo",
+    ".sdf": "an SDF file",
+}
+"""Files that describe robots, too, and are not read."""
 
 
 def robots() -> list[str]:
@@ -34,9 +41,12 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
         return inside(folder, name, "key robot", folder / "problem.toml")
     if name in robots():
         return READY / f"{name}.toml"
-    accepted = "a file .toml, .urdf, .csv or .json, or a ready robot: " + choices(name, robots())
+    accepted = "a file .toml, .urdf, .csv or .json"
     file = None if folder is None else folder / "problem.toml"
-    raise InputError("key robot", f"'{name}'", accepted, file)
+    other = OF_OTHERS.get(Path(name).suffix.lower())
+    if other:
+        raise InputError("key robot", f"'{name}', {other}", accepted, file)
+    raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, robots())}", file)
 
 
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:

@@ -202,7 +202,7 @@ class Urdf:
     def _root(self) -> str:
         roots = [link for link in self.links if link not in self.above]
         if len(roots) > 1:
-            accepted = "one, or the argument base (urdf_base in problem.toml)"
+            accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
             raise InputError("links without a parent", ", ".join(roots), accepted, self.path)
         return roots[0]
 
@@ -210,7 +210,7 @@ class Urdf:
         parents = {joint.parent for joint in self.joints.values()}
         leaves = [link for link in self.links if link not in parents and self._up(link, base) is not None]
         if len(leaves) != 1:
-            accepted = "one, or the argument tip (urdf_tip in problem.toml)"
+            accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
             raise InputError(f"links at the end of chains from '{base}'", ", ".join(leaves), accepted, self.path)
         return leaves[0]
 

@@ -167,7 +167,7 @@ def _axes(result: Calibration, name: str, data: Dataset) -> list[Element]:
         chart.bars(np.arange(3) + shift, np.arange(3) + shift + 0.3, values, when, hints)
     rows = []
     for i, axis in enumerate("xyz"):
-        rows.append([axis, *(f"{v[:, i].mean():+.3f} ± {v[:, i].std():.3f}" for v in vectors)])
+        rows.append([axis, *(f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors)])
     caption = "Measured minus modelled, mean ± standard deviation [mm]"
     return [
         figure(chart, "Along the axes of the instrument.", *BEFORE_AFTER),

@@ -41,7 +41,7 @@ def _intervals(result: Calibration) -> tuple[Array, str]:
     try:
         uncertainty = Uncertainty(result)
         low, high = uncertainty.intervals().T
-        note = f"± is half the {uncertainty.confidence:.0%} interval, noise and prior together. "
+        note = f"± is half the {100 * uncertainty.confidence:.0f} % interval, noise and prior together. "
         return (high - low) / 2, note + uncertainty.noise_test().verdict
     except InputError:
         return np.full(len(result.x), np.nan), "No intervals: the formulation has no covariance."
@@ -57,7 +57,7 @@ def _rows(result: Calibration, half: Array) -> list[list[str]]:
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
             name += ", at its bound"
-        figures = [f"{row['nominal']:.4f}", f"{row['identified']:.4f}", f"{row['deviation']:+.4f}"]
+        figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
         spread = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         rows.append([name, *figures, spread, bound])
@@ -85,7 +85,7 @@ def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
         if np.isfinite(bound[k]):
             for end in (-bound[k], bound[k]):
                 chart.line([end, end], [k - 0.35, k + 0.35], "mark")
-        chart.dots(x[[k]], [k], "after", [f"{name}: {x[k]:+.4f} ± {spread[k]:.4f} {unit}"])
+        chart.dots(x[[k]], [k], "after", [f"{name}: {x[k]:+z.4f} ± {spread[k]:.4f} {unit}"])
     legend = [("after", "deviation and interval")]
     if len(stated):
         legend.append(("mark", "tolerance"))

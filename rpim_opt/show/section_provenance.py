@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -20,11 +21,12 @@ from rpim_opt.store.stated_record import FIELDS
 def provenance_section(result: Calibration) -> list[Element]:
     """Return where the measurements come from and what was minimized."""
     record = result.record
-    rows = []
+    count: Counter[tuple[str, str]] = Counter()
     for name, data in sets(result).items():
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
-            rows.append([f"{name}, {what}", str(len(block.row)), _noise(block)])
+            count[f"{name}, {what}", _noise(block)] += len(block.row)
+    rows = [[what, str(number), noise] for (what, noise), number in count.items()]
     said = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",

@@ -32,7 +32,7 @@ def space_section(result: Calibration, embedded: dict[str, Any]) -> list[Element
         "after": _lines(P[drawn], after[drawn]),
     }
     ends = zip("xyz", P.min(axis=0), P.max(axis=0), strict=True)
-    span = ", ".join(f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in ends)
+    span = ", ".join(f"{axis} {low:z.2f} to {high:z.2f} m" for axis, low, high in ends)
     what = "measured positions in the instrument's frame"
     if result.problem.sample().touches is not None:
         what = "touches"

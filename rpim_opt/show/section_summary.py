@@ -11,6 +11,7 @@ from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.camera_words import camera_remarks
+from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -35,8 +36,13 @@ def summary_section(result: Calibration) -> list[Element]:
         tag("div", tag("dt", label), tag("dd", mm(value), tag("small", " mm")), class_=kind)
         for label, value, kind in figures
     ]
+    causes = likely_causes(result)
+    look = "lead"
+    if causes or not result.converged:
+        look = "lead alarm"
     return [
-        tag("p", _sentence(result, name, before, after), class_="lead" if result.converged else "lead alarm"),
+        tag("p", _sentence(result, name, before, after), class_=look),
+        *bullets(causes, "notes"),
         tag("dl", *cards, class_="cards"),
         *_left(result),
         *bullets(_notes(result, name), "notes"),

@@ -22,6 +22,8 @@ from rpim_opt.show.pieces import figure, mm, sets
 from rpim_opt.show.svg import Axis, Chart
 
 TITLE = "Weight of the penalty"
+WHY = {"learned": "largest evidence of all sizes"}
+"""Of choices that are not of one weight; others without a note were given."""
 MANY = 600
 """Equations beyond which a loss that is no square is drawn by the squares that it trusts, which have a formula: on
 paper the two curves are one, and a hundred robust fits of two thousand rows take minutes."""
@@ -162,5 +164,5 @@ def _choices(path: Path, chosen: Mapping[str, Selection], places: Mapping[str, i
     for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
         name = f"{rule} (chosen)" if rule == selector else rule
         mean = mm(path.error[places[rule]]) if rule in places else ""
-        rows.append([name, f"{choice.weight:.3g}", mean, choice.note or "given"])
+        rows.append([name, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
     return rows

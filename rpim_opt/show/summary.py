@@ -60,6 +60,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     whole = figures(result)
     lacking = judged(result)
     accepted = acceptance(result)
+    causes = likely_causes(result)
     return {
         "title": record.title,
         "source": record.source,
@@ -67,7 +68,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "errors": errors,
         "orientation": angles,
         "prices": [price._asdict() for price in result.prices],
-        "remarks": _remarks(result),
+        "remarks": [*_remarks(result), *causes],
+        "likely_causes": causes,
         "lack_of_fit": lacking and lacking.content(),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
@@ -127,7 +129,6 @@ def _remarks(result: Calibration) -> list[str]:
     ]
     if result.record.held_out is not None:
         remarks.append(result.record.held_out.sentence(len(result.problem.data)))
-    remarks += likely_causes(result)
     fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
     if fitted.any():
         remarks.insert(0, "Nominal: the drawing's robot, frames fitted.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import date, datetime
 from typing import Any
 
@@ -73,23 +73,29 @@ def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | 
     if not table:
         return None
     plain = {key: table[key] for key in ("confidence", "marker") if key in table}
-    known: dict[str, tuple[str, ...]] = {"limit": ("length",), **dict.fromkeys(BOX, ("length",))}
-    known |= {f"q{i}": (dimension,) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    others = {key: value for key, value in table.items() if key not in plain}
-    found = quantities(others, known, "table acceptance", _numbers, plain)
-    values = {stem: value for (stem, _), value in found.items()}
-    if not isinstance(values.get("limit"), float):
+    values = _quantities({key: value for key, value in table.items() if key not in plain}, robot, plain)
+    limit = values.pop("limit", None)
+    if not isinstance(limit, float):
         raise InputError("table acceptance", "no limit", "limit_mm = 0.1")
-    sides = {stem: _side(value, stem) for stem, value in values.items() if stem != "limit"}
-    if not isinstance(plain.get("marker", ""), str):
-        raise InputError("key acceptance.marker", repr(plain["marker"])[:60], "the name of a reflector")
+    sides = {stem: _side(value, stem) for stem, value in values.items()}
+    marker = plain.get("marker", "")
+    if not isinstance(marker, str):
+        raise InputError("key acceptance.marker", repr(marker)[:60], "the name of a reflector")
     return Requirement(
-        limit=values["limit"],
+        limit=limit,
         box=_box(sides),
         joints=tuple((int(stem[1:]), side) for stem, side in sides.items() if stem not in BOX),
-        marker=plain.get("marker", ""),
+        marker=marker,
         confidence=number(plain.get("confidence", CONFIDENCE), "key acceptance.confidence"),
     )
+
+
+def _quantities(table: Mapping[str, Any], robot: Robot, also: Iterable[str]) -> dict[str, Any]:
+    """Return the limit, the sides of a box and of joints by stem [SI]."""
+    known = dict.fromkeys(("limit", *BOX), ("length",))
+    known |= {f"q{i}": (dimension,) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    found = quantities(table, known, "table acceptance", _numbers, also)
+    return {stem: value for (stem, _), value in found.items()}
 
 
 def _numbers(value: Any, key: str, si: float) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,9 @@ from rpim_opt.use.iso9283 import Performance, iso9283
 PLACE = ("x", "y", "z")
 TURNS = (("rx", "ry", "rz"), ("a", "b", "c"), ("w", "p", "r"))
 """What the three angles may be called; each is judged by itself, whichever axis it turns about."""
+NAMES = ("configuration", "label")
+"""What a column that names the pose may be, the better one first."""
+QUANTITIES = {*PLACE, *(stem for group in TURNS for stem in group)}
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
 
 
@@ -29,6 +32,9 @@ class _Column(NamedTuple):
 
     name: str
     si: float
+
+
+_Parts = dict[str, _Column]
 
 
 def read_approaches(source: Any, units: str = "") -> Performance:
@@ -65,20 +71,7 @@ def read_approaches(source: Any, units: str = "") -> Performance:
 
 
 def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str]) -> Performance:
-    named = [(name, split(name)) for name in columns]
-    attained: dict[str, _Column] = {}
-    commanded: dict[str, _Column] = {}
-    pose = ""
-    for name, (stem, unit) in named:
-        found = recognised(stem, ())
-        if found.stem in ("configuration", "label"):
-            if not pose or found.stem == "configuration":
-                pose = name
-        elif found.kind != "derived" and any(found.stem in group for group in (PLACE, *TURNS)):
-            into = commanded if found.kind == "wanted" else attained
-            if found.stem in into:
-                raise InputError("the header", f"'{into[found.stem].name}' and '{name}'", "one of them")
-            into[found.stem] = _Column(name, _size(name, found.stem, unit, units))
+    pose, attained, commanded = _recognised(columns, units)
     if not pose or not set(PLACE) <= set(attained):
         raise InputError("the header", listed(list(columns), 6), ACCEPTED)
     rows = [str(i + 1) for i in range(len(columns[pose]))]
@@ -91,6 +84,26 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
         _if_there(columns, commanded, turns, rows),
         turns or TURNS[0],
     )
+
+
+def _recognised(columns: Iterable[str], units: Mapping[str, str]) -> tuple[str, _Parts, _Parts]:
+    """Return the column that names the pose, and those of what was attained and commanded by what they hold."""
+    names: dict[str, str] = {}
+    attained: _Parts = {}
+    commanded: _Parts = {}
+    of_kind = {"": attained, "measured": attained, "wanted": commanded}
+    for name in columns:
+        stem, unit = split(name)
+        found = recognised(stem, ())
+        into = of_kind.get(found.kind)
+        if found.stem in NAMES:
+            names.setdefault(found.stem, name)
+        elif found.stem in QUANTITIES and into is not None:
+            if found.stem in into:
+                raise InputError("the header", f"'{into[found.stem].name}' and '{name}'", "one of them")
+            into[found.stem] = _Column(name, _size(name, found.stem, unit, units))
+    pose = next((names[stem] for stem in NAMES if stem in names), "")
+    return pose, attained, commanded
 
 
 def _size(name: str, stem: str, unit: str, units: Mapping[str, str]) -> float:

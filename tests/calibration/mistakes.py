@@ -1,18 +1,25 @@
-"""What people get wrong in tables of measurements, done to simulated ones of real robots."""
+"""What people get wrong in tables of measurements, done to simulated ones of real robots.
+
+``python -m tests.calibration.mistakes`` writes `mistakes.md`: what is said of each.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 import rpim_opt as ro
+from rpim_opt.basics.text import markdown
 from rpim_opt.robot.library import READY
 from rpim_opt.robot.plain import read_mdh
 
+TABLE = Path(__file__).with_name("mistakes.md")
 NOISE = 5e-5
 COUNT = 40
+SEEDS = range(2, 12)
 
 
 def simulated_arm(name: str, seed: int = 1, count: int = COUNT, markers: int = 1) -> ro.CalibrationProblem:
@@ -125,14 +132,6 @@ def moved_by(far: float, turn: float = 0.0) -> Change:
     return values(change)
 
 
-def other_robot(name: str) -> Change:
-    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
-        other = simulated_arm(name)
-        return problem.on(other.data)
-
-    return changed
-
-
 def both(*changes: Change) -> Change:
     def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
         for each in changes:
@@ -143,7 +142,7 @@ def both(*changes: Change) -> Change:
 
 
 BY_TEXT = sorted(range(COUNT), key=lambda i: str(i + 1))
-MISTAKES: dict[str, tuple[Change, str]] = {
+IN_TABLES: dict[str, tuple[Change, str]] = {
     "joints 2 and 3 exchanged": (exchanged(1, 2), "joints 2 and 3 exchanged"),
     "joints 4 and 6 exchanged": (exchanged(3, 5), "joints 4 and 6 exchanged"),
     "joints 1 and 2 exchanged": (exchanged(0, 1), "joints 1 and 2 exchanged"),
@@ -161,8 +160,8 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "joint 5 coupled to 4": (coupled(4, 3, 1.0), "joint 5 coupled to joint 4"),
     "degrees as radians": (joints(np.degrees), "degrees, not radians"),
     "radians as degrees": (joints(np.radians), "radians, not degrees"),
-    "metres as millimetres": (values(lambda y: y / 1e3), "a thousand times larger"),
-    "millimetres as metres": (values(lambda y: 1e3 * y), "a thousand times smaller"),
+    "metres as millimetres": (values(lambda y: y / 1e3), "a thousand times larger: name the columns x_m"),
+    "millimetres as metres": (values(lambda y: 1e3 * y), "a thousand times smaller: name the columns x_mm"),
     "inches as millimetres": (values(lambda y: y / 25.4), "in inches"),
     "left-handed": (values(lambda y: y * [1, -1, 1]), "mirrored"),
     "x and y exchanged": (values(lambda y: y[:, [1, 0, 2]]), "mirrored"),
@@ -171,13 +170,94 @@ MISTAKES: dict[str, tuple[Change, str]] = {
     "values two rows too low": (values(lambda y: np.roll(y, 2, axis=0)), "2 rows too low"),
     "values from the last to the first": (values(lambda y: y[::-1]), "reverse order"),
     "values sorted as texts": (values(lambda y: y[BY_TEXT]), "sorted as texts"),
-    "a row of zeros": (rows_set([7], 0.0), "rows P8 have 0 for every"),
+    "a row of zeros": (rows_set([7], 0.0), "row P8 has 0 for every"),
     "three rows of zeros": (rows_set([7, 8, 20], 0.0), "rows P8, P9, P21 have 0 for every"),
     "two rows exchanged": (rows_exchanged(4, 21), "P5 and P22"),
     "tracker moved by 300 mm": (moved_by(0.3, 0.2), "from row P2"),
     "tracker moved by 1 mm": (moved_by(1e-3), "from row P2"),
-    "joints rounded to 0.1 degrees": (rounded(0.1), "(0.1 deg): rounding alone"),
-    "joints rounded to a degree": (rounded(1.0), "(1 deg): rounding alone"),
+    "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
+    "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),
 }
 ROBOTS = ("ur5e", "irb120", "iiwa7")
 OTHER = {"ur5e": "ur10e", "irb120": "irb140", "iiwa7": "fr3"}
+
+
+def calibrated(problem: ro.CalibrationProblem) -> ro.calibration.Calibration:
+    return ro.calibrate(problem, ro.tikhonov, weight=ro.reml)
+
+
+def another_robot(robot: str) -> ro.calibration.Calibration:
+    return calibrated(simulated_arm(robot).on(simulated_arm(OTHER[robot]).data))
+
+
+def reflectors_exchanged(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Exchange the values of two reflectors in three rows."""
+    first, second = problem.data.blocks
+    a, b = first.y.copy(), second.y.copy()
+    rows = [5, 11, 30]
+    a[rows], b[rows] = second.y[rows], first.y[rows]
+    return problem.on(replace(problem.data, blocks=(replace(first, y=a), replace(second, y=b))))
+
+
+def validated(result: ro.calibration.Calibration, rows: ro.Dataset) -> ro.calibration.Calibration:
+    return replace(result, record=replace(result.record, validation=rows))
+
+
+def rows_on_both_sides(robot: str) -> ro.calibration.Calibration:
+    result = calibrated(simulated_arm(robot))
+    return validated(result, result.problem.data.take([3, 9]))
+
+
+Wrong = Callable[[str], ro.calibration.Calibration]
+MISTAKES: dict[str, tuple[Wrong, str]] = {
+    name: (lambda robot, change=change: calibrated(change(simulated_arm(robot))), expected)
+    for name, (change, expected) in IN_TABLES.items()
+}
+MISTAKES |= {
+    "another robot": (another_robot, "the ready robot {other}"),
+    "two reflectors exchanged in three rows": (
+        lambda robot: calibrated(reflectors_exchanged(simulated_arm(robot, markers=2))),
+        "fit another reflector",
+    ),
+    "two rows calibrated with and kept apart": (rows_on_both_sides, "2 of 2 rows of the validation set"),
+}
+"""Calibrations of a robot with a mistake in them, and what names it."""
+
+
+def likely(robot: str, mistake: str) -> tuple[list[str], bool]:
+    """Return what is said of a mistake, and whether that names it."""
+    wrong, expected = MISTAKES[mistake]
+    causes = ro.calibration.likely_causes(wrong(robot))
+    return causes, any(expected.format(other=OTHER[robot]) in text for text in causes)
+
+
+def main() -> None:
+    """Write what is said of every mistake with three robots."""
+    rows = []
+    named = 0
+    for mistake in MISTAKES:
+        for robot in ROBOTS:
+            causes, found = likely(robot, mistake)
+            named += found
+            rows.append([mistake, robot, " ".join(causes)])
+    accused = [text for robot in ROBOTS for seed in SEEDS for text in good(robot, seed)]
+    lines = [
+        "# Mistakes in tables, and what `calibrate` says of them",
+        "",
+        "`python -m tests.calibration.mistakes` calibrates simulated measurements of three robots with "
+        f"{len(MISTAKES)} mistakes.",
+        f"{named} of {len(rows)} are named. Of {len(ROBOTS) * len(SEEDS)} tables without a mistake {len(accused)} "
+        "are accused.",
+        "",
+        markdown(["mistake", "robot", "what is said"], rows),
+    ]
+    TABLE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def good(robot: str, seed: int) -> list[str]:
+    """Return what is said of good data, which should be nothing."""
+    return ro.calibration.likely_causes(calibrated(simulated_arm(robot, seed)))
+
+
+if __name__ == "__main__":
+    main()

@@ -4,31 +4,51 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import openpyxl
+import pyarrow as pa
+import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
+from rpim_opt.robot.mdh import Robot
 from tests.simulate import ARM
 
-COUNT = 12
+COUNT = 36
+APART = 60
+"""Configurations of the table that judges, which no calibration sees."""
+NOISE = 0.02
+TURNED = 5e-5
+"""Of an instrument, along and about each axis [mm, rad]."""
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
-def clean() -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Return labels, joints (N, 6) [deg], and poses (N, 4, 4) [mm] of `ARM`, all with few decimals."""
+def off_its_drawing(rng: np.random.Generator) -> Robot:
+    """Return `ARM` as somebody built it: off its drawing by 0.5 mm and 0.5 mrad."""
+    mdh = ARM.mdh.copy()
+    mdh[:, :4] += 5e-4 * rng.normal(size=(6, 4))
+    return replace(ARM, mdh=mdh)
+
+
+def clean() -> tuple[np.ndarray, np.ndarray]:
+    """Return joints (N, 6) [deg] and poses (N, 4, 4) [mm] as an instrument sees them, with few decimals."""
     rng = np.random.default_rng(7)
-    q = rng.uniform(-120, 120, (COUNT, 6)).round(3)
+    built = off_its_drawing(rng)
+    q = rng.uniform(-120, 120, (COUNT + APART, 6)).round(3)
     base = numeric_frame([1.8, -0.7, 0.35, 0.1, -0.2, 1.1])
     tool = numeric_frame([0.03, -0.02, 0.06, 0.3, 0.2, -0.5])
-    T = base @ forward_kinematics(ARM, np.radians(q)) @ tool
-    T[:, :3, 3] = (1e3 * T[:, :3, 3] + 0.3 * rng.normal(size=(COUNT, 3))).round(4)
-    return [f"P{i + 1}" for i in range(COUNT)], q, T
+    T = base @ forward_kinematics(built, np.radians(q)) @ tool
+    T[:, :3, 3] = (1e3 * T[:, :3, 3] + NOISE * rng.normal(size=(len(q), 3))).round(4)
+    T[:, :3, :3] @= Rotation.from_rotvec(TURNED * rng.normal(size=(len(q), 3))).as_matrix()
+    return q, T
 
 
-LABELS, Q, T = clean()
+EVERY_Q, EVERY_T = clean()
+LABELS = [f"P{i + 1}" for i in range(COUNT)]
+Q, T = EVERY_Q[:COUNT], EVERY_T[:COUNT]
 P = T[:, :3, 3]
 WXYZ = Rotation.from_matrix(T[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
 Rows = list[list[str]]
@@ -93,6 +113,32 @@ def book(folder: Path, sheets: dict[str, Rows], numbers: bool = True, merged: Se
     return path
 
 
+def clocked(folder: Path, rate: float, apart: float, shift: float = 0.0) -> list[Path]:
+    """Write joints at a rate [1/s] while the arm rests at each place, and points with times of another clock."""
+    lines = []
+    for i, row in enumerate(ROWS):
+        lines += [[f"{i + k / rate:.4f}", *row[1:7]] for k in range(int(0.1 * rate))]
+    joints = write(folder, "joints.csv", text([["time [s]", *HEAD[1:7]]], lines))
+    moments = [f"{1e3 * (i + 0.05 + apart + shift):.2f}" for i in range(COUNT)]
+    rows = [[name[0], moment, *point] for name, moment, point in zip(NAMED, moments, POINTS, strict=True)]
+    return [joints, write(folder, "points.csv", text([["Point", "Timestamp [ms]", *HEAD[7:]]], rows))]
+
+
+def parquet(folder: Path) -> Path:
+    columns = [LABELS, *np.hstack([Q, P]).T]
+    path = folder / "raw.parquet"
+    pq.write_table(pa.table(dict(zip(HEAD, columns, strict=True))), path)
+    return path
+
+
+def of_two_kinds(folder: Path) -> list[Path]:
+    """Write joints as the controller's text and points as a workbook."""
+    joints = write(
+        folder, "program.txt", text([["Punkt", *joint_names("A{} [deg]")]], beside(NAMED, JOINTS), "\t", True)
+    )
+    return [joints, book(folder, {"Messung": [["Punkt", *HEAD[7:]], *beside(NAMED, POINTS)]})]
+
+
 Options = dict[str, str]
 Shape = tuple[Callable[[Path], Path | list[Path]], Options, str]
 """What writes the files, the options of ``rpim-opt new``, and what is measured."""
@@ -114,7 +160,8 @@ GROUPS = ["", "Joint angles", *[""] * 5, "Position", "", ""]
 BARE = ["Name", *joint_names("A{}"), "X", "Y", "Z"]
 UNITS_LINE = ["", *["deg"] * 6, *["mm"] * 3]
 PREAMBLE = "Export of cell 7\nOperator;Smith\nDate;2024-05-02;12:30\n\n"
-U95 = [["0.012", "0.013", "0.014"]] * COUNT
+STD = [["0.018", "0.020", "0.022"]] * COUNT
+U95 = [["0.036", "0.040", "0.044"]] * COUNT
 WANTED = cells(P + 0.7, 4)
 DEVIATIONS = cells(np.full((COUNT, 3), -0.7), 4)
 METRES = cells(P / 1e3, 7)
@@ -177,6 +224,7 @@ RAW: dict[str, Shape] = {
         text([[*HEAD[:7], *(f"{w} {a} [mm]" for w in ("Nominal", "Measured", "Dev") for a in "XYZ")]],
              beside(NAMED, JOINTS, WANTED, POINTS, DEVIATIONS)),
     ),
+    "Parquet": (parquet, {}, "position"),
     "Excel": excel({"Sheet1": [HEAD, *ROWS]}),
     "Excel, second sheet by name": excel({"Notes": [["warm", "up"]], "Points": [HEAD, *ROWS]}, sheet="Points"),
     "Excel, second sheet by number": excel({"Notes": [["warm", "up"]], "Points": [HEAD, *ROWS]}, sheet="2"),
@@ -196,7 +244,7 @@ RAW: dict[str, Shape] = {
     ),
     "Leica": one(
         text([["Point ID", *HEAD[1:], *(f"Std {a} [mm]" for a in "XYZ"), "Timestamp"]],
-             beside(ROWS, U95, [["2024-05-02 12:30:01"]] * COUNT), ";")
+             beside(ROWS, STD, [["2024-05-02 12:30:01"]] * COUNT), ";")
     ),
     "RoboDK": one(text([[*joint_names("J{}"), "X", "Y", "Z"]], beside(JOINTS, POINTS)), units="deg,mm"),
     "KUKA": one(
@@ -265,6 +313,10 @@ RAW: dict[str, Shape] = {
     ),
     "joints and points by row": two(
         text([HEAD[1:7]], JOINTS), text([["X [mm]", "Y [mm]", "Z [mm]"]], POINTS), key="row"
+    ),
+    "a controller's text and a workbook": (of_two_kinds, {}, "position"),
+    "joints and points of two clocks": (
+        lambda folder: clocked(folder, rate=100.0, apart=0.003), {"within": "0.006"}, "position"
     ),
     "several files below each other": two(
         text([HEAD], ROWS[:7]), text([[*HEAD[:7], "X [m]", "Y [m]", "Z [m]"]], beside(NAMED, JOINTS, METRES)[7:], ";")
