@@ -167,7 +167,8 @@ class Prior:
         """Return the posterior of an earlier calibration as the prior of the next, in the place of its own scales.
 
         Where the model is linear, calibrating with it at weight 1 equals calibrating with the data of both. It holds
-        the earlier penalty already: of several results of one arm only the last one is to be taken.
+        the earlier penalty already: of several results of one arm only the last one is to be taken. Where sizes were
+        learned it is as wide as `Calibration.covariance`, which knows of them and of heavy tails.
 
         Parameters
         ----------
