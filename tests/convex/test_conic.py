@@ -49,6 +49,7 @@ def test_the_minimum_is_that_of_cvxpy(kind: str, weight: float) -> None:
             found = program.solve(T, C, weight, H, G, size, attempt)
             assert found.status == cp.OPTIMAL
             assert found.u == pytest.approx(np.asarray(u.value), abs=2e-4)  # the root of 1e-8
+            assert np.append(*(program.values(found, each) for each in (v, w))) == pytest.approx(T @ found.u + C)
             assert found.iterations > 0
             assert 0 < found.seconds < 10
             got = program.multipliers(found, constraints[0])
