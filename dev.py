@@ -97,7 +97,7 @@ def versions(*pythons: str) -> int:
             for kernel in KERNELS:
                 said[version, kernel] = _readme(programs / "rpim-opt", Path(scratch, kernel))
                 print(version, kernel, said[version, kernel], flush=True)
-    return len(set(said.values())) - 1
+    return max(len(set(said.values())) - 1, 0)
 
 
 def _readme(program: Path, folder: Path) -> str:

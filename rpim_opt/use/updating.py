@@ -68,7 +68,7 @@ def update(
     >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
     >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
     >>> print(str(found).splitlines()[0])
-    The robot has not changed, as far as 8 readings can tell: chi-squared 26.0 of 24, probability 0.37.
+    The robot has not changed, as far as 8 readings can tell: chi-squared 25.9 of 24, probability 0.37.
     >>> [earlier.title for earlier in found.result.record.earlier], found.changes
     (['ABB IRB 120-3/0.58'], ())
     """
