@@ -82,7 +82,9 @@ Json = Annotated[
 @app.command()
 def new(
     folder: Annotated[Path, typer.Argument(help="The problem folder to make; none that is there already.")],
-    robot: Annotated[str, typer.Option(help="A ready robot (rpim-opt robots), or a file .urdf, .toml, .json, .csv.")],
+    robot: Annotated[
+        str, typer.Option(help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.")
+    ],
     data: Annotated[
         list[Path], typer.Option(help="Joint and measured values: text, Excel, Parquet; several are stacked or joined.")
     ],

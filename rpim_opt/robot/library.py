@@ -9,6 +9,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.inputs import inside
 from rpim_opt.robot.chain import Described
+from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.plain import read_mdh
 from rpim_opt.robot.urdf import read_urdf
 
@@ -17,7 +18,7 @@ READY = Path(__file__).resolve().parent / "ready"
 
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
 OF_OTHERS = {
-    ".xacro": "a xacro file, which the command xacro expands to URDF",
+    XACRO: "a xacro file, which only a command or a script may name: it is carried out",
     ".xml": "an XML file, of MuJoCo or others",
     ".mjcf": "a model of MuJoCo",
     ".sdf": "an SDF file",
@@ -51,6 +52,6 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
 
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
     """Return the robot of a file, with base and tool where a URDF states them."""
-    if file.suffix == ".urdf":
+    if file.suffix in (".urdf", XACRO):
         return read_urdf(file, urdf_base, urdf_tip)
     return Described(read_mdh(file), np.zeros(6), np.zeros(6))

@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.writing import write_bytes
 from rpim_opt.robot.chain import Chain, Described, corrected, describe, require_same_arm
+from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
@@ -33,7 +34,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     Parameters
     ----------
     path
-        An expanded URDF file; xacro files have to be expanded first.
+        A URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults (``rpim-opt[xacro]``).
     base, tip
         Names of links; the root, and the only leaf below the base.
 
@@ -82,12 +83,13 @@ def write_urdf(
     Parameters
     ----------
     source
-        The original. Its `read_urdf` with the same base and tip has to be the robot whose parameters were identified.
+        The original, or a file ``.xacro``: then what it expands to is. Its `read_urdf` with the same base and tip has
+        to be the robot whose parameters were identified.
     robot
         The robot with identified parameters, `Calibration.robot` or `use.identified`, which refuses what
         a URDF cannot express.
     target
-        Where to write; may be ``source``.
+        Where to write; may be ``source``, unless that is a xacro file.
     base, tip
         Names of links, as for `read_urdf`.
     base_frame, tool_frame
@@ -109,6 +111,8 @@ def write_urdf(
     >>> robot.mdh[:, 3], ro.read_urdf("identified.urdf").robot.mdh[:, 3]  # [m]
     (array([0.3]), array([0.301]))
     """
+    if Path(target).suffix.lower() == XACRO:
+        raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
     urdf = read_tree(Path(source))
     every, joints, chain = _chain(urdf, base, tip)
     table, T_base, T_tool, G = describe(chain)

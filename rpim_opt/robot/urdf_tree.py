@@ -18,8 +18,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.inputs import read_bytes
 from rpim_opt.basics.units import LARGEST
+from rpim_opt.robot.expanding import urdf_text
 from rpim_opt.robot.kinematics import numeric_frame
 from rpim_opt.robot.original import origin_numbers
 
@@ -87,7 +87,7 @@ class Joint:
         if len(parts) != count or not all(_is_number(part, largest) for part in parts):
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
             if "$" in text:
-                wanted += "; expand the file with the command xacro first"
+                wanted += "; a file with xacro's expressions ends in .xacro"
             raise self.error(f"{tag} {attribute}", repr(text[:40]), wanted)
         return np.array([float(part) for part in parts])
 
@@ -226,7 +226,7 @@ class Urdf:
 
 def read_tree(path: Path) -> Urdf:
     """Return the tree of links and joints of a file."""
-    data = read_bytes(path)
+    data = urdf_text(path)
     root = _tree(data, path)
     if root.tag != "robot":
         raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
@@ -244,7 +244,7 @@ def _named(root: Element, path: Path) -> tuple[dict[str, Element], dict[str, Ele
     known: dict[str, dict[str, Element]] = {"link": {}, "joint": {}}
     for element in root.children:
         if element.tag.startswith("xacro:"):
-            raise InputError(f"element <{element.tag}>", "a xacro file", "URDF: expand it with the command xacro", path)
+            raise InputError(f"element <{element.tag}>", "xacro in a file .urdf", "URDF, or a file .xacro", path)
         if element.tag not in known:
             continue
         name = element.attributes.get("name", "")

@@ -7,7 +7,11 @@ from typing import NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import require_file
+from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.library import ROBOT_FILES, find_robot
+
+NAMED = (*ROBOT_FILES, XACRO)
+"""Kinds of files that a command or a script may name; a problem folder, those without code."""
 
 
 class Source(NamedTuple):
@@ -20,10 +24,10 @@ class Source(NamedTuple):
 
 def find_source(robot: str) -> Source:
     """Return the source of a robot: a ready one by name, or a file."""
-    if not robot.endswith(ROBOT_FILES):
+    if not robot.endswith(NAMED):
         return Source(find_robot(robot), robot, "a ready robot")
     file = Path(robot)
     if not file.exists():
-        raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
+        raise InputError("the robot", "no such file", f"a file {', '.join(NAMED)}, or a ready robot", file)
     require_file(file)
     return Source(file, "robot.toml", f"modified DH table, from {file.name}")

@@ -67,7 +67,7 @@ def new_problem(
     folder
         A new one.
     robot
-        The name of a ready robot, or a file ``.urdf``, ``.toml``, ``.json`` or ``.csv``.
+        The name of a ready robot, or a file ``.urdf``, ``.xacro``, ``.toml``, ``.json`` or ``.csv``.
     data
         Measurements, in one or several text, Excel or Parquet files of whatever columns `understand_tables` recognises.
     measurement

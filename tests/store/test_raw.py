@@ -186,7 +186,7 @@ def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm,
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("arm.urdf.xacro", "command xacro"), ("arm.xml", "MuJoCo"), ("arm.mjcf", "MuJoCo"), ("arm.sdf", "SDF")],
+    [("arm.xml", "MuJoCo"), ("arm.mjcf", "MuJoCo"), ("arm.sdf", "SDF")],
 )
 def test_robots_of_other_programs_are_refused_by_name(monkeypatch, capsys, tmp_path, name, said) -> None:
     path = tmp_path / "raw.csv"
