@@ -267,9 +267,27 @@ def _calibrated(
     if formulation:
         changes["formulation"] = named_formulation(formulation)
     say("learning sizes" if changes.get("weight", instance.weight) is None else "choosing the weight")
-    return instance.calibrate(
-        **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
-    )
+    try:
+        return instance.calibrate(
+            **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
+        )
+    except NoSolutionFound as error:
+        raise _with_causes(error, instance) from None
+
+
+def _with_causes(error: NoSolutionFound, instance: Instance) -> NoSolutionFound:
+    """Return the error of a program without solution; where data are likely read wrongly, it says how."""
+    from rpim_opt.calibration.asking import calibrate
+    from rpim_opt.calibration.causes import likely_causes
+    from rpim_opt.convex.formulation import tikhonov
+
+    if error.conflict is not None:
+        return error
+    _, *causes = likely_causes(calibrate(instance.problem, tikhonov, weight=1.0)) or [""]
+    if not causes:
+        return error
+    said = "; ".join(cause.rstrip(".") for cause in causes)
+    return NoSolutionFound(error.formulation, error.weight, error.status, advice=said[0].lower() + said[1:])
 
 
 def _saved(result: Calibration, out: Path | None) -> list[Path]:

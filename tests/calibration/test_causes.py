@@ -145,21 +145,35 @@ def test_inspection_names_the_same(monkeypatch, capsys, tmp_path) -> None:
     assert "mm instead of" in text
 
 
-def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
-    """From a table with two columns exchanged: every command names them, and calibrating ends with code 1."""
-    out = str(tmp_path / "out")
-    more = {"inspect": [], "calibrate": ["--out", out]}
-    problem = exchanged(1, 2)(simulated_arm("ur5e"))
+def made(monkeypatch, folder, problem) -> None:
+    """Make the folder ``cell`` from a raw table of what was measured."""
     (block,) = problem.data.blocks
     header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
     rows = [
         ",".join([label, *(f"{v:.6f}" for v in np.degrees(q)), *(f"{v:.7f}" for v in y)])
         for label, q, y in zip(problem.data.label, block.q[:, 0], block.y, strict=True)
     ]
-    (tmp_path / "raw.csv").write_text("\n".join([header, *rows]))
-    assert run(monkeypatch, "new", str(tmp_path / "cell"), "--robot", "ur5e", "--data", str(tmp_path / "raw.csv")) == 0
+    (folder / "raw.csv").write_text("\n".join([header, *rows]))
+    assert run(monkeypatch, "new", str(folder / "cell"), "--robot", "ur5e", "--data", str(folder / "raw.csv")) == 0
+
+
+def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
+    """From a table with two columns exchanged: every command names them, and calibrating ends with code 1."""
+    out = str(tmp_path / "out")
+    more = {"inspect": [], "calibrate": ["--out", out]}
+    made(monkeypatch, tmp_path, exchanged(1, 2)(simulated_arm("ur5e")))
     for command, code in (("inspect", 0), ("calibrate", 1)):
         assert run(monkeypatch, command, str(tmp_path / "cell"), *more[command]) == code
         assert "joints 2 and 3 exchanged" in capsys.readouterr().out
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_program_without_solution_says_what_is_read_wrongly(monkeypatch, capsys, tmp_path) -> None:
+    wrong, said = MISTAKES["millimetres as metres"]
+    made(monkeypatch, tmp_path, wrong("ur5e").problem)
+    capsys.readouterr()
+    code = run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--formulation", "robust", "--select", "l_curve")
+    assert code in (1, 3)  # whether a solver gives up on kilometres is the solver's
+    printed = capsys.readouterr()
+    assert said in printed.out + printed.err
