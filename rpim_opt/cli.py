@@ -207,6 +207,7 @@ def calibrate(
     """
     with progress() as say:
         from rpim_opt.basics.phases import clock
+        from rpim_opt.calibration.causes import named
         from rpim_opt.show.options import required
         from rpim_opt.show.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
@@ -240,7 +241,7 @@ def calibrate(
     for file in written:
         text += f"\n\nWritten: {file}"
     show(text, {**found, "refitted_without": without, "written": written}, as_json)
-    if found["likely_causes"] or not result.converged:
+    if named(found["likely_causes"]) or not result.converged:
         raise typer.Exit(1)
     _end_by(found["acceptance"])
 
@@ -278,16 +279,15 @@ def _calibrated(
 def _with_causes(error: NoSolutionFound, instance: Instance) -> NoSolutionFound:
     """Return the error of a program without solution; where data are likely read wrongly, it says how."""
     from rpim_opt.calibration.asking import calibrate
-    from rpim_opt.calibration.causes import likely_causes
+    from rpim_opt.calibration.causes import likely_causes, named
     from rpim_opt.convex.formulation import tikhonov
 
     if error.conflict is not None:
         return error
-    _, *causes = likely_causes(calibrate(instance.problem, tikhonov, weight=1.0)) or [""]
-    if not causes:
+    causes = likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))
+    if not named(causes):
         return error
-    said = "; ".join(cause.rstrip(".") for cause in causes)
-    return NoSolutionFound(error.formulation, error.weight, error.status, advice=said[0].lower() + said[1:])
+    return NoSolutionFound(error.formulation, error.weight, error.status, advice=" ".join(causes).rstrip("."))
 
 
 def _saved(result: Calibration, out: Path | None) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import cast
 
 import numpy as np
@@ -81,6 +81,16 @@ def likely_causes(result: Outcome) -> list[str]:
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
         return [*head, NOTHING]
     return []
+
+
+def named(causes: Sequence[str]) -> bool:
+    """Whether `likely_causes` found a mistake, and not only that a fit is bad.
+
+    >>> from rpim_opt.calibration.causes import NOTHING, named
+    >>> named(["The fit is bad: ...", NOTHING]), named(["The fit is bad: ...", "Likely: ..."]), named([])
+    (False, True, False)
+    """
+    return bool(causes) and causes[-1] != NOTHING
 
 
 def _distrusted(result: Outcome) -> np.ndarray:
