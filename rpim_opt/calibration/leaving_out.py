@@ -11,6 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Tabled
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.terms import term
@@ -142,6 +143,7 @@ class Influence(Tabled):
         return rows
 
 
+@one_blas_thread  # small matrices: threads would wait for each other longer than they compute
 def influence(result: Calibration) -> Influence:
     """Return what leaving out every configuration would do to every parameter.
 
