@@ -21,12 +21,6 @@ from rpim_opt.store.stated_record import FIELDS
 def provenance_section(result: Calibration) -> list[Element]:
     """Return where the measurements come from and what was minimized."""
     record = result.record
-    count: Counter[tuple[str, str]] = Counter()
-    for name, data in sets(result).items():
-        for block in data.blocks:
-            what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
-            count[f"{name}, {what}", _noise(block)] += len(block.row)
-    rows = [[what, str(number), noise] for (what, noise), number in count.items()]
     said = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as the source says; not marked as simulated",
@@ -35,6 +29,27 @@ def provenance_section(result: Calibration) -> list[Element]:
         "Made": record.made,
         "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
     }
+    return section(
+        "Where the data come from",
+        facts(list(said.items())),
+        *_tables(result),
+        tag(
+            "p",
+            "All figures on this page were computed from the measurements and parameters of the calibration when "
+            "the page was written.",
+        ),
+    )
+
+
+def _tables(result: Calibration) -> list[Element]:
+    """Return the measurements, the files and the earlier calibrations that a result rests on."""
+    record = result.record
+    count: Counter[tuple[str, str]] = Counter()
+    for name, data in sets(result).items():
+        for block in data.blocks:
+            what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
+            count[f"{name}, {what}", _noise(block)] += len(block.row)
+    rows = [[what, str(number), noise] for (what, noise), number in count.items()]
     caption = "Measurements and their declared standard deviations"
     tables = [data_table(caption, ["data", "rows", "declared"], rows, prose=True)]
     if record.files:
@@ -44,16 +59,7 @@ def provenance_section(result: Calibration) -> list[Element]:
         earlier = [[each.title, each.made, str(each.rows), _carried(each), each.digest] for each in record.earlier]
         head = ["calibration", "made", "rows", "changed since", "digest"]
         tables.append(data_table("Carries on", head, earlier, prose=True))
-    return section(
-        "Where the data come from",
-        facts(list(said.items())),
-        *tables,
-        tag(
-            "p",
-            "All figures on this page were computed from the measurements and parameters of the calibration when "
-            "the page was written.",
-        ),
-    )
+    return tables
 
 
 def stated_details(result: Calibration) -> list[Element]:

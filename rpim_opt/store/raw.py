@@ -185,21 +185,27 @@ def understand_of(
     """Return what raw tables of an arm say, as `understand_tables` does."""
     asked = asked or Asked()
     paths = [Path(each) for each in data]
-    kind = pose
-    if measurement is not None:
-        kind = pick(MEASUREMENTS, measurement, "measurement")
-    if measurement is None and _seeing(paths, asked):
-        kind = eye_in_hand
-    elif measurement is None and _touching(paths, asked):
-        kind = revisit
+    known = _known_kind(paths, asked, measurement)
+    kind = known or pose
     tables = _understood(paths, arm, kind, asked)
-    if measurement is None and kind is pose:
+    if known is None:
         kind = _kind(tables, paths)
         if kind is not pose:
             tables = _understood(paths, arm, kind, asked)
     if kind is pose and any(each.numbered for each in tables):
         return _ordered(paths, arm, kind, asked, tables)
     return _whole(paths, arm, kind, asked, tables)
+
+
+def _known_kind(paths: Sequence[Path], asked: Asked, measurement: str | None) -> Measurement | None:
+    """Return the kind that is stated, or that columns of pixels or touches tell; None where tables have to be read."""
+    if measurement is not None:
+        return pick(MEASUREMENTS, measurement, "measurement")
+    if _seeing(paths, asked):
+        return eye_in_hand
+    if _touching(paths, asked):
+        return revisit
+    return None
 
 
 def _understood(paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:

@@ -199,24 +199,25 @@ def _ready_name(formulation: Formulation) -> str:
 
 
 def _selectors(stated: Any) -> list[tuple[str, Any]]:
-    found = []
-    for label, each in _listed(stated):
-        if each is None or isinstance(each, str):
-            name = each or LEARNED
-            if name == FOLDER:
-                found.append((label or FOLDER, FOLDER))
-                continue
-            found.append((label or name, weight_of(name)))
-        elif callable(each):
-            found.append((label or _rule_name(each), each))
-        elif isinstance(each, int | float | np.number) and not isinstance(each, bool):
-            found.append((label or f"{each:g}", require_weight(float(each), "selectors")))
-        elif isinstance(each, Mapping) and label:
-            found.append((label, each))
-        else:
-            accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
-            raise InputError("selectors", f"{each!r}", accepted)
-    return found
+    return [_selector(label, each) for label, each in _listed(stated)]
+
+
+def _selector(label: str | None, each: Any) -> tuple[str, Any]:
+    """Return the name of a selector or weight, and what it is."""
+    if each is None:
+        each = LEARNED
+    if each == FOLDER:
+        return label or FOLDER, FOLDER
+    if isinstance(each, str):
+        return label or each, weight_of(each)
+    if callable(each):
+        return label or _rule_name(each), each
+    if isinstance(each, Mapping) and label:
+        return label, each
+    if isinstance(each, bool) or not isinstance(each, int | float | np.number):
+        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
+        raise InputError("selectors", f"{each!r}", accepted)
+    return label or f"{each:g}", require_weight(float(each), "selectors")
 
 
 def _rule_name(rule: Callable[..., Any]) -> str:
