@@ -12,8 +12,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import data_table, page, section
 from rpim_opt.basics.writing import refused, write_text
-from rpim_opt.show.pieces import figure, mm
-from rpim_opt.show.svg import Axis, Chart
+from rpim_opt.show.chart import Axis, Chart, Dots, Line, Mark
+from rpim_opt.show.pieces import figure
+from rpim_opt.show.scales import mm
 from rpim_opt.use.monitored import Monitoring
 
 DAY, HOUR = 86400.0, 3600.0
@@ -44,7 +45,10 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     place, axis = _times(found)
     verdict, *rest = str(found).splitlines()
     lead = tag("p", verdict, class_="lead alarm" if found.drifts else "lead")
-    figures = [_misses(found, place, axis), _sums(found, place, _times(found)[1])]
+    figures = [
+        figure(_misses(found, place, axis), "Each alone, by what the checks before it leave open."),
+        figure(_sums(found, place, axis), "Together (CUSUM)."),
+    ]
     parts = [
         *section("Verdict", lead, *(tag("p", line) for line in rest)),
         *section("Over time", tag("div", *figures, class_="figures")),
@@ -99,33 +103,32 @@ def _table(found: Monitoring) -> Element:
     return data_table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
 
 
-def _misses(found: Monitoring, place: Array, axis: Axis) -> Element:
-    """Draw what every check misses, in standard deviations of a new reading, and what one of all may."""
+def _misses(found: Monitoring, place: Array, axis: Axis) -> Chart:
+    """Return what every check misses, in standard deviations of a new reading, and what one of all may."""
     high = float(max(found.sigmas.max(), found.allowed.max()))
-    chart = Chart("What every check misses, and what it may", axis, Axis("standard deviations", (0.0, 1.05 * high)))
-    chart.line(place, found.allowed, "mark")
     hints = [
         f"{label}: {sigmas:.1f} standard deviations, {mm(1e3 * error)} mm"
         for label, sigmas, error in zip(found.label, found.sigmas, found.error, strict=True)
     ]
     beyond = np.isin(np.arange(len(place)), found.beyond)
-    for which, class_ in ((~beyond, "after"), (beyond, "mark")):
-        chart.dots(place[which], found.sigmas[which], class_, [hints[i] for i in np.flatnonzero(which)])
-    return figure(
-        chart,
-        "Each alone, by what the checks before it leave open.",
-        ("after", "check"),
-        ("mark", "limit, checks beyond it"),
-    )
+    marks: list[Mark] = [Line(place, found.allowed, "mark", "limit, checks beyond it")]
+    for which, role, said in ((~beyond, "after", "check"), (beyond, "mark", "")):
+        at = np.flatnonzero(which)
+        if len(at):
+            marks.append(Dots(place[at], found.sigmas[at], role, said, [hints[i] for i in at]))
+    y = Axis("standard deviations", (0.0, 1.05 * high))
+    return Chart("What every check misses, and what it may", axis, y, marks)
 
 
-def _sums(found: Monitoring, place: Array, axis: Axis) -> Element:
-    """Draw the cumulative sum, its limit, and where it passes that first."""
+def _sums(found: Monitoring, place: Array, axis: Axis) -> Chart:
+    """Return the cumulative sum, its limit, and where it passes that first."""
     high = float(max(found.sums.max(), found.limit))
-    chart = Chart("Cumulative sum of what checks miss, and its limit", axis, Axis("sum", (0.0, 1.05 * high)))
-    chart.line(place, np.full(len(place), found.limit), "mark")
-    chart.line(place, found.sums, "after")
+    marks: list[Mark] = [
+        Line(place, np.full(len(place), found.limit), "mark", "limit, alarm"),
+        Line(place, found.sums, "after", "sum"),
+    ]
     alarm = found.alarm
     if alarm is not None:
-        chart.dots(place[[alarm]], found.sums[[alarm]], "mark", [f"alarm at {found.label[alarm]}"])
-    return figure(chart, "Together (CUSUM).", ("after", "sum"), ("mark", "limit, alarm"))
+        marks.append(Dots(place[[alarm]], found.sums[[alarm]], "mark", hints=[f"alarm at {found.label[alarm]}"]))
+    title = "Cumulative sum of what checks miss, and its limit"
+    return Chart(title, axis, Axis("sum", (0.0, 1.05 * high)), marks)

@@ -5,21 +5,17 @@ from __future__ import annotations
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.svg import Chart
+from rpim_opt.show.chart import Chart
+from rpim_opt.show.svg import Picture
 
 
-def figure(chart: Chart, caption: str, *legend: tuple[str, str]) -> Element:
-    """Return a chart with its legend, class of the key and text, and its caption."""
-    keys = [tag("span", tag("i", class_=f"key {name}"), text) for name, text in legend]
+def figure(picture: Picture | Chart, caption: str = "", *above: Element) -> Element:
+    """Return a chart with its legend and its caption, which its note ends; more may be drawn above it."""
+    drawn = picture if isinstance(picture, Picture) else Picture(picture)
+    keys = [tag("span", tag("i", class_=f"key {role}"), text) for role, text in drawn.chart.legend]
     head = [tag("div", *keys, class_="legend")] if keys else []
-    return tag("figure", *head, chart.element(), tag("figcaption", caption))
-
-
-def mm(value: float) -> str:
-    """Return a length given in mm with the digits that matter."""
-    if value < 10:
-        return f"{value:.3f}"
-    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+    said = " ".join(filter(None, [caption, drawn.chart.note]))
+    return tag("figure", *head, drawn.element(*above), tag("figcaption", said))
 
 
 def sets(result: Calibration) -> dict[str, Dataset]:
@@ -42,6 +38,3 @@ def quantity(result: Calibration) -> str:
     """Say what the errors are of."""
     kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
     return "position error" if kinds <= {"position", "pose"} else "error"
-
-
-BEFORE_AFTER = (("before", "before"), ("after", "after"))

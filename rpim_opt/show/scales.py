@@ -20,12 +20,19 @@ def error_bins(*errors: Array) -> Array:
     return np.geomspace(low, high, 25 if high > 1.01 * low else 2)
 
 
+def mm(value: float) -> str:
+    """Return a length given in mm with the digits that matter."""
+    if value < 10:
+        return f"{value:.3f}"
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+
+
 def below(low: float, sets: Mapping[str, Array]) -> str:
     """Say how many errors of each set lie below the first bin, which counts them, too; nothing where none does."""
     said = [f"{int(np.sum(errors < low))} {when}" for when, errors in sets.items() if (errors < low).any()]
     if not said:
         return ""
-    return f" The first bar holds all rows below {low:.2g} mm, too: {joined(said)}."
+    return f"The first bar holds all rows below {low:.2g} mm, too: {joined(said)}."
 
 
 def kept_tolerance(result: Calibration) -> Array:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from rpim_opt.basics.exceptions import RpimError
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import bullets, data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.observability import combination, observe
-from rpim_opt.show.pieces import figure, mm
-from rpim_opt.show.svg import Axis, Chart
+from rpim_opt.show.charts_weight import picard_chart
+from rpim_opt.show.pieces import figure
+from rpim_opt.show.scales import mm
+
+DIRECTIONS = "At the solution: the penalty holds directions below the line; data near 1 are noise (Picard's condition)."
 
 
 def identifiability_section(result: Calibration) -> list[Element]:
@@ -34,31 +35,8 @@ def identifiability_section(result: Calibration) -> list[Element]:
         tag("p", text),
         *bullets(told),
         tag("p", condition),
-        tag("div", _directions(result), class_="figures"),
+        tag("div", figure(picard_chart(result.program, result.penalty_weight), DIRECTIONS), class_="figures"),
     )
-
-
-def _directions(result: Calibration) -> Element:
-    """Return the singular values, what the data say along their directions, and where the penalty takes over."""
-    beta, s, _ = result.program.model.svd
-    k = np.flatnonzero(s > 0)
-    said = np.abs(beta[k])
-    level = float(np.sqrt(result.penalty_weight))
-    every = np.concatenate([s[k], said, [level] if level > 0 else []])
-    x = Axis("direction", (1, max(len(k), 2)))
-    y = Axis("size [sigmas]", (max(float(every.min()), 1e-4), float(every.max())), log=True)
-    chart = Chart("Singular values and what the data say along them", x, y)
-    chart.line(k + 1.0, s[k], "ink")
-    hints = [f"direction {i + 1}: data {abs(beta[i]):.3g}, s {s[i]:.3g}" for i in k]
-    chart.dots(k + 1.0, said, "after", hints)
-    legend = [("ink", "singular value s"), ("after", "data |u'b|")]
-    if level > 0:
-        chart.line([1, max(len(k), 2)], [level, level], "mark")
-        legend.append(("mark", "root of the weight"))
-    caption = (
-        "At the solution: the penalty holds directions below the line; data near 1 are noise (Picard's condition)."
-    )
-    return figure(chart, caption, *legend)
 
 
 MOST = 200

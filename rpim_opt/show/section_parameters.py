@@ -12,9 +12,9 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import turned_frames
+from rpim_opt.show.charts_result import deviations_chart
 from rpim_opt.show.pieces import figure
 from rpim_opt.show.scales import kept_tolerance
-from rpim_opt.show.svg import Axis, Chart
 
 
 def parameters_section(result: Calibration) -> list[Element]:
@@ -27,7 +27,13 @@ def parameters_section(result: Calibration) -> list[Element]:
         head = head[:-1]
         rows = [row[:-1] for row in rows]
     own = np.array(free.dimensions)[~free.of_frames]
-    charts = [_deviations(result, dimension, half) for dimension in ("length", "angle") if dimension in own]
+    charts = [
+        figure(
+            deviations_chart(result, dimension, half), f"The robot's own {dimension} parameters against the drawing."
+        )
+        for dimension in ("length", "angle")
+        if dimension in own
+    ]
     return section(
         "Parameters",
         tag("p", " ".join([note, *turned_frames(result)])),
@@ -62,35 +68,3 @@ def _rows(result: Calibration, half: Array) -> list[list[str]]:
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         rows.append([name, *figures, spread, bound])
     return rows
-
-
-def _deviations(result: Calibration, dimension: str, half: Array) -> Element:
-    free = result.problem.parameters.free
-    unit, si = display(dimension)
-    own = np.flatnonzero(~free.of_frames & (np.array(free.dimensions) == dimension))
-    names = [free.names[i] for i in own]
-    x = result.x[own] / si
-    spread = np.nan_to_num(half[own] / si, posinf=0.0)
-    bound = kept_tolerance(result)[own] / si
-    stated = bound[np.isfinite(bound)]
-    # an interval that ends far out would hide all others: it is cut at the chart's edge
-    reach = 1.1 * max(
-        float(np.max(np.abs(x))), float(np.median(np.abs(x) + spread)), float(stated.max(initial=0)), 1e-9
-    )
-    axis = Axis(f"deviation [{unit}]", (-reach, reach))
-    chart = Chart(f"Deviations of the {dimension} parameters", axis, Axis("", names=names), 60 + 17 * len(own))
-    chart.line([0, 0], [-0.5, len(own) - 0.5], "zero")
-    for k, name in enumerate(names):
-        chart.line([x[k] - spread[k], x[k] + spread[k]], [k, k], "after")
-        if np.isfinite(bound[k]):
-            for end in (-bound[k], bound[k]):
-                chart.line([end, end], [k - 0.35, k + 0.35], "mark")
-        chart.dots(x[[k]], [k], "after", [f"{name}: {x[k]:+z.4f} ± {spread[k]:.4f} {unit}"])
-    legend = [("after", "deviation and interval")]
-    if len(stated):
-        legend.append(("mark", "tolerance"))
-    return figure(
-        chart,
-        f"The robot's own {dimension} parameters against the drawing; intervals beyond the edge are cut.",
-        *legend,
-    )

@@ -16,8 +16,9 @@ from rpim_opt.calibration.region import Region, region_of
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.predicting import in_base
-from rpim_opt.show.pieces import figure, mm
-from rpim_opt.show.svg import Axis, Chart
+from rpim_opt.show.chart import Axis, Cells, Chart, Line, Mark
+from rpim_opt.show.pieces import figure
+from rpim_opt.show.scales import mm
 
 ANY = Requirement(limit=1.0)
 """All that was measured, where nothing is demanded."""
@@ -59,7 +60,7 @@ def reach_section(result: Calibration) -> list[Element]:
     )
     if limit is not None:
         text += " The search for the largest bound goes on between these configurations, and may end above the shades."
-    maps = [_view(found, name, across, up, region, limit) for name, across, up in VIEWS]
+    maps = [figure(_view(found, name, across, up, region, limit)) for name, across, up in VIEWS]
     return section("How far off the robot may be", tag("p", text), tag("div", *maps, class_="figures"))
 
 
@@ -72,28 +73,30 @@ def _ends(bound: Array) -> Array:
     return np.asarray(np.ceil(ends * 10.0**digits) / 10.0**digits, dtype=float)
 
 
-def _view(found: _Map, name: str, across: int, up: int, region: Region, limit: float | None) -> Element:
+def _view(found: _Map, name: str, across: int, up: int, region: Region, limit: float | None) -> Chart:
     u = found.at[:, across]
     v = found.at[:, up]
     largest = max(np.ptp(u), np.ptp(v)) / CELLS
     left, wide = _cells(u, largest)
     low, high = _cells(v, largest)
-    x = Axis(f"{'xyz'[across]} [mm]", (u.min(), u.max()))
-    y = Axis(f"{'xyz'[up]} [mm]", (v.min(), v.max()))
-    chart = Chart(f"Largest bound of the position reached, {name}", x, y, 420)
-    chart.alike()
     worst: dict[tuple[float, float], float] = {}
     for a, b, bound in zip(left, low, found.bound, strict=True):
         worst[a, b] = max(bound, worst.get((a, b), 0.0))
-    shades = {place: _shade(found.ends, bound, limit) for place, bound in worst.items()}
-    for (a, b), bound in worst.items():
-        chart.cell((a, a + wide), (b, b + high), shades[a, b], f"{mm(bound)} mm")
-    caption = f"{name.capitalize()}."
+    shades: dict[str, list[tuple[float, float]]] = {}
+    for place, bound in sorted(worst.items(), key=lambda item: item[1]):
+        shades.setdefault(_shade(found.ends, bound, limit), []).append(place)
+    marks: list[Mark] = []
+    for shade in sorted(shades):
+        hints = [f"{mm(worst[place])} mm" for place in shades[shade]]
+        marks.append(Cells(np.array(shades[shade]), (wide, high), shade, _said(found.ends, shade, limit), hints))
+    note = f"{name.capitalize()}."
     if region.box is not None:
         (a, b), (c, d) = 1e3 * region.box[across], 1e3 * region.box[up]
-        chart.line([a, b, b, a, a], [c, c, d, d, c], "ink")
-        caption += " The frame is the box that is demanded."
-    return figure(chart, caption, *_legend(found.ends, set(shades.values()), limit))
+        marks.append(Line([a, b, b, a, a], [c, c, d, d, c], "ink"))
+        note += " The frame is the box that is demanded."
+    x = Axis(f"{'xyz'[across]} [mm]", (u.min(), u.max()))
+    y = Axis(f"{'xyz'[up]} [mm]", (v.min(), v.max()))
+    return Chart(f"Largest bound of the position reached, {name}", x, y, marks, note, alike=True)
 
 
 def _cells(values: Array, largest: float) -> tuple[Array, float]:
@@ -111,12 +114,9 @@ def _shade(ends: Array, value: float, limit: float | None) -> str:
     return level
 
 
-def _legend(ends: Array, shades: set[str], limit: float | None) -> list[tuple[str, str]]:
-    legend: list[tuple[str, str]] = []
-    for k, end in enumerate(ends):
-        within = f"level{k}"
-        if within in shades:
-            legend.append((within, f"to {mm(min(float(end), limit or np.inf))} mm"))
-        if f"{within} over" in shades:
-            legend.append((f"{within} over", f"to {mm(end)} mm, above the limit"))
-    return legend
+def _said(ends: Array, shade: str, limit: float | None) -> str:
+    level, *over = shade.split()
+    end = float(ends[int(level.removeprefix("level"))])
+    if over:
+        return f"to {mm(end)} mm, above the limit"
+    return f"to {mm(min(end, limit or np.inf))} mm"

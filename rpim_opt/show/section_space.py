@@ -10,8 +10,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.markup import Element, tag
 from rpim_opt.basics.page import section
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import mm, sets
-from rpim_opt.show.scales import magnification
+from rpim_opt.show.pieces import sets
+from rpim_opt.show.scales import magnification, mm
 
 MOST = 2000
 """Points that are drawn at most."""

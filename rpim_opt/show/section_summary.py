@@ -15,7 +15,8 @@ from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import mm, quantity, repeated, sets
+from rpim_opt.show.pieces import quantity, repeated, sets
+from rpim_opt.show.scales import mm
 
 KEPT_APART = "kept apart"
 

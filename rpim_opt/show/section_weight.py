@@ -18,8 +18,10 @@ from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.program import Estimate, Program, pose
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
-from rpim_opt.show.pieces import figure, mm, sets
-from rpim_opt.show.svg import Axis, Chart
+from rpim_opt.show.charts_weight import l_curve_chart
+from rpim_opt.show.pieces import figure, sets
+from rpim_opt.show.scales import mm
+from rpim_opt.show.svg import Picture
 
 TITLE = "Weight of the penalty"
 WHY = {"learned": "largest evidence of all sizes"}
@@ -27,8 +29,6 @@ WHY = {"learned": "largest evidence of all sizes"}
 MANY = 600
 """Equations beyond which a loss that is no square is drawn by the squares that it trusts, which have a formula: on
 paper the two curves are one, and a hundred robust fits of two thousand rows take minutes."""
-VANISHED = 1e-4
-"""Penalties below this part of the middle one are not drawn: a lasso has nothing left there."""
 
 
 class Path(NamedTuple):
@@ -60,8 +60,11 @@ def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Elemen
         chosen = {**compare(program), **chosen}
     path = _path(result, program, chosen)
     places = {name: path.at(choice.weight) for name, choice in chosen.items() if choice.weight > 0}
-    chart, x, y = _curve(path, places, result.selector)
     k = places[result.selector]
+    points = {name: (path.residual[i], path.solution[i]) for name, i in places.items()}
+    picture = Picture(l_curve_chart(path.residual, path.solution, points, result.selector))
+    x = picture.x(path.residual)
+    y = picture.y(path.solution)
     embedded["curve"] = {
         "weight": path.weight.tolist(),
         "residual": path.residual.tolist(),
@@ -70,15 +73,14 @@ def weight_section(result: Calibration, embedded: dict[str, Any]) -> list[Elemen
         "of": path.of,
         "takers": _takers(places),
         "chosen": k,
-        "x": x(path.residual).tolist(),
-        "y": y(path.solution).tolist(),
+        "x": x.tolist(),
+        "y": y.tolist(),
     }
     slider = tag("input", type="range", id="weight", min=0, max=len(path.weight) - 1, value=k)
     drawn = figure(
-        chart,
+        picture,
         "Each point is the solution at one weight: little penalty above left, much below right." + by_squares,
-        ("mark", "chosen"),
-        ("other", "other selectors"),
+        tag("circle", id="cursor", r=9, class_="cursor", cx=f"{x[k]:g}", cy=f"{y[k]:g}"),
     )
     label = tag("label", "Weight", slider)
     side = tag("div", label, tag("output", id="weight-says", for_="weight"), class_="side")
@@ -131,24 +133,6 @@ def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]
         [1e3 * float(np.nanmean(problem.errors(scale * estimate.z))) for estimate in estimates],
         name,
     )
-
-
-def _curve(path: Path, places: Mapping[str, int], selector: str) -> tuple[Chart, Axis, Axis]:
-    residual = path.residual
-    solution = path.solution
-    shown = solution > VANISHED * float(np.median(solution))
-    x = Axis("root of the loss (residual norm) [sigmas]", (max(residual.min(), 1e-9), residual.max()), log=True)
-    y = Axis("root of the penalty [scales]", (solution[shown].min(), solution.max()), log=True)
-    chart = Chart("L-curve: misfit against size of the deviations", x, y, 330)
-    chart.line(residual[shown], solution[shown], "ink")
-    others = {name: k for name, k in places.items() if name != selector}
-    at = list(others.values())
-    chart.dots(residual[at], solution[at], "other", list(others))
-    k = places[selector]
-    chart.dots(residual[[k]], solution[[k]], "mark", [f"chosen, {selector}"], r=6)
-    cursor = {"cx": f"{float(x(residual[k])):g}", "cy": f"{float(y(solution[k])):g}"}
-    chart.add("circle", id="cursor", r=9, class_="cursor", **cursor)
-    return chart, x, y
 
 
 def _takers(places: Mapping[str, int]) -> dict[str, str]:

@@ -134,7 +134,7 @@ def test_what_is_not_convex_is_named_with_its_reason(formulation: ro.Formulation
 
 def test_a_plot_of_a_result_marks_its_weight() -> None:
     ax = ro.plot.l_curve(RESULT)
-    assert [text.get_text() for text in ax.get_legend().get_texts()] == [f"reml, weight {RESULT.weight:.2g}"]
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == [f"chosen: reml, weight {RESULT.weight:.2g}"]
     (marked,) = [line for line in ax.lines if line.get_marker() != "None"]
     loss, penalty = RESULT.program.value(RESULT.z)
     assert marked.get_xdata()[0] == pytest.approx(np.sqrt(loss), rel=1e-6)
