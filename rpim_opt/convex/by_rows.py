@@ -44,6 +44,7 @@ class Met:
 
     def __init__(self) -> None:
         self._at: dict[float, Near] = {}
+        self.in_box: Array | None = None  # (n,), of a quadratic program
 
     def nearest(self, weight: float) -> Near | None:
         """Return the minimum at the nearest weight."""

@@ -43,7 +43,12 @@ def values(objective: Objective, Z: Array) -> tuple[Array, Array]:
 
 
 def minimum_between(
-    objective: Objective, bounds: Bounds, weight: float, damping: Damping | None, free: Array, start: Array | None
+    objective: Objective,
+    bounds: Bounds,
+    weight: float,
+    damping: Damping | None,
+    free: Array | None = None,
+    near: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the minimum (n,) in a box, and the multipliers (n,) of its bounds.
 
@@ -54,17 +59,19 @@ def minimum_between(
     bounds
         The box.
     free
-        The minimum (n,) without box and damping.
-    start
-        A point near the minimum, (n,): that of a neighbouring weight.
+        The minimum (n,) without box and damping, if it is known.
+    near
+        A point (n,) near the minimum: that of a neighbouring weight or linearization. Of weight zero none is taken:
+        what the data do not see would stay where it is.
     """
     lower, upper = bounds
-    inside = bool(np.all((lower <= free) & (free <= upper)))
-    if inside and damping is None and weight > 0:
+    if free is None and (near is None or weight == 0):
+        free = minimum(objective, weight, None)
+    if free is not None and damping is None and weight > 0 and bool(np.all((lower <= free) & (free <= upper))):
         return free, np.zeros_like(free)
+    start = near if near is not None and weight > 0 else free
     A, b = objective.stacked(weight, damping)
-    near = free if start is None else start
-    return minimum_in_box(A, b, lower, upper, np.clip(near, lower, upper))
+    return minimum_in_box(A, b, lower, upper, np.clip(start, lower, upper))
 
 
 def path_between(objective: Objective, bounds: Bounds, weights: Array) -> tuple[Array, Array]:

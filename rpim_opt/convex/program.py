@@ -194,7 +194,8 @@ class Program(Objective):
         elif self.closed_form:
             estimate = self._at(minimum(self, weight, damping), weight)
         elif self.quadratic and box is not None:
-            z, multipliers = minimum_between(self, box, weight, damping, minimum(self, weight, None), None)
+            z, multipliers = minimum_between(self, box, weight, damping, near=self._met.in_box)
+            self._met.in_box = z
             estimate = self._at(z, weight, shares(self, box, z, multipliers))
         elif weight > 0 and self.faces is not None:
             estimate = self._on_faces(weight, damping)

@@ -29,7 +29,7 @@ from rpim_opt.problem.loads import (
 )
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
-from rpim_opt.robot.compiled import compiled
+from rpim_opt.robot.compiled import quickest
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
@@ -39,8 +39,6 @@ from rpim_opt.robot.parameters import Parameters
 
 SHIFTED = ("base_x", "base_y", "base_z")
 """Parameters that move all of a robot alike."""
-SOME, LARGE = 1000, 20_000
-"""Rows from which on a compiled function is worth loading, and worth compiling."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -826,11 +824,10 @@ class CalibrationProblem(Tabled):
         return blocks
 
     def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
-        function = self._functions(block)[what]
-        if len(block.row) >= SOME:
-            function = compiled(function, make=len(block.row) >= LARGE) or function
+        rows = self._rows(block, part)
+        function = quickest(self._functions(block)[what], len(rows), len(block.row))
         with phase("evaluation"):
-            return call_rows(function, [x, self.parameters.nominal], self._rows(block, part))
+            return call_rows(function, [x, self.parameters.nominal], rows)
 
     def _functions(self, block: Block) -> Functions:
         p = self.parameters

@@ -19,12 +19,38 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes
 from rpim_opt.basics.writing import scratch_folder, write_files
 
-FLAGS = ("-O2", "-fPIC", "-shared")
+FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+"""No product is fused with a sum, so that machine code has the virtual machine's last bits."""
 SWITCH = "RPIM_OPT_COMPILE"
 """Environment variable; 0 leaves everything to CasADi's virtual machine."""
 PATIENCE = 120
 """Seconds that a compiler gets."""
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
+SOME, LARGE, MANY = 1000, 20_000, 100_000
+"""Rows from which a library is worth loading; rows of a table, or evaluated in all, from which it is worth making."""
+
+
+class _Effort:
+    """Rows at which a function was evaluated."""
+
+    rows = 0
+
+
+@lru_cache(maxsize=256)
+def _effort(_: ca.Function) -> _Effort:
+    return _Effort()
+
+
+def quickest(function: ca.Function, rows: int, of: int) -> ca.Function:
+    """Return what evaluates a function at some rows more ``of`` a table: machine code where that pays, or itself.
+
+    The values have the same bits, so that it does not matter what was evaluated before.
+    """
+    effort = _effort(function)
+    effort.rows += rows
+    if max(effort.rows, of) < SOME:
+        return function
+    return compiled(function, make=of >= LARGE or effort.rows >= MANY) or function
 
 
 @lru_cache(maxsize=256)

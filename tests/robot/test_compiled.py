@@ -34,6 +34,25 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     forget()
 
 
+def test_machine_code_is_loaded_and_made_once_that_pays(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "MANY", 3000)
+    often = function()
+    assert native.quickest(often, 999, 999) is often
+    assert native.quickest(often, 1, 1) is often  # nothing was made before, and it does not pay yet
+    assert not list(cache.glob("*.so"))
+    forget()
+    assert native.quickest(often, 2000, 1) is not often
+    assert len(list(cache.glob("*.so"))) == 1
+    again = function()  # another process's
+    forget()
+    native._effort.cache_clear()
+    assert native.quickest(again, 10, 10) is again
+    assert native.quickest(again, 10, 1000) is not again  # what was made is loaded at once for a large table
+    native._effort.cache_clear()
+    large = function()
+    assert native.quickest(large, 10, native.LARGE) is not large
+
+
 def forget() -> None:
     native.compiled.cache_clear()
     native._version.cache_clear()
