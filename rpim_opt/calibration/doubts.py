@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import joined
 from rpim_opt.convex.evidence import FARTHEST, Evidence, Point
 
 NEARLY, APART = 6.0, 1.0
@@ -36,9 +37,11 @@ def doubts(evidence: Evidence, point: Point, others: Sequence[Point], spread: Ar
             break
     if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
         yield "A size came to the edge of what is believed possible: look at units, scales and declared noise."
-    for name, sd in zip(evidence.believed.names, spread, strict=False):
-        if name == "geometry" and sd > HARDLY:
-            yield f"The data hardly tell how large deviations are (by a factor of {np.exp(sd):.1f} either way)."
+    vague = [i for i in evidence.believed.geometry if spread[i] > HARDLY]
+    if vague:
+        names = joined([evidence.believed.names[i] for i in vague])
+        factor = np.exp(max(spread[vague]))
+        yield f"The data hardly tell how much {names} deviate (by a factor of {factor:.1f} either way)."
     m, n = evidence.data.X.shape
     if m < n:
         yield f"{m} equations for {n} parameters: at least {n - m} directions are prior alone."

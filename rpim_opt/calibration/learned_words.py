@@ -51,13 +51,14 @@ def _range(size: Size, factor: float = 1.0) -> str:
 
 def _sizes(learned: Learned) -> str:
     said = []
+    much = "{} deviate {} times as much as expected ({})"
     for name, size in learned.sizes.items():
         if name in FAMILIES:
             figure = f"{1e3 * EXPECTED * size.value:.2g} mrad ({_range(size, 1e3 * EXPECTED)})"
             said.append(FAMILIES[name].format(figure))
         else:
-            group = "deviations" if name == "geometry" else name
-            said.append(f"{group} are {size.value:.2g} times as large as expected ({_range(size)})")
+            said.append(much.format(name, f"{size.value:.2g}", _range(size)))
+            much = "{} {} times ({})"
     if not said:
         return ""
     return f"Learned from the data: {joined(said)}."

@@ -19,7 +19,7 @@ from rpim_opt.convex.evidence import Evidence, Point
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.stated import Stated
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.frames import fitted_frames
+from rpim_opt.problem.frames import settled
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.source import Source
 
@@ -155,10 +155,9 @@ def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
     if start is not None:
         return require_start(start, len(p.free))
     x = np.zeros(len(p.free))
-    fitted, frames = fitted_frames(problem)
-    moved = fitted.parameters.of_frames & fitted.parameters.identified
-    if fitted is not problem and moved.any():
-        x[p.of_frames[p.identified]] = frames
+    frames = p.of_frames & p.identified
+    if frames.any():  # those stated far from there count from there already
+        x[p.of_frames[p.identified]] = settled(problem.identifying(frames))
     return x
 
 

@@ -108,7 +108,7 @@ def restricted(evidence: Evidence, keep: np.ndarray) -> Evidence:
         group=number[group],
         heavy=believed.heavy[keep],
         names=tuple(believed.names[i] for i in used),
-        sd=believed.sd[used],
+        covariance=believed.covariance[np.ix_(used, used)],
         replaced=believed.replaced[keep],
         rows=believed.rows[:, keep],
     )

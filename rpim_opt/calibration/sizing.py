@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
 from rpim_opt.calibration.loop import require_finite, run
-from rpim_opt.convex.evidence import FAMILY_SD, GEOMETRY_SD, Believed, Evidence, Linearized, Point
+from rpim_opt.convex.evidence import Believed, Evidence, Linearized, Point, alike
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.stated import Stated
@@ -114,7 +114,7 @@ class Learning:
             group=stated.group,
             heavy=stated.heavy,
             names=stated.names,
-            sd=np.where(heavy, GEOMETRY_SD, FAMILY_SD),
+            covariance=alike(heavy),
             tails=self.prior.tails,
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,

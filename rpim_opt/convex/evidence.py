@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import block_diag, get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.late import optimize
@@ -19,6 +19,9 @@ CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1
 """Median of what a robot's scatter is believed to be before the data [m, rad, rad], and of the instrument's factor."""
 NOISE_SD, GEOMETRY_SD, FAMILY_SD = 2.0, 3.0, 2.0
 """Standard deviations of the natural logarithms of sizes, before the data."""
+APART = 1.0
+"""That of the ratio of two sizes of the geometry: lengths, angles and joint offsets are made by different means, but
+few data do not tell each size alone."""
 FARTHEST = 7.0
 """Logarithms of sizes stay within so much of their centres."""
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
@@ -28,6 +31,8 @@ STEEPEST = 0.8
 """Local variances are taken to follow themselves by no more: steps are at most five times what the fixed point says."""
 TOGETHER = 0.3
 """Changes of their logarithms below which their steps are Newton's, coupled."""
+BASIN = 0.3
+"""Logarithms of sizes within which of an optimum that is known no other is looked for."""
 FARTHEST_STEP = 1.0
 """Of the logarithms, that such a step may go."""
 RIDGE = 1e-13
@@ -46,8 +51,8 @@ class Believed:
         (p,) which deviations have Student's tails; the others are normal.
     names
         Of the sizes.
-    sd
-        Standard deviations of their logarithms, before the data.
+    covariance
+        (s, s) of their logarithms, before the data: `alike`.
     tails
         Degrees of freedom of Student's t.
     replaced
@@ -59,11 +64,25 @@ class Believed:
     group: np.ndarray
     heavy: np.ndarray
     names: tuple[str, ...]
-    sd: Array
+    covariance: Array
     tails: float
     replaced: np.ndarray
     rows: Array
     values: Array
+
+    @property
+    def geometry(self) -> np.ndarray:
+        """Numbers of the groups that have Student's tails."""
+        return np.unique(self.group[self.heavy])
+
+
+def alike(geometry: np.ndarray) -> Array:
+    """Return the covariance (s, s) of logarithms of sizes before the data; geometry (s,) says which are alike."""
+    among = np.ix_(geometry, geometry)
+    covariance = np.diag(np.where(geometry, GEOMETRY_SD, FAMILY_SD) ** 2)
+    own = APART**2 / 2
+    covariance[among] = GEOMETRY_SD**2 - own + own * np.eye(int(geometry.sum()))
+    return covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +146,8 @@ class Evidence:
                   + sum over heavy of  (nu + 1) ln((nu size^2 + z^2 + C) / (nu + 1)) - nu ln size^2 - ln v
                                        + 1 - (z^2 + C) / v
 
-    and logarithms of sizes are normal around `CENTRES` and 1. Student's t enters by its mean field (a variational
-    bound); a deviation that nothing decides adds nothing.
+    and logarithms of sizes are normal around those of `CENTRES` and 1, sizes of the geometry `alike`. Student's t
+    enters by its mean field (a variational bound); a deviation that nothing decides adds nothing.
 
     Parameters
     ----------
@@ -153,9 +172,10 @@ class Evidence:
         return np.concatenate([np.zeros(len(self.believed.names)), np.log([CENTRES[kind] for kind in self.noise])])
 
     @cached_property
-    def sd(self) -> Array:
-        """Their standard deviations (s,)."""
-        return np.concatenate([self.believed.sd, np.full(len(self.noise), NOISE_SD)])
+    def root(self) -> Array:
+        """Root L (s, s) of what is known of them: L'L is the inverse of their covariance."""
+        sizes = np.linalg.inv(np.linalg.cholesky(self.believed.covariance))
+        return np.asarray(block_diag(sizes, np.eye(len(self.noise)) / NOISE_SD), dtype=float)
 
     def scatter(self, logs: Array) -> Scatter:
         """Return the noise at logarithms of sizes (s,)."""
@@ -184,8 +204,8 @@ class Evidence:
             value += float(np.sum((part.y - part.X @ z) ** 2)) + part.logdet
         value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
         value += self._tails(e2, size2, v)
-        off = (logs - self.centre) / self.sd
-        gradient = 2 * off / self.sd
+        off = self.root @ (logs - self.centre)
+        gradient = 2 * off @ self.root
         gradient[: len(b.names)] += self._by_size(e2, size2, v)
         gradient[len(b.names) :] += self._by_noise(logs, whitened, z, C)
         return Point(value + float(off @ off), gradient, z, C, v, logs)
@@ -294,27 +314,45 @@ class Evidence:
         numpy.linalg.LinAlgError
             When the data are not finite.
         """
-        found = []
+        found: list[Point] = []
         for start in starts:
-            last: Point | None = None
-
-            def objective(logs: Array) -> tuple[float, Array]:
-                nonlocal last
-                last = self.at(logs, last, ROUGHLY)
-                return last.value, last.gradient
-
-            bounds = list(zip(self.centre - FARTHEST, self.centre + FARTHEST, strict=True))
-            options = {"maxiter": 80, "ftol": tolerance, "gtol": 1e-4}
-            best = optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            found.append(self.at(best.x, last))
+            point = self._climbed(start, tolerance, found)
+            if point is not None:
+                found.append(point)
         return sorted(found, key=lambda point: point.value)
+
+    def _climbed(self, start: Array, tolerance: float, found: Sequence[Point]) -> Point | None:
+        """Return the optimum that is reached from some sizes (s,); None where the way leads into one that is known."""
+        last: Point | None = None
+
+        def objective(logs: Array) -> tuple[float, Array]:
+            nonlocal last
+            last = self.at(logs, last, ROUGHLY)
+            return last.value, last.gradient
+
+        def known(intermediate_result: Any) -> bool:
+            x, value = intermediate_result.x, intermediate_result.fun
+            return any(value >= point.value and np.abs(x - point.logs).max() <= BASIN for point in found)
+
+        def watch(intermediate_result: Any) -> None:
+            if known(intermediate_result):
+                raise StopIteration
+
+        bounds = list(zip(self.centre - FARTHEST, self.centre + FARTHEST, strict=True))
+        options = {"maxiter": 80, "ftol": tolerance, "gtol": 1e-4}
+        best = optimize.minimize(
+            objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=watch
+        )
+        if known(best):
+            return None
+        return self.at(best.x, last)
 
     def starts(self) -> list[Array]:
         """Return where optima are looked for: what is expected, all of it noise, and large deviations."""
         sizes = len(self.believed.names)
         noisy = np.arange(len(self.centre)) >= sizes
         geometry = np.zeros(len(self.centre))
-        geometry[np.unique(self.believed.group[self.believed.heavy])] = 2.0
+        geometry[self.believed.geometry] = 2.0
         return [self.centre, self.centre + 3.0 * noisy, self.centre + geometry]
 
 

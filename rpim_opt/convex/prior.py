@@ -19,10 +19,12 @@ from rpim_opt.convex.posterior import Result, posterior
 from rpim_opt.convex.stated import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths
 from rpim_opt.convex.statement import Statement
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.robot.overlay import Overlay
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.robot.overlay import Overlay, is_joint_offset
+from rpim_opt.robot.parameter_names import MDH_DIMENSION, own_name
 from rpim_opt.robot.parameters import Parameters
 
+OFFSETS = "joint offsets"
+"""The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
 _FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
@@ -33,7 +35,8 @@ class Prior:
 
     By default deviations are about as large as the scales of the parameters say, some of them much larger (Student's
     t), joint offsets three times as large, because they are set at assembly, and frames may be anywhere within ten of
-    their scales. How large a group of them is altogether, the data may tell. `stated` says it of a problem in numbers.
+    their scales. How large a group of them is altogether, the data may tell: lengths, angles and joint offsets have a
+    size each, which are believed alike. `stated` says it of a problem in numbers.
 
     Parameters
     ----------
@@ -46,8 +49,9 @@ class Prior:
     tails
         Degrees of freedom of the Student's t of the robot's own geometry; infinity: a normal distribution.
     groups
-        Parameters of the robot that share a size of their own, as patterns: ``(("a?", "d?"), ("alpha?",))``. What they
-        leave out of its geometry shares one, and so does every family of other terms (compliance, eccentricity, ...).
+        Parameters of the robot that share a size of their own, as patterns: ``(("a?", "d?"), ("alpha?",))``. Of what
+        they leave out of its geometry the lengths, the angles and the joint offsets share one each, and so does every
+        family of other terms (compliance, eccentricity, ...).
     joint_offset
         By how much the scale of a joint's theta is multiplied.
     frames
@@ -69,7 +73,7 @@ class Prior:
     >>> prior = Prior(scale={"theta?_mrad": 10.0}) & Prior.known("a2 + a3 +- 0.05 mm")
     >>> stated = prior.stated(ro.load("position").problem.parameters)
     >>> float(stated.scale.max()), len(stated.values), stated.names  # frames, statements, groups
-    (10.0, 1, ('geometry',))
+    (10.0, 1, ('angles', 'lengths', 'joint offsets'))
     """
 
     centre: Mapping[str, float] = field(default_factory=dict)
@@ -361,9 +365,12 @@ class Prior:
         for group in self.groups:
             if any(fnmatchcase(name, pattern) for pattern in group):
                 return " ".join(group)
-        if _GEOMETRY.fullmatch(own_name(name)):
-            return "geometry"
-        return family_of(name)
+        if is_joint_offset(name):
+            return OFFSETS
+        found = _GEOMETRY.fullmatch(own_name(name))
+        if found is None:
+            return family_of(name)
+        return f"{MDH_DIMENSION[found[1]]}s"
 
 
 def family_of(name: str) -> str:

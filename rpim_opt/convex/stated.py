@@ -62,11 +62,11 @@ class Stated:
     >>> parameters = ro.load("position").problem.parameters
     >>> stated = ro.convex.Prior.known("a2 + a3 +- 0.05 mm").stated(parameters)  # scales of 0.5 mm
     >>> stated.names, stated.rows.shape, stated.rows[stated.rows != 0]
-    (('geometry',), (1, 34), array([10., 10.]))
+    (('angles', 'lengths', 'joint offsets'), (1, 34), array([10., 10.]))
     >>> for name, width, group in list(zip(stated.parameters.names, stated.scale, stated.group))[-11:-8]:
     ...     print(name, width, group)
-    theta6 3.0 0
-    d6 1.0 0
+    theta6 3.0 2
+    d6 1.0 1
     base_x 10.0 -1
     """
 

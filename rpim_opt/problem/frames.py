@@ -216,6 +216,11 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
         return problem, np.zeros(len(p.free))
     alone = problem.identifying(frames)
     alone = relocated(alone) or alone
+    return alone, settled(alone)
+
+
+def settled(alone: Source) -> Array:
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated."""
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
     z = np.zeros(len(scale))
@@ -232,7 +237,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
         if damping == 0 and np.linalg.norm(step) <= SHORT * (1 + np.linalg.norm(z)):
             break
         damping = damping / 8 if damping > 1e-6 else 0.0
-    return alone, scale * z
+    return scale * z
 
 
 def _damped_step(model: LinearModel, z: Array, damping: float) -> Array:

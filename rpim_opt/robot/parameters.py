@@ -9,14 +9,13 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.units import display
-from rpim_opt.robot.kinematics import roll_pitch_yaw, rotation_rpy
+from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.overlay import Overlay
 from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, own_name
 
@@ -278,8 +277,8 @@ class Parameters(Tabled):
             # a frame of which a table holds but some angles cannot be composed
             if index.keys() >= set(angles):
                 triple = [index[name] for name in angles]
-                R = ca.DM(rotation_rpy(*x[triple]) @ rotation_rpy(*self.nominal[triple])).full()
-                result[triple] = roll_pitch_yaw(R)
+                moved = numeric_frame([0, 0, 0, *x[triple]]) @ numeric_frame([0, 0, 0, *self.nominal[triple]])
+                result[triple] = roll_pitch_yaw(moved[:3, :3])
         return result
 
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:

@@ -20,12 +20,11 @@ NOISE = ("position", "orientation", "joint")
 
 
 def believed(group: list[int], heavy: list[bool], names: tuple[str, ...], tails: float = 3.0) -> Believed:
-    """Return beliefs without statements."""
+    """Return beliefs without statements, sizes alike."""
     p = len(group)
     none = np.zeros((0, p))
-    return Believed(
-        np.array(group), np.array(heavy), names, np.full(len(names), 1.5), tails, np.zeros(p, bool), none, np.zeros(0)
-    )
+    covariance = 1.0 + 1.25 * np.eye(len(names))
+    return Believed(np.array(group), np.array(heavy), names, covariance, tails, np.zeros(p, bool), none, np.zeros(0))
 
 
 def linearized(seed: int, configurations: int, p: int, k: int = 6) -> Linearized:
@@ -54,7 +53,10 @@ def dense(evidence: Evidence, logs: Array) -> tuple[Array, Array]:
 
 
 def hyperprior(evidence: Evidence, logs: Array) -> float:
-    return float(np.sum(((logs - evidence.centre) / evidence.sd) ** 2))
+    off = logs - evidence.centre
+    sizes = len(evidence.believed.names)
+    of_sizes = off[:sizes] @ np.linalg.solve(evidence.believed.covariance, off[:sizes])
+    return float(of_sizes + np.sum((off[sizes:] / NOISE_SD) ** 2))
 
 
 def test_normal_deviations_give_the_textbooks_likelihood() -> None:
@@ -138,7 +140,8 @@ def test_local_variances_settle_where_steps_each_for_itself_run_in_circles(
     problem = ro.load(name).problem
     few = problem.on(problem.data.configurations(6, seed))
     evidence = Learning(Prior(), NOISE).evidence(few, np.zeros(len(few.parameters.free)))
-    point = evidence.at(evidence.centre + off)
+    sizes = len(evidence.believed.names)
+    point = evidence.at(evidence.centre + np.array(off[:1] * sizes + off[1:]))
     heavy = evidence.believed.heavy
     e2 = point.z**2 + np.diag(point.C)
     size2 = np.exp(2 * point.logs[0])
@@ -246,7 +249,8 @@ def test_nothing_is_believed_of_noise_but_its_order() -> None:
     data = linearized(11, 4, 2)
     evidence = Evidence(data, believed([0, 0], [False] * 2, ("a",)), NOISE)
     assert np.allclose(np.exp(evidence.centre[1:]), [CENTRES[kind] for kind in NOISE])
-    assert (evidence.sd[1:] == NOISE_SD).all()
+    assert hyperprior(evidence, evidence.centre) == 0
+    assert np.allclose(evidence.root[1:, 1:], np.eye(len(NOISE)) / NOISE_SD)
     found = evidence.scatter(evidence.centre)
     assert [found.position, found.orientation, found.joint] == pytest.approx(np.exp(evidence.centre[1:]))
 
@@ -266,11 +270,12 @@ def test_a_gibbs_sampler_agrees() -> None:
     for stack in result.problem.stacks(False):
         for index, block in zip(stack.index, stack.covariance(result.problem.scatter), strict=True):
             R[np.ix_(index, index)] = block
-    size = result.learned.sizes["geometry"].value
+    sizes = np.append([size.value for size in result.learned.sizes.values()], 1.0)
+    size = sizes[stated.group]
     W = np.linalg.inv(np.linalg.cholesky(R))
     A, b = W @ J, W @ y
     rng = np.random.default_rng(0)
-    v = np.where(stated.heavy, size**2, 1.0)
+    v = size**2
     draws = []
     for k in range(6000):
         L = np.linalg.cholesky(A.T @ A + np.diag(1 / v))

@@ -131,8 +131,8 @@ def test_what_is_believed_where_nothing_is_said() -> None:
     parameters = PROBLEM.parameters.identify(["a?", "theta?", "ecc_*", "ratio?", "base_*"])
     stated = Prior().stated(parameters)
     by_name = dict(zip(parameters.free.names, zip(stated.scale, stated.group, stated.heavy, strict=True), strict=True))
-    assert by_name["a2"] == (1.0, 0, True)
-    assert by_name["theta2"] == (3.0, 0, True)
+    assert by_name["a2"] == (1.0, stated.names.index("lengths"), True)
+    assert by_name["theta2"] == (3.0, stated.names.index("joint offsets"), True)
     assert by_name["base_rx"] == (10.0, -1, False)
     groups = {stated.names[by_name[name][1]] for name in ("ecc_cos3", "ecc_sin3")}
     assert groups == {"ecc"}
@@ -145,7 +145,7 @@ def test_groups_have_sizes_of_their_own_and_infinite_tails_are_normal() -> None:
     names = [stated.names[k] if k >= 0 else "" for k in stated.group]
     assert {name for name, p in zip(names, FREE.names, strict=True) if p[0] in "ad" and p[1].isdigit()} == {"a? d?"}
     assert names[at("alpha2")[0]] == "alpha?"
-    assert names[at("theta2")[0]] == "geometry"
+    assert names[at("theta2")[0]] == "joint offsets"
     assert not stated.heavy.any()
 
 
