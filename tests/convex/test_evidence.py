@@ -12,7 +12,17 @@ from scipy.stats import multivariate_normal
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.sizing import Learning
-from rpim_opt.convex.evidence import CENTRES, NOISE_SD, Believed, Evidence, Linearized
+from rpim_opt.convex.evidence import (
+    APART,
+    CENTRES,
+    FAMILY_SD,
+    GEOMETRY_SD,
+    NOISE_SD,
+    Believed,
+    Evidence,
+    Linearized,
+    alike,
+)
 from rpim_opt.convex.prior import Prior
 from rpim_opt.problem.scatter import Stack
 
@@ -226,6 +236,22 @@ def test_several_starts_find_both_optima_of_few_data() -> None:
         found.append(points[0].value <= evidence.mode([evidence.centre])[0].value + 1e-9)
         assert np.abs(points[0].gradient).max() < 1e-2
     assert all(found)
+
+
+def test_a_way_into_an_optimum_that_is_known_is_not_climbed_to_its_end() -> None:
+    evidence = Evidence(linearized(3, 8, 4), believed([0, 0, 1, 1], [True] * 4, ("a", "b")), ("position",))
+    (alone,) = evidence.mode([evidence.centre])
+    points = evidence.mode([evidence.centre, evidence.centre + 0.5, evidence.centre - 0.5])
+    assert len(points) == 1
+    assert points[0].value == pytest.approx(alone.value, rel=1e-12)
+
+
+def test_sizes_of_the_geometry_are_alike_before_the_data() -> None:
+    covariance = alike(np.array([True, False, True]))
+    assert np.allclose(np.sqrt(np.diag(covariance)), [GEOMETRY_SD, FAMILY_SD, GEOMETRY_SD])
+    ratio = np.array([1.0, 0.0, -1.0])
+    assert np.sqrt(ratio @ covariance @ ratio) == pytest.approx(APART)
+    assert covariance[0, 1] == covariance[1, 2] == 0
 
 
 def test_sizes_of_simulated_data_are_found() -> None:
