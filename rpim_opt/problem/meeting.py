@@ -8,6 +8,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block
 from rpim_opt.problem.placing import register
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame
@@ -16,8 +17,6 @@ from rpim_opt.robot.parameters import Parameters
 
 APART = 0.1
 """How far nominal robots may be from each other at a point that both have touched [m], until it is another point."""
-ENOUGH = 3
-"""Points that place a base."""
 Places = Mapping[str, Array]
 
 
@@ -47,18 +46,32 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     known: dict[str, Array] = {}
     found = {}
     for robot, places in _touched(problem):
-        p = problem.parameters.of_robot(robot)
-        base = numeric_frame(_frame(p, "base_"))
-        common = [name for name in places if name in known]
-        if len(common) >= ENOUGH and _placed_by_touches(problem, robot, p):
-            source = np.array([places[name] for name in common])
-            base = register(source, np.array([known[name] for name in common]))
+        base, placed = _standing(problem, robot, places, known)
+        if placed:
             found[robot] = frame_numbers(base)
-        elsewhere = {name: base[:3, :3] @ place + base[:3, 3] for name, place in places.items()}
-        if len(common) >= ENOUGH or not _placed_by_touches(problem, robot, p):
-            _require_near(robot, {name: elsewhere[name] - known[name] for name in common})
-        known |= {name: place for name, place in elsewhere.items() if name not in known}
+        for name, place in places.items():
+            known.setdefault(name, _seen_from(base, place))
     return found
+
+
+def _standing(problem: CalibrationProblem, robot: str, places: Places, known: Places) -> tuple[Array, bool]:
+    """Return where a base (4, 4) is, and whether known places say so; refuse touches that are elsewhere."""
+    p = problem.parameters.of_robot(robot)
+    stated = numeric_frame(_frame(p, "base_"))
+    common = {name: place for name, place in places.items() if name in known}
+    if not _placed_by_touches(problem, robot, p):
+        _require_near(robot, stated, common, known)
+        return stated, False
+    try:
+        base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
+    except InputError:  # too few, or on a line
+        return stated, False
+    _require_near(robot, base, common, known)
+    return base, True
+
+
+def _seen_from(base: Array, place: Array) -> Array:
+    return base[:3, :3] @ place + base[:3, 3]
 
 
 def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, Places]]:
@@ -67,15 +80,20 @@ def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, Places]]:
         p = problem.parameters.of_robot(robot)
         all_of: dict[str, list[Array]] = {}
         for block in problem.data.blocks:
-            if block.robot != robot or block.touched is None or not block.measurement.touching:
-                continue
-            if block.measurement.planar:
-                continue
-            T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(_frame(p, tool_prefix(block.markers[0])))
-            for name, position in zip(block.touched[:, 0], T[:, :3, 3], strict=True):
-                all_of.setdefault(str(name), []).append(position)
+            names = _points(block)
+            if block.robot == robot and len(names):
+                T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(_frame(p, tool_prefix(block.markers[0])))
+                for name, position in zip(names, T[:, :3, 3], strict=True):
+                    all_of.setdefault(name, []).append(position)
         if all_of:
             yield robot, {name: np.mean(positions, axis=0) for name, positions in all_of.items()}
+
+
+def _points(block: Block) -> list[str]:
+    """Return the points that rows touched; none where they touched planes, or nothing."""
+    if block.touched is None or not block.measurement.touching or block.measurement.planar:
+        return []
+    return [str(name) for name in block.touched[:, 0]]
 
 
 def _frame(p: Parameters, prefix: str) -> Array:
@@ -88,10 +106,10 @@ def _placed_by_touches(problem: CalibrationProblem, robot: str, p: Parameters) -
     return bool(sought) and all(block.touched is not None for block in problem.data.blocks if block.robot == robot)
 
 
-def _require_near(robot: str, apart: Mapping[str, Array]) -> None:
+def _require_near(robot: str, base: Array, places: Places, known: Places) -> None:
     """Refuse touches of one point that nominal robots put into different places."""
-    for name, difference in apart.items():
-        distance = float(np.linalg.norm(difference))
+    for name, place in places.items():
+        distance = float(np.linalg.norm(_seen_from(base, place) - known[name]))
         if distance > APART:
             found = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
             accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"

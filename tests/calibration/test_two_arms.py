@@ -12,7 +12,7 @@ import rpim_opt as ro
 from rpim_opt.calibration.contact_words import scatter
 from rpim_opt.data.contact import by_points
 from rpim_opt.problem.meeting import met
-from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
+from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
 SIGMA = 3e-5
 STANDS = np.array([1.1, 0.05, 0.0, 0.0, 0.0, np.pi])
@@ -146,18 +146,31 @@ def test_points_that_are_elsewhere_are_not_called_alike(cell) -> None:
     assert len(ro.together(left=left, right=stated, shared=[]).touches.rows) == len(SOCKETS)
 
 
-def test_a_robot_that_an_instrument_sees_stands_where_that_says() -> None:
-    """Its base is not what touches of others would have it; and fewer than three common points place nothing."""
-    left = arm_of(ALL)
+@pytest.mark.parametrize("line", [["S0", "S7"], ["S0", "middle", "S7"]])
+def test_points_on_a_line_place_no_base(line: list[str]) -> None:
+    """Nor do two; whether they are in one place nobody can say then, and the base stays where it is stated."""
     rng = np.random.default_rng(1)
-    x = np.zeros(len(left.parameters.free))
-    few = {name: SOCKETS[name] for name in ("S0", "S7")}
-    one = left.on(touched(left, x, np.zeros(6), few, 3, rng))
-    two = arm_of([*ALL, "base_*"])
-    xs = np.zeros(len(two.parameters.free))
-    both = ro.together(left=one, right=two.on(touched(two, xs, STANDS, few, 3, rng)), shared=[])
-    assert met(both) == {}
-    assert np.abs(frame_numbers(numeric_frame(STANDS)) - STANDS).max() < 1e-9
+    sockets = SOCKETS | {"middle": [0.5, 0.5, 0.5]}
+    some = {name: sockets[name] for name in line}
+    parts = {}
+    for name, arm, base in (("left", arm_of(ALL), np.zeros(6)), ("right", arm_of([*ALL, "base_*"]), STANDS)):
+        parts[name] = arm.on(touched(arm, np.zeros(len(arm.parameters.free)), base, some, 2, rng, sigma=0.0))
+    assert met(ro.together(**parts, shared=[])) == {}
+
+
+def test_a_robot_that_an_instrument_sees_stands_where_that_says(cell) -> None:
+    """Touches do not place its base, but have to be where that puts them."""
+    left, right = (cell[0].alone(name) for name in ("left", "right"))
+    p = right.parameters
+    nominal = p.nominal.copy()
+    nominal[[p.names.index(f"base_{c}") for c in FRAME]] = STANDS
+    data = right.data
+    seen = ro.Dataset.of(data.q[:3], np.zeros((3, 3)), SIGMA)
+    both_kinds = right.on(ro.Dataset.together([data, seen], ["touches", "tracker"]))
+    with pytest.raises(ro.InputError, match="from those of another robot"):
+        ro.together(left=left, right=both_kinds, shared=[])
+    stated = both_kinds.with_parameters(replace(p, nominal=nominal))
+    assert met(ro.together(left=left, right=stated, shared=[])) == {}
 
 
 @pytest.mark.slow
