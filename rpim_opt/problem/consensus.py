@@ -9,10 +9,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import transform
 from rpim_opt.problem.loops import Loops, Turns
 from rpim_opt.problem.placing import proper
-from rpim_opt.problem.rotations import smallest, undercut
+from rpim_opt.problem.rotations import undercut
 
 MOST_PAIRED = 2000
 """Measurements up to which all pairs are compared."""
@@ -24,12 +23,10 @@ ASKED = 40
 """Measurements, evenly spread, of which is asked what they go with."""
 MOST_SOLVED = 60
 """Pairs, and sets, of measurements whose relaxations are solved to show that they do not agree."""
-FAR = 0.5
-"""Angle [rad] within which all starts have to be that fit as well, for there to be one."""
 ROUNDING = 1e-7
 """Error of an angle from its cosine [rad]."""
 SURPRISE = 1e-4
-"""Probability that what is expected of translations is off by more than an agreement allows."""
+"""Probability that a good measurement, or what is expected of translations, is off by more than counts as good."""
 
 
 def compatible(turns: Turns, beyond: Array) -> np.ndarray:
@@ -127,12 +124,12 @@ def _largest(pairs: np.ndarray) -> int:
     return low
 
 
-def alone(loops: Loops, rotations: Array, agreeing: np.ndarray, beyond: Array) -> bool:
+def alone(loops: Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
     """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
 
     They cannot if fewer are left over than would have to, or if no other is in a core of that size; nor if every set
-    of that size with another in it has a sum of squares, by its relaxation's bound, above what agreeing allows, or
-    leaves rotations (k, 3, 3) near these alone.
+    of that size with another in it has a sum of squares, by its relaxation's bound, above what agreeing allows. One
+    whose square (N,) a good one may have, in ten thousand, is no other.
     """
     N = len(agreeing)
     count = int(np.sum(agreeing))
@@ -141,16 +138,17 @@ def alone(loops: Loops, rotations: Array, agreeing: np.ndarray, beyond: Array) -
     if count < 2:
         return False
     pairs = compatible(loops.turns, beyond)
-    others = np.flatnonzero(core(pairs, count) & ~agreeing)
+    strange = ~agreeing & (squares > chdtri(loops.freedom, SURPRISE))
+    others = np.flatnonzero(core(pairs, count) & strange)
     if not _told_apart(loops, pairs, others, core(pairs, count), beyond):
         return False
     rivals: list[list[int]] = []
-    for other in np.flatnonzero(core(pairs, count) & ~agreeing):
+    for other in np.flatnonzero(core(pairs, count) & strange):
         rest = _around(pairs, int(other), count)
         if len(rivals) + comb(len(rest), count - 1) > MOST_SOLVED:
             return False
         rivals += [[int(other), *some] for some in combinations(rest, count - 1)]
-    return all(_harmless(loops, rotations, rival, beyond) for rival in rivals)
+    return not any(_may_agree(loops, rival, beyond) for rival in rivals)
 
 
 def _told_apart(loops: Loops, pairs: np.ndarray, others: np.ndarray, among: np.ndarray, beyond: Array) -> bool:
@@ -159,8 +157,7 @@ def _told_apart(loops: Loops, pairs: np.ndarray, others: np.ndarray, among: np.n
     if len(asked) > MOST_SOLVED:
         return False
     for i, j in asked:
-        least = undercut(_form(loops, [i, j]), loops.shared)
-        pairs[i, j] = pairs[j, i] = least <= _allowed(loops, [i, j], beyond)
+        pairs[i, j] = pairs[j, i] = _may_agree(loops, [i, j], beyond)
     return True
 
 
@@ -171,22 +168,9 @@ def _around(pairs: np.ndarray, other: int, count: int) -> list[int]:
     return [each for each in members if each != other] if other in members else []
 
 
-def _harmless(loops: Loops, rotations: Array, members: list[int], beyond: Array) -> bool:
-    """Return whether measurements agree with no rotations that are far from these."""
-    least = smallest(_form(loops, members), (), loops.shared)
-    excess = _allowed(loops, members, beyond) - least.value
-    if least.bound > least.value + excess:
-        return True
-    apart = transform.Rotation.from_matrix(np.swapaxes(rotations, 1, 2) @ least.rotations).magnitude()
-    return float(np.max(apart)) + least.radius(excess) <= FAR
-
-
-def _form(loops: Loops, members: list[int]) -> Array:
+def _may_agree(loops: Loops, members: list[int], beyond: Array) -> bool:
+    """Return whether the relaxation leaves it open that measurements, and what is expected of translations, agree."""
     weights = np.zeros(len(loops.rows))
     weights[members] = 1.0
-    return loops.form(loops.triangle(weights))
-
-
-def _allowed(loops: Loops, members: list[int], beyond: Array) -> float:
-    """Return the sum of squares up to which measurements agree, and translations with what is expected of them."""
-    return float(np.sum(beyond[members]) + chdtri(len(loops.prior), SURPRISE))
+    least = undercut(loops.form(loops.triangle(weights)), loops.shared)
+    return least <= float(np.sum(beyond[members]) + chdtri(len(loops.prior), SURPRISE))

@@ -90,7 +90,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
         found = _repeated(loops, first, loss, lambda squares: _huber_weights(squares, beyond))
     else:
         found = _truncated(loops, beyond, candidates)
-    return replace(found, alone=alone(loops, found.smallest.rotations, found.weights > FULL, beyond))
+    return replace(found, alone=alone(loops, found.squares, found.weights > FULL, beyond))
 
 
 def _truncated(loops: Loops, beyond: Array, candidates: Sequence[Array]) -> Solved:

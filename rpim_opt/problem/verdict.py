@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.consensus import FAR
 from rpim_opt.problem.graduated import FULL, Solved
 from rpim_opt.problem.loops import Loops
 
@@ -17,6 +16,8 @@ GAP = 1e-3
 """What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
 UNKNOWN = 0.1
 """Standard deviation of a rotation [rad] from which it is not determined."""
+FAR = 0.5
+"""Angle [rad] within which all starts have to be that fit as well, for there to be one."""
 AS_WELL = 1e-4
 """Probability that the truth fits worse than what counts as fitting as well."""
 

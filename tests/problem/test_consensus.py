@@ -101,15 +101,18 @@ def test_no_rotations_undercut_what_multipliers_say(seed: int) -> None:
     assert bound >= smallest(L).bound - 1e-6
 
 
-def consenting(groups: list[int], seed: int) -> tuple[Loops, np.ndarray, np.ndarray]:
-    """Return loops of so many poses for each of several bases, the rotations of the first, and which are its."""
+def consenting(groups: list[int], seed: int) -> tuple[Loops, np.ndarray]:
+    """Return loops of so many poses for each of several bases, and which are of the first."""
     rng = np.random.default_rng(seed)
     flange = frames(rng, sum(groups), 0.5)
     tool = frames(rng, 1, 0.1)[0]
     bases = frames(rng, len(groups), 1.0)
     which = np.repeat(np.arange(len(groups)), groups)
-    loops = seen(rng, flange, bases[which] @ flange @ tool, (1e-3, 1e-3))
-    return loops, np.array([bases[0, :3, :3], tool[:3, :3].T]), which == 0
+    return seen(rng, flange, bases[which] @ flange @ tool, (1e-3, 1e-3)), which == 0
+
+
+FAR_OFF = 1e6
+"""A square that no good measurement has."""
 
 
 @pytest.mark.parametrize(
@@ -117,17 +120,20 @@ def consenting(groups: list[int], seed: int) -> tuple[Loops, np.ndarray, np.ndar
     [([3, 1], True), ([3, 2], True), ([4, 4], False), ([4, 3, 3], True), ([3, 3, 1], False), ([1, 1], False)],
 )
 def test_who_agrees_is_alone_where_no_others_are_as_many(groups: list[int], expected: bool) -> None:
-    loops, rotations, agreeing = consenting(groups, 3)
-    assert alone(loops, rotations, agreeing, np.full(len(agreeing), BEYOND)) == expected
+    loops, agreeing = consenting(groups, 3)
+    assert alone(loops, FAR_OFF * ~agreeing, agreeing, np.full(len(agreeing), BEYOND)) == expected
 
 
-def test_others_near_the_same_answer_are_no_rivals() -> None:
-    """One that agrees as well, left out: sets with it are as many, but they lead to the same frames."""
-    loops, rotations, agreeing = consenting([5, 3], 5)
+def test_one_that_a_good_one_may_be_is_no_rival() -> None:
+    """Left out by a hair it leads to the same frames; left out by far it does not, though it agrees with the others."""
+    loops, agreeing = consenting([5, 3], 5)
     agreeing[0] = False
     beyond = np.full(8, BEYOND)
-    assert not alone(loops, rotations[::-1], np.arange(8) >= 5, beyond)
-    assert alone(loops, rotations, agreeing, beyond)
+    squares = FAR_OFF * ~agreeing
+    assert not alone(loops, squares, agreeing, beyond)
+    squares[0] = 1.3 * BEYOND
+    assert alone(loops, squares, agreeing, beyond)
+    assert not alone(loops, FAR_OFF * (np.arange(8) < 5), np.arange(8) >= 5, beyond)
 
 
 def test_turns_by_the_same_angle_are_told_apart_by_the_places() -> None:
@@ -140,8 +146,7 @@ def test_turns_by_the_same_angle_are_told_apart_by_the_places() -> None:
     loops = seen(rng, flange, measured, (1e-3, 1e-3))
     beyond = np.full(4, BEYOND)
     assert compatible(loops.turns, beyond).all()
-    rotations = np.array([base[:3, :3], tool[:3, :3].T])
-    assert alone(loops, rotations, np.arange(4) < 3, beyond)
+    assert alone(loops, FAR_OFF * (np.arange(4) == 3), np.arange(4) < 3, beyond)
 
 
 def test_motions_have_turns_too() -> None:
