@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -28,6 +29,14 @@ SCENES = ("any turns", "few poses", "half turns", "small turns", "nearly one axi
 """How the flange turns; with half turns also base and tool are turned by 180 degrees within 0.01."""
 RIGHT = float(chi2.ppf(1 - 1e-6, 12))
 """Squared distance from the truth in standard deviations up to which an answer is right within the noise."""
+DETERMINED = 0.1
+"""Standard deviation of the least certain rotation [rad], at the truth, up to which good poses determine the answer."""
+AS_WELL = float(chi2.ppf(1 - 1e-4, 12))
+"""What another answer's cost may be above the best, for noise to leave open which of them is true."""
+ELSEWHERE = 0.5
+"""Angle [rad] from which another answer is not the same."""
+STARTS = 40
+"""Descents that look for another answer."""
 CLOSED = ("Shah", "Li", "Park and Martin")
 
 
@@ -64,6 +73,7 @@ def run(seed: int) -> dict[str, float | str]:
         "milliseconds": 1e3 * seconds,
         "cost": _cost(flange, measured, *own, sigma, loss),
         "distance": _distance(information, base, tool, *own),
+        "determined": _least_certain(information),
         "gap": start.gap,
         "rank_ratio": start.rank_ratio,
         "uncertainty": start.uncertainty,
@@ -74,6 +84,8 @@ def run(seed: int) -> dict[str, float | str]:
     for name, (Z, X) in _closed_forms(flange, measured).items():
         found[f"{name}, cost"] = _cost(flange, measured, Z, X, sigma, loss)
         found[f"{name}, distance"] = _distance(information, base, tool, Z, X)
+    if _least_certain(information) <= DETERMINED and not start.certified:
+        found["another"] = float(_another(rng, flange[good], measured[good], base, tool, sigma))
     return found
 
 
@@ -160,6 +172,37 @@ def _distance(information: np.ndarray, Z: Any, X: Any, Z1: Any, X1: Any) -> floa
     return float(e @ information @ e)
 
 
+def _least_certain(information: np.ndarray) -> float:
+    """Return the largest standard deviation of a rotation [rad], translations being whatever fits."""
+    turn = np.tile(np.repeat([False, True], 3), 2)
+    across = information[np.ix_(turn, ~turn)]
+    least = information[np.ix_(~turn, ~turn)]
+    of_turns = information[np.ix_(turn, turn)] - across @ np.linalg.pinv(least, rcond=1e-10, hermitian=True) @ across.T
+    weakest = np.linalg.eigvalsh(of_turns)[0]
+    return float(1 / np.sqrt(weakest)) if weakest > 0 else np.inf
+
+
+def _another(rng: np.random.Generator, flange: Any, measured: Any, base: Any, tool: Any, sigma: Any) -> bool:
+    """Return whether other frames, to which descents lead from anywhere, fit good poses as well as those near these."""
+
+    def moved(step: np.ndarray, Z: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _moved(Z, step[:6]), _moved(X, step[6:])
+
+    def descended(Z: np.ndarray, X: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        cost = lambda step: _residual(flange, measured, *moved(step, Z, X), sigma).ravel()  # noqa: E731
+        found = least_squares(cost, np.zeros(12), x_scale="jac")
+        return 2 * found.cost, *moved(found.x, Z, X)
+
+    best, Z, X = descended(base, tool)
+    for _ in range(STARTS):
+        first, last = Rotation.random(2, rng=rng).as_matrix()
+        value, Z1, X1 = descended(*_with_translations(flange, measured, first, last))
+        apart = Rotation.from_matrix([Z[:3, :3].T @ Z1[:3, :3], X[:3, :3].T @ X1[:3, :3]]).magnitude()
+        if value <= best + AS_WELL and apart.max() > ELSEWHERE:
+            return True
+    return False
+
+
 def _closed_forms(flange: Any, measured: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return base and tool by every closed form that has an answer."""
     found = {}
@@ -221,11 +264,12 @@ def _with_translations(flange: Any, measured: Any, Z: Any, X: Any) -> tuple[np.n
 
 def report(rows: list[dict[str, Any]]) -> Report:
     """Return how often answers are right and certified, by scene, and what that takes."""
+    told = [row for row in rows if _told(row)]
     metrics = {
         "worse_than_a_closed_form": float(sum(row["cost"] > _best(row) * (1 + 1e-9) + 1e-6 for row in rows)),
-        "certified_but_wrong": float(sum(row["certified"] and not _right(row) for row in rows)),
-        "right": _share(rows, _right),
-        "certified_of_right": _share([row for row in rows if _right(row)], lambda row: bool(row["certified"])),
+        "certified_but_wrong": float(sum(_wrong(row) for row in rows)),
+        "right": _share(told, _right),
+        "certified_of_right": _share([row for row in told if _right(row)], lambda row: bool(row["certified"])),
     }
     lines = []
     for scene in SCENES:
@@ -235,17 +279,20 @@ def report(rows: list[dict[str, Any]]) -> Report:
                 lines.append([scene, "10 to 40 %" if some else "none", str(len(part)), *_counts(part)])
     times = [[row["milliseconds"] for row in rows if bool(row["outliers"]) == some] for some in (False, True)]
     clean, robust = (f"{np.median(each):.0f} ms (95 %: {np.percentile(each, 95):.0f} ms)" for each in times)
+    two = sum(row.get("another") == 1 for row in rows)
     text = (
         f"{len(rows)} cases: 3 to 60 poses, noise of 0.01 to 5 mm and 0.1 to 32 mrad, half of them with outliers (then "
         "the truncated loss). An answer is right if its distance from the truth, in standard deviations of the good "
-        "poses, is one that noise has in all but one of a million cases. Turns about one axis do not determine base "
-        f"and tool. Costs above that of the best closed form: {metrics['worse_than_a_closed_form']:.0f}. Certified "
-        f"but wrong: {metrics['certified_but_wrong']:.0f}. Of the right ones "
-        f"{100 * metrics['certified_of_right']:.1f} % are certified; the others are right by chance, or so many poses "
-        f"were outliers that as many might agree with something else. Time of the processor, one thread: {clean}, with "
-        f"outliers {robust}.\n\n"
+        "poses, is one that noise has in all but one of a million cases. Good poses determine it if, at the truth, "
+        f"they leave no rotation uncertain by more than {DETERMINED} rad, and if no other frames fit them as well "
+        f"({two} cases, found by {STARTS} descents from anywhere): turns about one axis do not, nor do two good poses "
+        f"of three. Costs above that of the best closed form: {metrics['worse_than_a_closed_form']:.0f}. Certified but "
+        f"wrong or not determined: {metrics['certified_but_wrong']:.0f}. Of the {len(told)} that are determined "
+        f"{100 * metrics['right']:.1f} % are right, and of these {100 * metrics['certified_of_right']:.1f} % certified."
+        f" Time of the processor, one thread: {clean}, with outliers {robust}.\n\n"
     )
-    head = ["scene", "outliers", "cases", "right", "certified", "certified, wrong", "best closed form right"]
+    head = ["scene", "outliers", "cases", "determined", "of them right", "of them certified", "certified, wrong",
+            "best closed form right"]  # fmt: skip
     names = [f"{name}, distance" for name in CLOSED]
     determined = [row for row in rows if row["certified"] and not row["outliers"]]
     far = {"certified start": [_root(row["distance"]) for row in determined]}
@@ -260,6 +307,16 @@ def _root(square: float) -> float:
 
 def _right(row: dict[str, Any]) -> bool:
     return row["distance"] <= RIGHT
+
+
+def _told(row: dict[str, Any]) -> bool:
+    """Return whether good poses determine base and tool, and leave one answer."""
+    return row["determined"] <= DETERMINED and row.get("another") != 1
+
+
+def _wrong(row: dict[str, Any]) -> bool:
+    """Return whether what is not right, or not determined, is certified."""
+    return bool(row["certified"]) and not (_right(row) and _told(row))
 
 
 def _closed(row: dict[str, Any], what: str) -> list[float]:
@@ -277,8 +334,9 @@ def _share(rows: list[dict[str, Any]], what: Callable[[dict[str, Any]], bool]) -
 
 
 def _counts(part: list[dict[str, Any]]) -> list[str]:
-    right = [_right(row) for row in part]
-    certified = [bool(row["certified"]) for row in part]
-    wrong = [c and not r for c, r in zip(certified, right, strict=True)]
-    closed = [min(_closed(row, "distance"), default=np.inf) <= RIGHT for row in part]
-    return [str(sum(each)) for each in (right, certified, wrong, closed)]
+    told = [row for row in part if _told(row)]
+    right = [row for row in told if _right(row)]
+    certified = [row for row in right if row["certified"]]
+    wrong = [row for row in part if _wrong(row)]
+    closed = [row for row in told if min(_closed(row, "distance"), default=np.inf) <= RIGHT]
+    return [str(len(each)) for each in (told, right, certified, wrong, closed)]

@@ -60,12 +60,14 @@ def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
 
 
 def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield every point or plane by name, with the rows that touched it."""
+    """Yield every point or plane by name, with the rows that touched it: with any tool, of any robot."""
+    rows: dict[str, list[int]] = {}
     for block in data.blocks:
         if block.measurement.touching and block.touched is not None:
-            names = block.touched[:, 0]
-            for name in dict.fromkeys(names.tolist()):
-                yield name, block.row[names == name]
+            for name, row in zip(block.touched[:, 0], block.row, strict=True):
+                rows.setdefault(name, []).append(int(row))
+    for name, of in rows.items():
+        yield name, np.array(of)
 
 
 def scatter_rows(found: Sequence[Scatter]) -> list[list[str]]:
@@ -117,7 +119,10 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     if any(problem.touches.planar):
         nearest.append("the plane that fits all touches of it best")
     said = f"Error of a touch: the distance of the tool from {', or '.join(nearest)}, as the model has them"
-    remarks = [f"{said}. Where these are nobody measured: it is how well the robot repeats itself from all sides."]
+    tells = "the robot repeats itself"
+    if len(problem.arms) > 1:
+        tells = "the robots meet there, and repeat themselves,"
+    remarks = [f"{said}. Where these are nobody measured: it is how well {tells} from all sides."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
         remarks.append("No distance is known: how large the robot is rests on its drawing alone.")
     return remarks

@@ -14,6 +14,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.identified import Machine, require_robot
 from rpim_opt.problem.predicting import moved, predicted, within_ranges
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
+from rpim_opt.robot.parameter_names import of_joint, own_name
 
 WORTH = 0.9
 """A calibration whose predicted error is above this part of the drawing's is worth nothing."""
@@ -67,7 +68,7 @@ def improvement(result: Calibration) -> Improvement | None:
     Parameters
     ----------
     result
-        With a squared penalty or none, of one robot with joint limits.
+        With a squared penalty or none, of one robot with joint limits, in one place or several (`together`).
 
     Examples
     --------
@@ -100,10 +101,11 @@ def _trace(D: Array, C: Array) -> float:
 
 def _slopes(result: Calibration) -> tuple[Array, Array]:
     """Return the slopes of flange positions without what placing takes back, (3 W, n) and (W, 3, n)."""
-    machine = _at_flange(result)
+    machine, columns = _at_flange(result)
     q = within_ranges(machine)
     p = predicted(machine, q).position
-    J = moved(machine, q).slope
+    J = np.zeros((len(p), 3, len(result.x)))
+    J[:, :, columns] = moved(machine, q).slope
     D = J.reshape(-1, J.shape[2])
     p = p - p.mean(axis=0)
     turning = np.zeros((len(p), 3, 3))
@@ -118,16 +120,26 @@ def _slopes(result: Calibration) -> tuple[Array, Array]:
     return D, D.reshape(J.shape)
 
 
-def _at_flange(result: Calibration) -> Machine:
-    """Return the machine with its reflectors at the flange, looked at where it was linearized."""
+def _at_flange(result: Calibration) -> tuple[Machine, np.ndarray]:
+    """Return the machine with its reflectors at the flange, where it was linearized, and which columns of x it has.
+
+    Several problems of `together` are one machine where they share all that is identified of the joints.
+    """
+    problem = result.problem.sample()
     parameters = result.problem.parameters
-    only = next(iter(result.problem.arms.values()))
-    if len(result.problem.arms) > 1:
-        only = None
-    tools = np.array([name.startswith("tool_") for name in parameters.names])
-    nominal = np.where(tools, 0.0, parameters.nominal)
-    at = np.where(tools[parameters.identified], 0.0, result.x)
-    return Machine(only, replace(parameters, nominal=nominal), result.problem.sample().data, at=at)
+    robot = next(iter(problem.arms))
+    joints = [name for name in parameters.free.names if of_joint(name) or name in parameters.terms]
+    own = [name for name in joints if own_name(name) != name]
+    if own:
+        raise InputError("improvement", f"several robots: '{own[0]}' is of one alone", "one robot")
+    places = parameters.places_of(robot)
+    columns = (np.cumsum(parameters.identified) - 1)[places[parameters.identified[places]]]
+    of_robot = parameters.of_robot(robot)
+    tools = np.array([name.startswith("tool_") for name in of_robot.names])
+    nominal = np.where(tools, 0.0, of_robot.nominal)
+    at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
+    data = problem.alone(robot).data
+    return Machine(problem.arms[robot], replace(of_robot, nominal=nominal), data, at=at), columns
 
 
 def _moving_apart(result: Calibration) -> tuple[Array, Array]:

@@ -207,6 +207,8 @@ def _first_touches(data: Dataset) -> dict[str, Block]:
 def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
     """Return the row that states a distance; its joint values are those of a touch of either point."""
     first, second = (touched[name] for name in known.between)
+    if second.robot != first.robot:  # a row is of one robot; where the two are all touches say
+        second = first
 
     def both(one: Array | None, other: Array | None) -> Array | None:
         if one is None or other is None:
@@ -222,6 +224,7 @@ def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
         markers=(*first.markers, *second.markers),
         torque=both(first.torque, second.torque),
         payload=first.payload,
+        robot=first.robot,
         approach=both(first.approach, second.approach),
         point=np.array([known.between], dtype=object),
     )

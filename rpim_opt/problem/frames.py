@@ -13,6 +13,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.located import locate
+from rpim_opt.problem.meeting import met
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.placing import NOMINAL_ERROR, Place
 from rpim_opt.problem.source import Source
@@ -177,6 +178,11 @@ def _each_relocated(problem: Source) -> Source | None:
             places = p.places_of(name)
             untouched = nominal[places] == p.nominal[places]
             nominal[places] = np.where(untouched, found.parameters.nominal, nominal[places])
+    for name, place in met(problem.sample()).items():
+        own = p.of_robot(name)
+        base = _frame_of(own, "base_")
+        if _misplaced(own, base, place):
+            nominal[p.places_of(name)[base]] = place
     if (nominal == p.nominal).all():
         return None
     return problem.with_parameters(replace(p, nominal=nominal))

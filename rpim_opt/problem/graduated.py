@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.problem.consensus import FEWEST, alone, compatible, likeliest, likely
 from rpim_opt.problem.loops import Loops
 from rpim_opt.problem.rotations import Smallest, lifted, nearest, smallest
 
@@ -18,8 +19,8 @@ QUANTILES = {"huber": 0.90, "truncated": 0.99}
 FACTOR = 1.6
 """By which the truncated loss comes nearer to itself from one pass to the next."""
 MOST_PASSES = 100
-FEWEST = 3
-"""Measurements that have to have a weight."""
+FULL = 0.999
+"""Weight from which a measurement agrees."""
 SETTLED = 1e-6
 """Weights that change by less from pass to pass are found."""
 
@@ -42,6 +43,8 @@ class Solved:
         The loss, summed, and what is expected of translations.
     settled
         Whether the weights are those of the residuals.
+    alone
+        Whether no other measurements than those of full weight can be as many that agree.
     """
 
     v: Array
@@ -50,6 +53,7 @@ class Solved:
     squares: Array
     cost: float
     settled: bool = True
+    alone: bool = True
 
 
 Weigh = Callable[[Array], Array]
@@ -66,7 +70,8 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
 
     From the relaxation's optimum of the squares Huber's loss follows repeated weights c / r, and the truncated loss
     graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127), by Newton's steps; the last weighted problem is the
-    relaxation's again. The truncated loss is followed from the candidates, too, so that none of them is better.
+    relaxation's again. The truncated loss begins with the largest core of measurements that turn alike, and if not all
+    of that agree, with all of them; it is followed from the candidates, too, so that none of them is better.
 
     Parameters
     ----------
@@ -77,19 +82,38 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     candidates
         Rotations (k, 3, 3) to start from, too.
     """
-    ones = np.ones(len(loops.rows))
-    first = _weighted(loops, ones, loss, candidates)
     if loss == "squares":
-        return first
+        return _weighted(loops, np.ones(len(loops.rows)), loss, candidates)
     beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
     if loss == "huber":
-        return _repeated(loops, first, loss, lambda squares: _huber_weights(squares, beyond))
-    found = _graduated(loops, first, beyond)
-    for rotations in candidates:
-        other = _from(loops, rotations, beyond)
-        if other is not None and other.cost < found.cost * (1 - SETTLED):
-            found = other
-    return found
+        first = _weighted(loops, np.ones(len(loops.rows)), loss, candidates)
+        found = _repeated(loops, first, loss, lambda squares: _huber_weights(squares, beyond))
+    else:
+        found = _truncated(loops, beyond, candidates)
+    return replace(found, alone=alone(loops, found.squares, found.weights > FULL, beyond))
+
+
+def _truncated(loops: Loops, beyond: Array, candidates: Sequence[Array]) -> Solved:
+    """Return the least of the truncated loss that is found from the likeliest measurements, from all and candidates.
+
+    Where too few of the likeliest agree with that, parts of them are begun with, too.
+    """
+    pairs = compatible(loops.turns, beyond)
+    first = likeliest(pairs)
+    found = [_graduated(loops, first, beyond), *(_from(loops, rotations, beyond) for rotations in candidates)]
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(_graduated(loops, np.ones(len(pairs), dtype=bool), beyond))
+    best = _least(found)
+    if best.weights.sum() < first.sum() - 1:
+        best = _least([best, *(_graduated(loops, part, beyond) for part in likely(pairs, first))])
+    return best
+
+
+def _least(found: Sequence[Solved | None]) -> Solved:
+    """Return the first of those that cost least, up to rounding."""
+    known = [each for each in found if each is not None]
+    least = min(each.cost for each in known)
+    return next(each for each in known if each.cost * (1 - SETTLED) <= least)
 
 
 def _weighted(loops: Loops, weights: Array, loss: str, candidates: Sequence[Array] = ()) -> Solved:
@@ -146,17 +170,18 @@ def _repeated(loops: Loops, solved: Solved, loss: str, weigh: Weigh) -> Solved:
     return replace(solved, settled=False)
 
 
-def _graduated(loops: Loops, solved: Solved, beyond: Array) -> Solved:
-    """Return a least of the truncated loss: losses between a square and it, each from the one before.
+def _graduated(loops: Loops, among: np.ndarray, beyond: Array) -> Solved:
+    """Return a least of the truncated loss: losses of some measurements (N,) from squares to it, each from the last.
 
     The loss of parameter mu has weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them
     sqrt(mu (mu + 1) c^2 / r^2) - mu.
     """
-    ratio = float(np.max(solved.squares / beyond))
+    solved = _weighted(loops, among.astype(float), "truncated")
+    ratio = float(np.max(among * solved.squares / beyond))
     mu = 1 / max(2 * ratio - 1, 1e-3)
     for _ in range(MOST_PASSES):
         between = np.sqrt(mu * (mu + 1) * beyond / np.maximum(solved.squares, 1e-300)) - mu
-        weights = np.clip(between, 0.0, 1.0)
+        weights = among * np.clip(between, 0.0, 1.0)
         if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
             break
         solved = _followed(loops, weights, "truncated", solved)

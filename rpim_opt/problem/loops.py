@@ -16,6 +16,26 @@ SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
+class Turns:
+    """Orientations of measurements B_i = Z A_i X, up to their errors: A_i'A_j and B_i'B_j turn by the same angle.
+
+    Parameters
+    ----------
+    first, second
+        (N, 3, 3) A_i and B_i.
+    sigma
+        (N,) standard deviations of B_i [rad].
+    group
+        (N,) numbers of what has the same Z and X; negative where the orientation was not measured.
+    """
+
+    first: Array
+    second: Array
+    sigma: Array
+    group: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Loops:
     """Residuals J_i v of measurements, v = (translations, scale, 1, vec R_1, ..., vec R_k), rotations' rows first.
 
@@ -31,6 +51,8 @@ class Loops:
         (N,) degrees of freedom of a measurement: 3 for a position, 6 for a pose.
     shared
         How many of the rotations, the first ones, others have products with; the others have none among themselves.
+    turns
+        What does not depend on the unknowns.
     """
 
     rows: Array
@@ -38,6 +60,7 @@ class Loops:
     linear: int
     freedom: Array
     shared: int
+    turns: Turns
 
     @property
     def unknowns(self) -> int:
@@ -145,7 +168,9 @@ def of_poses(seen: Seen, scaled: bool) -> Loops:
         J[at, 3:, last[at] + k] = of_tool[at, :, k] * angles[at, None]
     weak = RIDGE * float(np.sqrt(np.sum(lengths**2)))
     prior = _expected(seen.expected, max(1 / seen.spread, weak), robot, J.shape[2])
-    return Loops(J, prior, linear, np.where(seen.turned, 6, 3), bases)
+    group = np.where(seen.turned, seen.instrument * tools + seen.marker, -1)
+    turns = Turns(A, B, seen.sigma[:, 1], group)
+    return Loops(J, prior, linear, np.where(seen.turned, 6, 3), bases, turns)
 
 
 def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float, scaled: bool) -> Loops:
@@ -173,7 +198,8 @@ def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float,
     J[:, 3:] /= np.sqrt(2) * sigma[:, 1, None, None]
     weak = RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2)))
     prior = _expected(expected[None], max(1 / spread, weak), robot, J.shape[2])
-    return Loops(J, prior, linear, np.full(N, 6), 1)
+    turns = Turns(A[:, :3, :3], B[:, :3, :3], sigma[:, 1], np.zeros(N, dtype=int))
+    return Loops(J, prior, linear, np.full(N, 6), 1, turns)
 
 
 def _expected(points: Array, certainty: float, robot: int, n: int) -> Array:

@@ -105,7 +105,7 @@ def _cone(count: int, shared: int) -> _Cone:
     return _Cone(sparse.csc_matrix(data["A"]), data["c"], conif.dims_to_solver_cones(data["dims"]), own, stated.places)
 
 
-def relax(Q: Array, shared: int | None = None) -> Moments:
+def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moments:
     """Return the moment matrix and the multipliers of `moments.Relaxation`.
 
     Parameters
@@ -115,6 +115,8 @@ def relax(Q: Array, shared: int | None = None) -> Moments:
     shared
         The first so many rotations are those that the others have products with, and they have none among themselves;
         all by default.
+    sought
+        Tolerance of gap and feasibility.
 
     Examples
     --------
@@ -136,15 +138,15 @@ def relax(Q: Array, shared: int | None = None) -> Moments:
     P = sparse.csc_matrix((len(cone.q), len(cone.q)))
     with phase("solve"):
         b = cone.triangles(Q / size)
-        found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings()).solve()
+        found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings(sought)).solve()
     return Moments(cone.matrix(np.array(found.z)), size * np.array(found.x)[cone.columns], str(found.status))
 
 
 @lru_cache
-def _settings() -> Any:
+def _settings(sought: float) -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
     settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = SOUGHT
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = sought
     return settings

@@ -19,6 +19,8 @@ SHORT = 1e-13
 """Rotations are found when a step is shorter [rad]."""
 SPREAD = 1e-3
 """Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
+FINE = 1e-12
+"""Tolerance with which the relaxation is solved again where its moments are those of several rotations."""
 DRAWN = 20
 CROSS = np.array(
     [
@@ -60,13 +62,19 @@ class Smallest:
     def radius(self, excess: float) -> float:
         """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
 
-        Both x are of the same length and begin with 1, so that |x - x_best|^2 <= 3 |x_other|^2; and
-        |R - R_best|^2 = 8 sin^2(angle / 2).
+        Both x have the length n = 1 + 3 k, squared, so that c = x'x_best / n has 1 - c^2 = |x_other|^2 / n, and
+        |x - x_best|^2 = 2 n (1 - c), of which one rotation has 8 sin^2(angle / 2). A trace of -1 or more keeps c above
+        (1 - k) / n.
         """
         if self.steepness <= 0:
             return float(np.pi)
-        other = (excess + self.value - self.bound) / self.steepness
-        return float(2 * np.arcsin(min(1.0, np.sqrt(3 * other / 8))))
+        k = len(self.rotations)
+        n = 1 + 3 * k
+        square = 1 - (excess + self.value - self.bound) / (self.steepness * n)
+        if square <= ((1 - k) / n) ** 2:
+            return float(np.pi)
+        apart = 2 * n * (1 - np.sqrt(square))
+        return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
 def nearest(L: Array, rotations: Array) -> Smallest:
@@ -107,12 +115,25 @@ def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = No
     """
     Q = L.T @ L
     moments = relax(Q, shared)
+    if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
+        moments = relax(Q, shared, FINE)
     starts = [*_rounded(moments), *candidates]
     refined = [_refined(L, start) for start in starts]
     values = [_value(L, R) for R in refined]
     best = refined[int(np.argmin(values))]
     bound, steepness = _bound(Q, lifted(best), min(values), moments.multipliers)
     return Smallest(best, min(values), bound, moments.rank_ratio, _slopes(L, best)[1] / 2, steepness)
+
+
+def undercut(L: Array, shared: int | None = None) -> float:
+    """Return a value of |L x|^2 that no rotations undercut, by the relaxation's multipliers alone."""
+    Q = L.T @ L
+    moments = relax(Q, shared, FINE)
+    value = float(np.sum(Q * moments.matrix))
+    count = (len(Q) - 1) // 9
+    S = Q - np.tensordot(moments.multipliers, rotation_constraints(count), axes=1)
+    S[0, 0] -= value
+    return value + min(0.0, float(np.linalg.eigvalsh(S)[0])) * (1 + 3 * count)
 
 
 def lifted(rotations: Array) -> Array:

@@ -11,7 +11,9 @@ from string import ascii_uppercase
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.meeting import met
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.parameter_names import known_patterns
 from rpim_opt.robot.parameters import Parameters
@@ -42,7 +44,8 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     ------
     InputError
         For fewer than two problems, a pattern that matches no parameter that all have, shared parameters that are
-        stated differently, scatter (it is stated of the whole, or learned), measurements in parts.
+        stated differently, scatter (it is stated of the whole, or learned), measurements in parts, and touches of a
+        point that is elsewhere for another robot.
 
     Examples
     --------
@@ -65,8 +68,10 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     for name in common:
         _require_same(name, parts)
     robots = {name: part.robot for name, part in parts.items()}
-    data = Dataset.of_robots({name: part.data for name, part in parts.items()})
-    return CalibrationProblem(robots, _joined(parts, common), data)
+    data = by_points(Dataset.of_robots({name: part.data for name, part in parts.items()}))
+    whole = CalibrationProblem(robots, _joined(parts, common), data)
+    met(whole)  # what is touched by several robots is in one place
+    return whole
 
 
 def _require_parts(parts: Mapping[str, CalibrationProblem], count: int) -> None:

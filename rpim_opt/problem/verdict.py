@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.graduated import Solved
+from rpim_opt.problem.graduated import FULL, Solved
 from rpim_opt.problem.loops import Loops
 
 GAP = 1e-3
@@ -115,8 +115,6 @@ def judged(
 def _doubt(solved: Solved, gap: float, uncertainty: float, radius: float, scale: float) -> str:
     """Return what keeps a start from being certain, in words; nothing where nothing does."""
     N = len(solved.weights)
-    full = int(np.sum(solved.weights > 0.999))
-    needed = N // 2 + 2
     if uncertainty > UNKNOWN:
         return (
             f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would"
@@ -129,6 +127,7 @@ def _doubt(solved: Solved, gap: float, uncertainty: float, radius: float, scale:
         return "the measurements do not determine the scale"
     if not solved.settled:
         return "the weights of the loss did not settle"
-    if solved.weights.min() < 1 and full < needed:
-        return f"{full} of {N} measurements agree; {needed} would have to, so that no others can"
+    if solved.weights.min() < 1 and not solved.alone:
+        full = int(np.sum(solved.weights > FULL))
+        return f"{full} of {N} measurements agree, and as many others may agree with another start"
     return ""

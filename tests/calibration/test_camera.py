@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -82,6 +83,46 @@ def test_the_sentence_is_in_the_output(tmp_path: Path) -> None:
     assert any("These views do not improve this robot" in line for line in summary(result, {})["remarks"])
     write_report(result, tmp_path / "report.html")
     assert "These views do not improve this robot" in (tmp_path / "report.html").read_text()
+
+
+def boards_in_two_places(shared: list[str]) -> ro.CalibrationProblem:
+    """Return the same views in halves, of which the second shows a board that stands 30 mm further along x."""
+    problem = replace(calibrated()[1].problem, scatter=None)
+    rng = np.random.default_rng(4)
+    second = problem.data.configuration > np.median(problem.data.configuration)
+    parts = {}
+    for name, rows, shift in (("table", ~second, 0.0), ("wall", second, 0.03)):
+        part = problem.on(problem.data.take(np.flatnonzero(rows)))
+        x = calibrated()[1].x.copy()
+        x[problem.parameters.free.names.index("base_x")] += shift
+        (block,) = part.data.blocks
+        seen = replace(block, y=part.modelled(x)[0] + 0.1 * rng.normal(size=block.y.shape))
+        parts[name] = part.on(replace(part.data, blocks=(seen,)))
+    return ro.together(**parts, shared=shared)
+
+
+def test_boards_in_two_places_are_one_calibration() -> None:
+    """Two problems that share all but the base; that they are one robot the expected errors know."""
+    _, result = calibrated()
+    names = result.problem.parameters.names
+    found = ro.calibrate(boards_in_two_places([name for name in names if not name.startswith("base_")]))
+    assert found.converged
+    free = found.problem.parameters.free
+    k = [free.names.index(f"{place}.base_x") for place in ("table", "wall")]
+    apart = np.diff((free.nominal + found.x)[k])[0]
+    sd = np.sqrt(np.array([-1, 1]) @ found.covariance[np.ix_(k, k)] @ [-1, 1])
+    assert sd < 1e-3
+    assert abs(apart - 0.03) < 4 * sd
+    one, both = (ro.calibration.improvement(each) for each in (result, found))
+    assert one is not None
+    assert both is not None
+    assert both.before == pytest.approx(one.before, rel=0.05)
+    assert both.after == pytest.approx(one.after, rel=0.3)
+
+
+def test_two_robots_are_not_expected_to_be_one() -> None:
+    both = boards_in_two_places(["camera_*", "tool_*"])
+    assert ro.calibration.improvement(ro.calibrate(both, ro.tikhonov, weight=1.0)) is None
 
 
 @pytest.mark.slow
