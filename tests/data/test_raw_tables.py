@@ -1,4 +1,4 @@
-"""Raw tables whose names, sheets, units or rows are odd: understood as they are meant, or one sentence says what not."""
+"""Raw tables whose names, sheets, units or rows are odd: understood as meant, or one sentence says what not."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_first_sheet_with_cells_is_read_and_another_one_by_name_or_number(tm
     assert "sheet 'points' of notes, points: the first with cells" in found.notes[0]
     for sheet in ("points", "2"):
         assert dict(read(path, sheet=sheet).columns) == dict(found.columns)
-    with pytest.raises(ro.InputError, match="found 'poinst', accepted: .*points"):
+    with pytest.raises(ro.InputError, match=r"found 'poinst', accepted: .*points"):
         read(path, sheet="poinst")
     with pytest.raises(ro.InputError, match="an empty file"):
         read(path, sheet="notes")

@@ -152,10 +152,10 @@ def test_what_cannot_be_designed_is_said() -> None:
             choose(problem, q, count)
     with pytest.raises(ro.InputError, match="a joint without limits"):
         random_candidates(ro.robot.Robot("free", problem.robot.mdh), 3)
-    with pytest.raises(ro.InputError, match="no column for 'q2', accepted: q2_rad or .* or q2_deg"):
+    with pytest.raises(ro.InputError, match=r"no column for 'q2', accepted: q2_rad or .* or q2_deg"):
         read_candidates({"q1_deg": [1.0]}, problem.robot)
+    two = ro.load("distance").problem
     with pytest.raises(ro.InputError, match="'distance' between two points"):
-        two = ro.load("distance").problem
         choose(two, random_candidates(two.robot, 5), 2)
 
 

@@ -72,7 +72,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "measured values in two columns": (lambda: ro.Dataset.of(Q, np.zeros((4, 2)), 1e-4), "3 measured values a row"),
     "torques of other rows": (lambda: ro.Dataset.of(Q, np.zeros((4, 3)), 1e-4, torque=Q[:2]), "shape (2, 6)"),
     "a payload too many": (lambda: ro.Dataset.of(Q, np.zeros((4, 3)), 1e-4, payload=np.ones(5)), "shape (4,)"),
-    "a tracker that is a number": (lambda: declared_noise({"tracker": 5}, position), "a table, for positions and poses"),
+    "a tracker that is a number": (lambda: declared_noise({"tracker": 5}, position), "a table, for positions"),
     "a tracker of distances": (
         lambda: declared_noise({"tracker": {"range_um": 5.0}}, ro.load("distance").problem.data.blocks[0].measurement),
         "a table, for positions and poses",
@@ -106,7 +106,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: posed(few_views(3), own(fx=0.0)), "a focal length of 0 px, accepted: one greater than zero"
     ),
     "views that show three corners": (
-        lambda: posed(world("eye_in_hand").data.take(np.array([0, 1, 5])), own()), "no view that shows a pose"
+        lambda: posed(world("eye_in_hand").data.take(np.array([0, 1, 5, 12, 13, 17])), own()),
+        "no view that shows a pose",
     ),
     "two views for a focal length": (
         lambda: starting_camera(few_views(2), few_views(2).blocks[0]), "2 views of a flat board"
