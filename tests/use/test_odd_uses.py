@@ -198,7 +198,7 @@ def test_approaches_with_other_columns() -> None:
 
 
 def test_files_of_controllers_are_for_robots_that_have_them(tmp_path: Path) -> None:
-    problem, _ = simulated(("theta[23]",), 5, robot=ro.robot.Robot("bent", ARM.mdh + [0.1, 0, 0, 0, 0]))
+    problem, _ = simulated(("theta[23]",), 5, robot=ro.robot.Robot("bent", np.add(ARM.mdh, [0.1, 0, 0, 0, 0])))
     with pytest.raises(
         ro.InputError, match="alpha1 or a1 that are not zero, accepted: a ready robot of Universal Robots"
     ):
