@@ -1,4 +1,4 @@
-"""The gap of penalties with kinks: no point lies lower than it allows, wherever it is asked, and steps stay in boxes."""
+"""The gap of penalties with kinks: no point lies lower than it allows, wherever it is asked; steps stay in boxes."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def test_a_table_of_some_angles_of_a_frame_is_added_up() -> None:
     assert part.values(x) == pytest.approx(part.nominal + x, abs=1e-15)
     full = whole.identify(["base_r?"]).free
     turned = full.values(np.array([0.1, 0.2, 0.3]))
-    assert not np.allclose(turned, full.nominal + [0.1, 0.2, 0.3], atol=1e-3)
+    assert not np.allclose(turned, np.add(full.nominal, [0.1, 0.2, 0.3]), atol=1e-3)
 
 
 def test_tolerances_are_shown_where_there_are_some() -> None:
@@ -137,7 +137,7 @@ def test_two_frames_are_one_place_within_a_centimetre_and_a_tenth_of_a_radian() 
 
 def test_an_arm_of_another_file_is_refused() -> None:
     types = ("revolute",) * 6
-    require_same_arm(ARM, MDH + [0, 0, 2 * np.pi, 0.05, 0], types, Path("arm.urdf"))  # a turn is none
+    require_same_arm(ARM, np.add(MDH, [0, 0, 2 * np.pi, 0.05, 0]), types, Path("arm.urdf"))  # a turn is none
     with pytest.raises(ro.InputError, match=r"d1 off by 0\.2 m or rad"):
         require_same_arm(ARM, MDH + [[0, 0, 0, 0.2 * (i == 0), 0] for i in range(6)], types, Path("arm.urdf"))
     with pytest.raises(ro.InputError, match=r"alpha3 off by 0\.3 m or rad"):
