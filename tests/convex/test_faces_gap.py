@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
@@ -91,6 +92,14 @@ def test_no_point_lies_lower_than_the_gap_allows(kind: str, weight: float) -> No
             missing = faces.value(y, weight) - face.value
             gap = faces.gap(y, faces.slope(y, weight), weight)
             assert gap >= missing * (1 - 1e-9) - 1e-12 * abs(face.value)
+
+
+@pytest.mark.parametrize("kind", ["priced", "groups", "groups with squares, some free"])
+def test_where_nothing_is_to_be_fitted_nothing_is_the_minimum(kind: str) -> None:
+    faces = replace(made(kind, 1), d=np.zeros(12), g=np.zeros(N))
+    face = faces.minimum(1.0)
+    assert not face.y.any()
+    assert (face.gap, face.value) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -30,3 +30,11 @@ def test_a_constant_gradient_is_asked_once(monkeypatch) -> None:
     monkeypatch.setattr(feasible, "_speeds", lambda *_: pytest.fail("asked again"))
     whole = [affine]
     assert missed([0, 2, 0]) == pytest.approx([5 / np.sqrt(10)])
+
+
+def test_a_cone_changes_as_fast_as_the_fastest_of_its_sides() -> None:
+    """What CVXPY says is missed of |3 (x, y)| <= z, over 3; a side that is constant does not change."""
+    z = cp.Variable(3)
+    z.value = np.array([6.0, 0.0, 0.0])
+    for cone, speed in ((cp.SOC(z[2], 3 * z[:2]), 3.0), (cp.SOC(cp.Constant(1.0), 0.5 * z[:2]), 0.5)):
+        assert feasible._missed(cone, z, {}) == pytest.approx(cone.violation() / speed, rel=1e-9)

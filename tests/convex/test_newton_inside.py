@@ -156,3 +156,15 @@ def test_what_no_penalty_sees_is_not_penalized() -> None:
     a = at.inverse @ (Z - at.offset)
     assert float(np.sum((L @ Z - 0.1) ** 2)) == pytest.approx(float(np.sum(a[at.penalized] ** 2)), rel=1e-9)
     assert np.abs(L @ at.B[:, ~at.penalized]).max() < 1e-9
+
+
+def test_coordinates_without_some_rows_are_those_of_the_others() -> None:
+    at = made("huber", "equation")[0].at
+    kept = np.arange(len(at.b)) % 3 != 1
+    less = at.of(kept)
+    assert less.gram == pytest.approx(less.rows.T @ less.rows, rel=1e-9, abs=1e-9 * np.max(at.gram))
+    assert not less.rows[~kept].any()
+    assert not less.b[~kept].any()
+    assert np.array_equal(less.rows[kept], at.rows[kept])
+    assert less.lengths == pytest.approx(np.sum(less.rows**2, axis=0), rel=1e-9)
+    assert at.rows[~kept].any()  # those that it came from stay

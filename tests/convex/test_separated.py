@@ -17,6 +17,7 @@ from tests.convex.test_newton import EQUATIONS, NORMS
 COUNT = 7
 OWN = {
     "each its own norm": lambda v: cp.sum(cp.multiply(np.linspace(0.5, 2.0, v.size), v)),
+    "absolute values": lambda v: cp.sum(2 * cp.abs(v)) + cp.sum(cp.huber(v)),
     "each its own tilt": lambda v: cp.sum(cp.multiply(np.arange(1.0, 1.0 + v.size), cp.exp(v))),
 }
 OVER = {name: (loss, None) for name, loss in EQUATIONS.items()}

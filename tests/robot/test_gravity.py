@@ -11,6 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.deflection import STANDARD
 from rpim_opt.robot.family import _draws
+from rpim_opt.robot.gravity import MOUNTINGS
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM
@@ -342,3 +343,13 @@ def test_a_urdf_without_masses_leaves_the_guess_and_a_wrong_mass_is_named(tmp_pa
             ro.read_urdf(path, base="base", tip="tip")
     path.write_text(text.replace('value="0.5"', 'value="?"'))  # of a finger, beside the chain
     assert ro.read_urdf(path, base="base", tip="tip").robot.gravity.masses == pytest.approx((4.0, 4.0, 2.25))
+
+
+def test_mountings_are_where_gravity_points_in_the_base_frame() -> None:
+    assert MOUNTINGS == {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("direction", [(1.0, 2.0), ("a", 0, 0), (np.nan, 0, 1), (0.0, 0.0, 0.0), 3.0])
+def test_a_direction_that_is_none_is_refused(direction: object) -> None:
+    with pytest.raises(ro.InputError, match=r"three finite numbers|a vector that points somewhere"):
+        ro.robot.Gravity(direction)  # type: ignore[arg-type]
