@@ -210,6 +210,23 @@ def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) ->
     assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("write", "bend"),
+    [
+        (lambda r: cp.sum(cp.power(r - 1, 4)), lambda v: 12 * (v - 1) ** 2),
+        (lambda r: cp.sum(cp.huber(2 * r + 0.5, 1.5)), lambda v: 8.0 * (np.abs(2 * v + 0.5) <= 1.5)),
+        (lambda r: cp.sum(cp.square(3 - r / 2)) + cp.sum(r), lambda v: 0.5 + 0 * v),
+    ],
+)
+def test_atoms_that_have_formulas_are_exact(write: Any, bend: Any) -> None:
+    """To rounding, where differences of slopes would be eight digits."""
+    r = cp.Variable(9)
+    rows = rows_of(write(r), r)
+    assert rows is not None
+    v = np.random.default_rng(3).normal(size=9)
+    assert rows.bend(v) == pytest.approx(bend(v), rel=1e-13)
+
+
 NO_SUMS: dict[str, Any] = {
     "norms with a kink": lambda r: cp.sum(cp.norm(cp.vstack([r, 2 * r]), axis=0)),
     "of all": lambda r: cp.norm2(r) + cp.sum(cp.huber(r)),

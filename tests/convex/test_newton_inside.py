@@ -9,6 +9,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex import by_rows
+from rpim_opt.convex.by_rows import Kinked, Met, Near
 from rpim_opt.convex.newton import Newton, Point
 from tests.convex.test_newton import CASES, MODEL, SMOOTH, stated
 
@@ -168,3 +170,27 @@ def test_coordinates_without_some_rows_are_those_of_the_others() -> None:
     assert np.array_equal(less.rows[kept], at.rows[kept])
     assert less.lengths == pytest.approx(np.sum(less.rows**2, axis=0), rel=1e-9)
     assert at.rows[~kept].any()  # those that it came from stay
+
+
+def test_a_minimum_begins_at_that_of_the_nearest_weight() -> None:
+    """And at the last one that was met; of too many the first goes."""
+
+    def near(k: int) -> Near:
+        return Near(np.full(1, float(k)), Kinked([], 1.0), np.empty(0), 0.0)
+
+    met = Met()
+    assert met.nearest(1.0) is None
+    assert met.near(1.0) == []
+    weights = (0.0, 1e-3, 1.0, 100.0, 1e4)
+    for k, weight in enumerate(weights):
+        met.keep(weight, near(k))
+    found = {asked: met.nearest(asked) for asked in (0.0, 1e-4, 0.04, 20.0, 3e5)}
+    assert {asked: each.z[0] for asked, each in found.items() if each} == {0.0: 0, 1e-4: 1, 0.04: 2, 20.0: 3, 3e5: 4}
+    assert [each.z[0] for each in met.near(20.0)] == [3, 4]
+    assert [each.z[0] for each in met.near(1e4)] == [4]
+    for k in range(by_rows.MOST):
+        met.keep(1e6 + k, near(k))
+    kept = met.nearest(1e4)
+    assert kept is not None
+    assert kept.z[0] == 0  # that at 1e6: those before it are gone
+    assert len(met._at) == by_rows.MOST
