@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.use.changes import Cause
 from rpim_opt.use.cusum import since
 from rpim_opt.use.drifts import Drift
-from rpim_opt.use.export import export_ur_calibration, export_urdf
+from rpim_opt.use.export import _require_different, export_ur_calibration, export_urdf
 from rpim_opt.use.targets import read_targets
 from rpim_opt.use.validation import read_measurements
 from tests.simulate import ARM, simulated
@@ -205,3 +206,53 @@ def test_files_of_controllers_are_for_robots_that_have_them(tmp_path: Path) -> N
         export_ur_calibration(ro.calibrate(problem, weight=1.0), tmp_path / "none.conf", tmp_path / "out.conf")
     with pytest.raises(ro.InputError, match=r"none\.urdf"):
         export_urdf(calibrated(), tmp_path / "none.urdf", tmp_path / "out.urdf")
+
+
+def test_what_no_file_holds_is_named_and_counted() -> None:
+    problem, _ = simulated(("ecc?*", "compliance?"), 40)
+    result = ro.calibrate(problem, weight=1.0)
+    with pytest.raises(ro.InputError, match=r"and \d+ more, accepted: MDH parameters"):
+        ro.use.identified(replace(result, x=np.full(len(result.x), 1e-6)))
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match="a folder, accepted: a name of its own for every file"):
+        _require_different([tmp_path])
+    with pytest.raises(ro.InputError):
+        _require_different([tmp_path / "a", tmp_path / "a"])
+
+
+def test_validation_says_what_it_knows_and_what_not() -> None:
+    bare = str(ro.use.validate(calibrated("lasso"), checks()))
+    assert "has no covariance for these rows: how large errors may be is not known." in bare
+    assert "orientation" not in bare
+    pose = ro.load("pose")
+    assert pose.validation is not None
+    said = str(ro.use.validate(pose.calibrate(weight=1.0), pose.validation))
+    assert "orientation, identified [mrad]" in said
+    assert "95 % intervals of a reading" in said
+
+
+def test_everything_may_be_let_go() -> None:
+    """Nothing of the last calibration but its widths is then left."""
+    data = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 30, 5e-5, 3)[0].data
+    found = ro.use.update(calibrated(), data, anew=["*"])
+    anew = ro.calibrate(calibrated().problem.on(data), ro.least_squares)
+    assert found.result.x == pytest.approx(anew.x, abs=2e-5)
+    halves = [data.take(np.arange(k, k + 15)) for k in (0, 15)]
+    p = calibrated().problem
+    parts = PartitionedProblem(p.robot, p.parameters, halves[0], tuple(lambda each=each: each for each in halves))
+    with pytest.raises(ro.InputError, match="a calibration of measurements in parts, accepted: one of measurements in"):
+        ro.use.update(ro.calibrate(parts, ro.tikhonov, 1.0), checks())
+
+
+def test_one_of_several_robots_is_compensated_as_it_alone() -> None:
+    """Without a covariance, too: of a lasso nothing is said of intervals."""
+    other = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 20, 5e-5, 3)[0]
+    both = ro.together(left=calibrated().problem, right=other, shared=())
+    q = checks().q
+    for formulation in (ro.tikhonov, ro.lasso):
+        whole = ro.calibrate(both, formulation, 1.0)
+        alone = ro.calibrate(other, formulation, 1.0)
+        found = ro.use.compensate(whole, q=q, robot="right")
+        assert found.q == pytest.approx(ro.use.compensate(alone, q=q).q, abs=1e-4)
