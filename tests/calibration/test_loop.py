@@ -520,3 +520,16 @@ def test_an_objective_that_did_not_fall_for_long_is_taken_to_be_the_least() -> N
     assert not loop()._stalled(replace(still, history=tuple(passed[:10])))
     falling = [Iteration(100.0 + 1e-3 * k, 1.0, 1.0, 0.0) for k in range(12, 0, -1)]
     assert not loop()._stalled(replace(still, history=tuple(falling)))
+
+
+def test_a_start_outside_of_the_constraints_is_moved_inside_before_the_first_pass() -> None:
+    """Also where one parameter alone is outside."""
+    problem = ro.load("paper_arm").problem
+    tight = problem.with_parameters(problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5}))
+    free = tight.parameters.free
+    start = np.zeros(len(free))
+    start[3] = 7 * free.tolerance[3]
+    loop = Loop(tight.frozen(), ro.bounded, None, {}, 1e-8, 500)
+    x = free.scale * _begun(loop, ro.bounded, choosing(1.0, True), start).z
+    assert (np.abs(x) <= free.tolerance * (1 + 1e-9)).all()
+    assert x == pytest.approx(np.clip(start, -free.tolerance, free.tolerance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex import by_rows
 from rpim_opt.convex.by_rows import Kinked, Met, Near
+from rpim_opt.convex.interior import _whitened
 from rpim_opt.convex.newton import Newton, Point
+from rpim_opt.convex.objective import Damping
 from tests.convex.test_newton import CASES, MODEL, SMOOTH, stated
 
 RNG = np.random.default_rng(4)
@@ -194,3 +197,32 @@ def test_a_minimum_begins_at_that_of_the_nearest_weight() -> None:
     assert kept is not None
     assert kept.z[0] == 0  # that at 1e6: those before it are gone
     assert len(met._at) == by_rows.MOST
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.7])
+@pytest.mark.parametrize("damped", [False, True])
+def test_cones_are_solved_where_data_penalty_and_damping_are_about_the_identity(weight: float, damped: bool) -> None:
+    """In u with z = T u + c: c is the least of all three, and their curvature is one in every direction."""
+    stated = ro.Formulation("squares", penalty=lambda z: ro.tikhonov.penalty(2 * z - 0.3))
+    program = ro.convex.pose(stated, MODEL)
+    damping = None
+    A, b = [MODEL.A, np.sqrt(weight) * 2 * np.eye(N)], [MODEL.b, np.sqrt(weight) * np.full(N, 0.3)]
+    if damped:
+        damping = Damping(0.1 * Z, np.geomspace(0.5, 3.0, N))
+        A.append(np.diag(damping.size))
+        b.append(damping.size * damping.centre)
+    rows, right = np.vstack(A), np.concatenate(b)
+    T, c = _whitened(program, weight, damping)
+    assert rows @ T @ T.T @ rows.T @ rows == pytest.approx(rows, rel=1e-5, abs=1e-6 * np.max(np.abs(rows)))
+    assert T.T @ rows.T @ rows @ T == pytest.approx(np.eye(N), abs=1e-5)
+    assert c == pytest.approx(np.linalg.lstsq(rows, right)[0], rel=1e-5, abs=1e-6)
+
+
+def test_directions_that_nothing_sees_stay_nominal() -> None:
+    blind = replace(MODEL, A=MODEL.A * (np.arange(N) != 4))
+    program = ro.convex.pose(ro.Formulation("squares", loss=ro.huber(1e7), loss_over="equation"), blind)
+    T, c = _whitened(program, 0.0, None)
+    assert np.abs(T[4]).max() < 1e-8
+    assert abs(c[4]) < 1e-12
+    penalized = ro.convex.pose(ro.tikhonov, blind)
+    assert np.abs(_whitened(penalized, 0.7, None)[0][4]).max() > 0.1
