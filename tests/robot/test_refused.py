@@ -147,3 +147,12 @@ def test_an_arm_of_another_file_is_refused() -> None:
     backwards = ro.robot.Robot("back", MDH, joint_map=np.diag([1.0, -1, 1, 1, 1, 1]))
     with pytest.raises(ro.InputError, match="with signs or couplings"):
         require_same_arm(backwards, MDH, types, Path("arm.urdf"))
+
+
+def test_a_line_names_four_parameters_and_says_that_there_are_more() -> None:
+    free = ro.load("position").problem.parameters.free
+    names = ", ".join(free.names[:4])
+    assert f"{names}, ..." in free._short()
+    four = ro.load("position").problem.parameters.identify(list(free.names[:4])).free
+    assert names in four._short()
+    assert "..." not in four._short()
