@@ -227,6 +227,15 @@ def test_atoms_that_have_formulas_are_exact(write: Any, bend: Any) -> None:
     assert rows.bend(v) == pytest.approx(bend(v), rel=1e-13)
 
 
+def test_the_larger_of_a_line_and_a_number_has_its_kink_where_they_meet() -> None:
+    r = cp.Variable(9)
+    rows = rows_of(cp.sum(cp.maximum(2 * r, 3.0)), r)
+    assert rows is not None
+    ((factor, (a, c)),) = rows.kinks
+    assert (factor * a, factor * c) == (pytest.approx(1.0), pytest.approx(-1.5))
+    assert len(rows.pieces) == 1
+
+
 NO_SUMS: dict[str, Any] = {
     "norms with a kink": lambda r: cp.sum(cp.norm(cp.vstack([r, 2 * r]), axis=0)),
     "of all": lambda r: cp.norm2(r) + cp.sum(cp.huber(r)),

@@ -121,7 +121,13 @@ def test_rows_are_projected_group_by_group(name: str) -> None:
 def test_a_loss_that_falls_or_has_kinks_elsewhere_is_not_separated() -> None:
     starts = np.arange(0, 2 * COUNT, 2)
     v = cp.Variable(COUNT)
-    for loss in (-cp.sum(v), cp.sum(cp.abs(v - 1)), cp.sum(cp.multiply(np.arange(COUNT) - 3.0, v))):
+    beside = np.arange(COUNT) % 2
+    for loss in (
+        -cp.sum(v),
+        cp.sum(cp.abs(v - 1)),
+        cp.sum(cp.abs(v - beside)),
+        cp.sum(cp.multiply(np.arange(COUNT) - 3.0, v)),
+    ):
         rows = rows_of(loss, v)
         assert rows is not None
         assert not Separated(rows, starts, 2 * COUNT).holds
