@@ -15,6 +15,7 @@ import importlib.machinery
 import json
 import os
 import random
+import re
 import resource
 import sys
 import time
@@ -284,25 +285,38 @@ class Known:
         self.lines = coverage.CoverageData(str(folder / "coverage"))
         self.lines.read()
         self.tests: dict[str, dict[str, Any]] = json.loads((folder / "tests.json").read_text())
+        self.imports: dict[str, set[str]] = {}
 
     def chosen(self, mutant: Mutant) -> list[str]:
-        """Return the tests that run a changed line (its module's where it stands in no function), quickest first."""
+        """Return the tests that run a changed line, then those of files that import the module, quickest first.
+
+        What a function keeps for its next callers (``lru_cache``) runs for one test and decides about others, too: of
+        such lines the second ones know.
+        """
         by_line = self.lines.contexts_by_lineno(str(ROOT / "rpim_opt" / mutant.file))
-        run = mutant.run or by_line
-        contexts = {context for line in run for context in by_line.get(line, ()) if context}
-        fitting = [
-            (entry["seconds"], test)
-            for test, entry in self.tests.items()
-            if not contexts.isdisjoint(entry.get("contexts", ()))
-        ]
+        lines = mutant.run or by_line
+        contexts = {context for line in lines for context in by_line.get(line, ()) if context}
+        found = []
+        for test, entry in self.tests.items():
+            runs = not contexts.isdisjoint(entry.get("contexts", ()))
+            if runs or (entry.get("contexts") and mutant.file in self._imported(test.partition("::")[0])):
+                found.append((not runs, entry["seconds"], test))
         taken = []
         total = 0.0
-        for seconds, test in sorted(fitting):
+        for _, seconds, test in sorted(found):
             total += seconds
             if taken and total > SECONDS:
                 break
             taken.append(test)
         return taken
+
+    def _imported(self, file: str) -> set[str]:
+        """Return the files of the package that a file of tests imports by name."""
+        if file not in self.imports:
+            text = (ROOT / file).read_text(encoding="utf-8")
+            names = re.findall(r"^from rpim_opt\.(\S+) import", text, re.MULTILINE)
+            self.imports[file] = {f"{name.replace('.', '/')}.py" for name in names}
+        return self.imports[file]
 
 
 def _fails_unchanged(file: str, number: int, known: Known) -> bool:

@@ -238,9 +238,7 @@ class _Search:
         return float(ratios[first]), int(falling[first])
 
     def _added(self, j: int, mu_j: float, change: Array, fall: float) -> None:
-        size = self._size
-        if size == len(self.x):
-            raise IndexError  # cannot be: as many rows as unknowns let none enter
+        size = self._size  # below that of B: as many rows as unknowns let none enter
         self.B[:size, :size] -= np.multiply.outer(change, change / fall)
         self.B[:size, size] = self.B[size, :size] = -change / fall
         self.B[size, size] = -1 / fall

@@ -248,7 +248,7 @@ class Faces:
         curved = float(np.sum((self.M @ step) ** 2))
         if self.H is not None:
             curved += 0.5 * weight * max(float(step @ self.H @ step), 0.0)
-        return max(young, 0.0) + curved + self._cost(excess, y, weight)
+        return max(young, 0.0) + curved + self._cost(excess, y, step, weight)
 
     def _over(self, slope: Array, weight: float) -> Array:
         """Return what a slope (n,) has beyond the prices of the groups."""
@@ -270,15 +270,18 @@ class Faces:
         single = float(np.sum((here - least)[~self.grouped]))
         return single + float(np.sum(self.picks @ here + groups * self.lengths(y)))
 
-    def _cost(self, excess: Array, y: Array, weight: float) -> float:
-        """Return what it costs a lower bound to take an excess (n,) off the slope."""
+    def _cost(self, excess: Array, y: Array, step: Array, weight: float) -> float:
+        """Return what it costs a lower bound to take an excess (n,) off the slope after a step.
+
+        Of what the equations see, the squares hold y' near y + step: |e|^2 / 4 - e'M step in their coordinates.
+        """
         if not excess.any():
             return 0.0
         s, Vt = self.spectrum
         seen = Vt @ excess
         unseen = excess - seen @ Vt
         unseen[np.abs(unseen) <= self.rounding(y, weight)] = 0.0
-        cost = float(np.sum((seen / (2 * s)) ** 2))
+        cost = float(np.sum((seen / (2 * s)) ** 2) - seen @ (Vt @ step))
         if not unseen.any():
             return cost
         priced = weight * self.prices

@@ -160,8 +160,7 @@ class _Reduced:
                 return None
             top = starts[place]
             below = slice(top + 1, top + self.cones[place])
-            scale = -self.E[top, t]
-            found.append((-self.B[below] / scale, -self.r[below] / scale, float(price[t])))
+            found.append((-self.B[below], -self.r[below], float(price[t])))
         unbounded = [t for t in range(len(price)) if t not in cone_of and not self.E[: self.single, t].any()]
         if unbounded:
             return None
@@ -174,7 +173,7 @@ class _Reduced:
             tops = np.flatnonzero(self.E[start])
             inner = self.E[start + 1 : start + size]
             plain = len(tops) == 1 and not self.B[start].any() and self.r[start] == 0 and not inner.any()
-            if not plain or self.E[start, tops[0]] >= 0 or tops[0] in found:
+            if not plain or self.E[start, tops[0]] != -1 or tops[0] in found:
                 return None
             found[int(tops[0])] = place
         return found
@@ -182,16 +181,15 @@ class _Reduced:
     def _pair(self, t: int, rows: np.ndarray, price: Array, cone_of: dict[int, int], g: Array, found: list) -> bool:
         """Enter what two inequalities t >= u, t >= w make; False where they are something else."""
         E = self.E[rows]
-        scale = -E[:, t]
         others = np.delete(np.arange(E.shape[1]), t)
-        if len(rows) != 2 or (scale <= 0).any():
+        if len(rows) != 2 or (E[:, t] != -1).any():
             return False
         crossed = others[np.any(E[:, others] != 0, axis=0)]
-        u = self.B[rows] / scale[:, None]
-        c = self.r[rows] / scale
+        u = self.B[rows]
+        c = self.r[rows]
         if len(crossed):  # |s| of a norm s is s
             s = crossed[0]
-            factors = E[:, s] / scale
+            factors = E[:, s]
             alone = len(crossed) == 1 and s in cone_of and not u.any() and not c.any()
             if not alone or factors.max() != -factors.min():
                 return False

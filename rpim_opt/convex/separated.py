@@ -106,10 +106,10 @@ class Separated:
     @property
     def holds(self) -> bool:
         """Whether the sum is one that can be separated: its kinks over norms all at zero, and no slope falling."""
-        finite = np.all(np.isfinite(self.at_zero)) and np.all(np.asarray(self.at_zero) >= 0)
         if self.starts is None:
             return True
-        return bool(finite and all(np.all(of.c == 0) for _, of in self.rows.kinks))
+        rises = np.all(np.asarray(self.at_zero) >= 0)
+        return bool(rises and all(np.all(of.c == 0) for _, of in self.rows.kinks))
 
     def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
         """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""

@@ -259,7 +259,7 @@ def _multiple(e: Any) -> tuple[Any, Any] | None:
         return 1 / _number(e.args[1]), e.args[0]
     if kind == "multiply":
         for constant, other in (e.args, e.args[::-1]):
-            if constant.is_constant() and not other.is_constant():
+            if constant.is_constant():
                 return _number(constant), other
     return None
 

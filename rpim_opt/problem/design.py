@@ -328,11 +328,9 @@ def _filled(v: Array, count: int) -> Array:
     """min(1, mu v) with mu such that the sum is count."""
     order = np.argsort(-v)
     tail = np.cumsum(v[order][::-1])[::-1]
-    for k in range(count):  # k weights at 1
-        mu = (count - k) / tail[k]
-        if mu * v[order[k]] <= 1:
-            return np.minimum(1.0, mu * v)
-    return np.minimum(1.0, v / v[order[count - 1]])
+    ones = np.arange(count)  # that many weights at 1
+    mu = (count - ones) / tail[:count]
+    return np.minimum(1.0, mu[np.argmax(mu * v[order[:count]] <= 1)] * v)
 
 
 def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array, weights: Array, passes: int = 20) -> np.ndarray:

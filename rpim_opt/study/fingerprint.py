@@ -100,6 +100,8 @@ def _of_code(thing: Any, seen: Seen) -> Iterator[bytes]:
     known = _of_library(module)
     if isinstance(thing, FunctionType):  # what a script executes may say that it is of any module
         known = thing.__code__.co_filename.startswith(LIBRARIES)
+    elif isinstance(thing, ModuleType):  # one that a script loaded by its path is known by that alone
+        known = known and not _is_own(thing)
     if isinstance(thing, BuiltinFunctionType) or known:
         yield module.encode()
     elif isinstance(thing, ModuleType):
@@ -144,6 +146,12 @@ def _of_object(thing: Any, seen: Seen) -> Iterator[bytes]:
         yield from _parts(getattr(thing, "value", None), seen)
     else:
         yield from _parts(dict(getattr(thing, "__dict__", {})), seen)
+
+
+def _is_own(module: ModuleType) -> bool:
+    """Whether a module's file is none of a library's."""
+    file = getattr(module, "__file__", None)
+    return file is not None and not str(Path(file).resolve()).startswith(LIBRARIES)
 
 
 def _of_library(module: str) -> bool:

@@ -520,3 +520,44 @@ def test_an_objective_that_did_not_fall_for_long_is_taken_to_be_the_least() -> N
     assert not loop()._stalled(replace(still, history=tuple(passed[:10])))
     falling = [Iteration(100.0 + 1e-3 * k, 1.0, 1.0, 0.0) for k in range(12, 0, -1)]
     assert not loop()._stalled(replace(still, history=tuple(falling)))
+
+
+def test_a_start_outside_of_the_constraints_is_moved_inside_before_the_first_pass() -> None:
+    """Also where one parameter alone is outside."""
+    problem = ro.load("paper_arm").problem
+    tight = problem.with_parameters(problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5}))
+    free = tight.parameters.free
+    start = np.zeros(len(free))
+    start[3] = 7 * free.tolerance[3]
+    loop = Loop(tight.frozen(), ro.bounded, None, {}, 1e-8, 500)
+    x = free.scale * _begun(loop, ro.bounded, choosing(1.0, True), start).z
+    assert (np.abs(x) <= free.tolerance * (1 + 1e-9)).all()
+    assert x == pytest.approx(np.clip(start, -free.tolerance, free.tolerance))
+
+
+def test_many_refusals_end_where_little_was_promised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The seventh, of a step that promises less than a millionth of the objective; one that promises more goes on."""
+    best = ro.calibrate(PROBLEM, ro.tikhonov, 1.0)
+    start = state()
+    monkeypatch.setattr(
+        "rpim_opt.calibration.loop._merit",
+        lambda program, z, weight: _merit(program, z, weight) + 1e9 * (program is not here.program),
+    )
+
+    def at(z: np.ndarray, refused: int) -> State:
+        program = start.program.on(loop().linearized(z))
+        merit = _merit(program, z, 1.0)
+        return replace(start, z=z, program=program, merit=merit, refused=refused)
+
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=N)
+    close = at(best.z, 0)
+    rise = _merit(close.program, best.z + direction, 1.0) - close.merit
+    little = best.z + np.sqrt(1e-7 * close.merit / rise) * direction
+    for refused, outcome in ((4, ""), (5, ""), (6, "rest"), (7, "rest")):
+        here = at(little, refused)
+        found = loop().advanced(here)
+        assert found.outcome == outcome
+        assert found.refused == refused + 1
+    here = at(np.zeros(N), 7)
+    assert loop().advanced(here).outcome == ""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from rpim_opt.convex.conic import Conic, _Affine, _blocks, _Pattern
+from rpim_opt.convex.conic import ATTEMPTS, Conic, _Affine, _blocks, _Pattern
 
 N, K = 5, 4
 RNG = np.random.default_rng(8)
@@ -133,3 +133,16 @@ def test_an_objective_in_other_unknowns_has_its_value() -> None:
         for y in RNG.normal(size=(5, 6)):
             assert ours(y) == pytest.approx(theirs(y) - theirs(np.zeros(6)), rel=1e-9)
         assert (np.tril(upper, -1) == 0).all()
+
+
+@pytest.mark.parametrize("attempt", range(len(ATTEMPTS)))
+def test_what_is_added_has_its_value_in_whatever_units_it_is_solved(attempt: int) -> None:
+    """Variables that are not of u, of sizes from a thousandth to a thousand."""
+    v, slack = cp.Variable(N, name="v"), cp.Variable(N, name="slack")
+    size = np.geomspace(1e-3, 1e3, N)
+    bounds = [slack >= cp.multiply(size, v), slack >= -cp.multiply(size, v)]
+    program = Conic(cp.sum(slack), bounds, [v], None)
+    values = np.arange(N) - 1.5
+    found = program.solve(np.zeros((N, 0)), values, 0.0, np.empty((0, 0)), np.empty(0), attempt=attempt)
+    assert program.values(found, slack) == pytest.approx(size * np.abs(values), rel=1e-4)
+    assert program.values(found, v) == pytest.approx(values, rel=1e-12)

@@ -42,6 +42,10 @@ OTHERS: dict[str, Penalty] = {
     "Huber": lambda z: cp.sum(cp.huber(z, 1)),
     "three lines": lambda z: cp.sum(cp.maximum(z, -z, 2 * z - 1)),
     "entropy": lambda z: cp.sum(cp.kl_div(z + 1, 1)),
+    "largest eigenvalue": lambda z: cp.lambda_max(cp.diag(z)),
+    "log-sum-exp": cp.log_sum_exp,
+    "powers": lambda z: cp.sum(cp.power(cp.abs(z), 1.5)),
+    "in a half-space": lambda z: cp.norm1(z) + cp.transforms.indicator([z[0] >= -9]),
     "sorted": lambda z: cp.sum_largest(cp.abs(z), 2),
 }
 

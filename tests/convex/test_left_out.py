@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.left_out import Folds, solved, solved_again, without_say
+from rpim_opt.convex.left_out import Folds, _folds, solved, solved_again, without_say
 from rpim_opt.convex.newton_step import NewtonStep
 from rpim_opt.convex.select_held_out import _left_out_error, held_out_error
 from rpim_opt.problem.linear import LinearModel
@@ -135,3 +135,10 @@ def test_small_systems_are_solved_and_what_nothing_decides_is_zero() -> None:
     assert pytest.approx(np.linalg.solve(M, v[..., None])[..., 0], rel=1e-10) == found.T
     singular = np.diag([2.0, 0.0])[..., None]
     assert solved(singular, np.array([[4.0], [1.0]]))[:, 0].tolist() == [2.0, 0.0]
+
+
+def test_a_fold_stands_for_the_equations_that_it_has() -> None:
+    parts = [np.array([0, 5]), np.array([1]), np.arange(6, 12)]
+    program = ro.convex.pose(ro.tikhonov, MODEL)
+    counts = [len(without(program, part).b) for part in parts]
+    assert [fold.model.equations for fold in _folds(program, parts)] == counts

@@ -62,6 +62,16 @@ def test_the_first_squares_lie_nowhere_below_the_loss(name: str) -> None:
         assert value(Z + z) >= program.value(Z + z)[0] * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("size", [1e-2, 1e2])
+def test_steps_are_short_beside_residuals_of_any_size(size: float) -> None:
+    """Of sum v^4 as below, all residuals times a number."""
+    model = MODEL.scaled(np.full(len(MODEL.b), size))
+    made, _ = Squares(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)(model, Z)
+    r = model.A @ Z - model.b
+    expected = (model.A.T * 6 * r**2) @ model.A
+    assert pytest.approx(expected, rel=2e-3, abs=1e-6 * np.abs(expected).max()) == made.A.T @ made.A
+
+
 def test_with_short_steps_squares_have_the_curvature_of_the_loss() -> None:
     """Of sum v^4 over residuals: 12 v^2 along each, so that half the Hessian is A' diag(6 v^2) A."""
     quartic = Squares(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)

@@ -96,6 +96,22 @@ def test_the_gap_of_a_smooth_loss_vanishes_at_its_minimum_alone(name: str) -> No
     assert duality_gap(program, best.z * 1.01, 0.7) > 1e-4 * best.objective
 
 
+@pytest.mark.parametrize("name", ["huber", "log cosh"])
+@pytest.mark.parametrize(("low", "high"), [(-0.02, 0.03), (0.01, np.inf), (-np.inf, -0.01)])
+def test_the_gap_in_a_box_vanishes_at_its_minimum_alone(name: str, low: float, high: float) -> None:
+    """Components on bounds of either side count where they lead inwards, and not where they are held."""
+    sides = ro.constraints.Box("box", lambda p: (np.full(len(p), low), np.full(len(p), high)))
+    program = ro.convex.pose(replace(stated(name, "equation"), constraints=(sides,)), MODEL)
+    found = program.solve(1.0)
+    assert ((found.z == low) | (found.z == high)).any()
+    assert duality_gap(program, found.z, 1.0) <= 1e-8 * found.objective
+    middle = np.clip(0.5 * (max(low, -0.1) + min(high, 0.1)), low, high)
+    for share in (0.01, 0.3):
+        z = found.z + share * (middle - found.z)
+        missing = program.objective(z, 1.0) - found.objective
+        assert duality_gap(program, z, 1.0) >= missing * (1 - 1e-9)
+
+
 def test_a_slope_that_is_none_proves_nothing() -> None:
     """Of a sum of norms every vector within the unit ball is a slope at zero; others than the minimum's prove less."""
     few = model(condition=30.0)
@@ -194,6 +210,32 @@ def test_rows_have_the_value_slope_and_curvature_of_the_expression(name: str) ->
     assert rows.bend(v) == pytest.approx(bend, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("write", "bend"),
+    [
+        (lambda r: cp.sum(cp.power(r - 1, 4)), lambda v: 12 * (v - 1) ** 2),
+        (lambda r: cp.sum(cp.huber(2 * r + 0.5, 1.5)), lambda v: 8.0 * (np.abs(2 * v + 0.5) <= 1.5)),
+        (lambda r: cp.sum(cp.square(3 - r / 2)) + cp.sum(r), lambda v: 0.5 + 0 * v),
+    ],
+)
+def test_atoms_that_have_formulas_are_exact(write: Any, bend: Any) -> None:
+    """To rounding, where differences of slopes would be eight digits."""
+    r = cp.Variable(9)
+    rows = rows_of(write(r), r)
+    assert rows is not None
+    v = np.random.default_rng(3).normal(size=9)
+    assert rows.bend(v) == pytest.approx(bend(v), rel=1e-13)
+
+
+def test_the_larger_of_a_line_and_a_number_has_its_kink_where_they_meet() -> None:
+    r = cp.Variable(9)
+    rows = rows_of(cp.sum(cp.maximum(2 * r, 3.0)), r)
+    assert rows is not None
+    ((factor, (a, c)),) = rows.kinks
+    assert (factor * a, factor * c) == (pytest.approx(1.0), pytest.approx(-1.5))
+    assert len(rows.pieces) == 1
+
+
 NO_SUMS: dict[str, Any] = {
     "norms with a kink": lambda r: cp.sum(cp.norm(cp.vstack([r, 2 * r]), axis=0)),
     "of all": lambda r: cp.norm2(r) + cp.sum(cp.huber(r)),
@@ -269,7 +311,7 @@ def test_with_few_second_derivatives_the_minimum_is_the_same(
             patched.setattr(newton.Newton, "_hessian", counted.method())
             program = ro.convex.pose(formulation, MODEL)
             found = program.path(weights)
-            assert 1 <= counted.count <= 3 * len(weights)
+            assert 1 <= counted.count < len(weights)
         for one, other in zip(found, expected, strict=True):
             assert one.iterations > 0
             assert one.objective == pytest.approx(other.objective, rel=1e-9)

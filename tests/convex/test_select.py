@@ -14,6 +14,7 @@ import rpim_opt as ro
 from rpim_opt.convex.select import SELECTORS, disagreement
 from rpim_opt.convex.select_curve import _points, menger
 from rpim_opt.convex.select_held_out import _held_out, held_out_error
+from rpim_opt.convex.select_linear import _lowest
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
@@ -340,3 +341,12 @@ def test_frames_tell_nothing_of_how_large_deviations_are() -> None:
     shifted = m.with_values(m.b + m.A[:, frames] @ np.full(int(frames.sum()), 50.0))
     pair = [ro.reml(ro.convex.pose(ro.tikhonov, each)).weight for each in (m, shifted)]
     assert pair[0] == pytest.approx(pair[1], rel=1e-3)
+
+
+def test_the_lowest_valley_goes_before_an_edge_where_edges_say_little() -> None:
+    score = np.array([-9.0, 1.0, 0.5, 2.0, 0.1, 0.1, 3.0, -8.0])
+    assert _lowest(score, local=True) == 5  # the end of a flat one
+    assert _lowest(score, local=False) == 0
+    assert _lowest(score[::-1], local=True) == 3
+    assert _lowest(np.arange(5.0), local=True) == 0
+    assert _lowest(-np.arange(5.0), local=True) == 4

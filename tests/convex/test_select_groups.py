@@ -245,3 +245,14 @@ def test_a_mapping_asks_for_one_selector() -> None:
         rule_of({"a?": ro.reml, "d?": ro.k_fold})
     with pytest.raises(ro.InputError, match="50 configurations"):
         rule_of({"a?": partial(ro.k_fold, folds=60)})(Grouped.of(simulated(1, {}), KINDS))
+
+
+def test_a_frame_that_no_row_sees_takes_nothing_away() -> None:
+    model = simulated(1, {}, rows=60)
+    frames = np.flatnonzero(model.parameters.of_frames)
+    A = model.A.copy()
+    A[:, frames[0]] = 0.0
+    reduced = Grouped.of(replace(model, A=A), {"alpha? theta?": None, "a? d?": None}).robot()
+    assert np.isfinite(reduced.R).all()
+    assert reduced.equations == len(model.b) - np.linalg.matrix_rank(A[:, frames])
+    assert np.abs(A[:, frames].T @ model.b).max() > 0

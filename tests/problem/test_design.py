@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -93,3 +95,85 @@ def test_what_is_measured_already_counts() -> None:
     assert found.value == pytest.approx(np.trace(np.linalg.solve(information(found.chosen), C)), rel=1e-8)
     with pytest.raises(ro.InputError, match="criterion E"):
         choose(problem, q, 6, "E", measured=problem.data)
+
+
+FEW = (9, 4)
+"""Candidates, and how many of them: every set can be tried."""
+
+
+def small() -> tuple[ro.CalibrationProblem, np.ndarray]:
+    arm = ro.robot.Robot(
+        "two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]), limits=np.tile([-2.0, 2.0], (2, 1))
+    )
+    problem, _ = simulated(("theta2", "tool_x", "base_[xy]"), configurations=3, robot=arm, seed=8)
+    # directions that a design weighs, not ones that any three readings decide
+    there = problem.parameters.scaled({"tool_mm": 0.3, "base_mm": 0.3, "angle_mrad": 0.3})
+    data = ro.Dataset.of(problem.data.q, problem.data.blocks[0].y, 2e-4)
+    return ro.CalibrationProblem(arm, there, data), random_candidates(arm, FEW[0], 4)
+
+
+@pytest.mark.parametrize("criterion", "DAEV")
+def test_of_few_candidates_the_best_of_all_sets_is_between_the_found_one_and_the_bound(criterion: str) -> None:
+    """Found is within its own gap of what trying every set finds; a maximum for D and E, else a minimum."""
+    problem, q = small()
+    n = len(problem.parameters.free)
+    there = problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), 2e-4))
+    rows = there.linearize(np.zeros(n)).A.reshape(len(q), 3, n)
+    slopes = there.jacobian(np.zeros(n)).reshape(-1, n) * problem.parameters.free.scale
+    C = slopes.T @ slopes / len(q)
+
+    def value(chosen: tuple[int, ...]) -> float:
+        M = np.eye(n) + np.einsum("kin,kim->nm", rows[list(chosen)], rows[list(chosen)])
+        figures = {
+            "D": lambda: np.linalg.slogdet(M)[1],
+            "A": lambda: np.trace(np.linalg.inv(M)),
+            "E": lambda: np.linalg.eigvalsh(M)[0],
+            "V": lambda: np.trace(np.linalg.solve(M, C)),
+        }
+        return float(figures[criterion]())
+
+    sets = list(combinations(range(FEW[0]), FEW[1]))
+    values = np.array([value(chosen) for chosen in sets])
+    found = choose(problem, q, FEW[1], criterion)
+    assert found.value == pytest.approx(value(tuple(found.chosen)), rel=1e-9)
+    if criterion in "DE":
+        assert found.value <= values.max() * (1 + 1e-9)
+        assert values.max() <= found.bound * (1 + 1e-9)
+    else:
+        assert found.value >= values.min() * (1 - 1e-9)
+        assert values.min() >= found.bound * (1 - 1e-9)
+    assert found.value == pytest.approx({True: values.max(), False: values.min()}[criterion in "DE"], rel=1e-6)
+
+
+def test_what_cannot_be_designed_is_said() -> None:
+    problem, q = small()
+    for count in (0, len(q)):
+        with pytest.raises(ro.InputError, match=r"accepted: 1 to 8, fewer than the candidates"):
+            choose(problem, q, count)
+    with pytest.raises(ro.InputError, match="a joint without limits"):
+        random_candidates(ro.robot.Robot("free", problem.robot.mdh), 3)
+    with pytest.raises(ro.InputError, match=r"no column for 'q2', accepted: q2_rad or .* or q2_deg"):
+        read_candidates({"q1_deg": [1.0]}, problem.robot)
+    two = ro.load("distance").problem
+    with pytest.raises(ro.InputError, match="'distance' between two points"):
+        choose(two, random_candidates(two.robot, 5), 2)
+
+
+def test_poses_are_designed_with_their_orientations() -> None:
+    """A candidate counts six equations, not three: the information is that of poses."""
+    problem = ro.load("pose").problem
+    q = random_candidates(problem.robot, 12, 5)
+    found = choose(problem, q, 6, "D")
+    y = np.tile([0.0, 0, 0, 1, 0, 0, 0], (6, 1))
+    kind = problem.data.blocks[0].measurement
+    covariance = np.median(problem.data.blocks[0].covariance, axis=0)
+    chosen = problem.on(ro.Dataset.of(q[found.chosen], y, covariance, measurement=kind))
+    A = chosen.linearize(np.zeros(len(problem.parameters.free))).A
+    assert len(A) == 36
+    assert found.value == pytest.approx(np.linalg.slogdet(np.eye(A.shape[1]) + A.T @ A)[1], rel=1e-8)
+
+
+def test_a_bound_that_says_nothing_is_said() -> None:
+    """One row of many unknowns: what the best set would reach is not known within a factor of two."""
+    found = ro.problem.Design(np.array([1]), np.ones(3), "V", 3.0, 1.0, 2.0)
+    assert str(found).endswith("too few for a useful bound on how near the best set is; choose more.")

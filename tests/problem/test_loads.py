@@ -9,6 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.problem.loads import bearing, repeatable
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
@@ -164,3 +165,26 @@ def test_a_distances_second_point_may_come_from_another_side() -> None:
         approach = data.blocks[0].approach
         assert approach is not None
         assert approach[:, 1].tolist() == second
+
+
+def test_what_rows_bear_is_theirs() -> None:
+    problem = ro.load("position").problem
+    data = problem.data.take(np.arange(4))
+    torque = np.arange(24.0).reshape(4, 6)
+    found = bearing(data, problem.data, torque, payload=2.5, columns={"heat": 20.0}).blocks[0]
+    assert found.torque is not None
+    assert np.array_equal(found.torque, torque[:, None])
+    assert found.payload is not None
+    assert found.payload.tolist() == [2.5] * 4
+    assert found.columns["heat"].tolist() == [20.0] * 4
+    assert found.approach is None
+    bare = bearing(data, problem.data).blocks[0]
+    assert bare.torque is None
+    assert bare.payload is None
+
+
+def test_rows_that_read_the_same_thing_again_have_the_same_joints() -> None:
+    """Of measurements between two points those of both; nothing else where the model sees no column."""
+    for name in ("position", "distance"):
+        block = ro.load(name).problem.data.blocks[0]
+        assert np.array_equal(repeatable(block), block.q.reshape(len(block.q), -1))

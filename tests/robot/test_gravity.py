@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.deflection import STANDARD
+from rpim_opt.robot.deflection import STANDARD, moment_slopes
 from rpim_opt.robot.family import _draws
+from rpim_opt.robot.gravity import MOUNTINGS
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM
@@ -342,3 +343,35 @@ def test_a_urdf_without_masses_leaves_the_guess_and_a_wrong_mass_is_named(tmp_pa
             ro.read_urdf(path, base="base", tip="tip")
     path.write_text(text.replace('value="0.5"', 'value="?"'))  # of a finger, beside the chain
     assert ro.read_urdf(path, base="base", tip="tip").robot.gravity.masses == pytest.approx((4.0, 4.0, 2.25))
+
+
+def test_mountings_are_where_gravity_points_in_the_base_frame() -> None:
+    assert MOUNTINGS == {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("direction", [(1.0, 2.0), ("a", 0, 0), (np.nan, 0, 1), (0.0, 0.0, 0.0), 3.0])
+def test_a_direction_that_is_none_is_refused(direction: object) -> None:
+    with pytest.raises(ro.InputError, match=r"three finite numbers|a vector that points somewhere"):
+        ro.robot.Gravity(direction)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("link", [1, 2, 3, 4])
+def test_slopes_by_first_moments_are_differences_of_torques(link: int) -> None:
+    """Of a link's mass that is moved along an axis of its frame; nothing before it feels it, nothing that slides."""
+    types = ("revolute", "revolute", "prismatic", "revolute")
+    mdh = np.random.default_rng(3).uniform(-1, 1, (4, 5))
+    q = np.random.default_rng(4).uniform(-1, 1, (6, 4))
+    tilted = (0.6, 0.0, -0.8)
+    masses = tuple(2.0 * (k == link) for k in range(1, 5))
+    slopes = moment_slopes(ro.robot.Robot("arm", mdh, types, gravity=ro.robot.Gravity(tilted)), q)
+    assert not slopes[:, link:, link - 1].any()
+    assert not slopes[:, 2].any()
+
+    def torques(centre: np.ndarray) -> np.ndarray:
+        centres = tuple(tuple((centre * (k == link)).tolist()) for k in range(1, 5))
+        gravity = ro.robot.Gravity(tilted, masses, centres)
+        return ro.robot.gravity_torques(ro.robot.Robot("arm", mdh, types, gravity=gravity), q)
+
+    for axis in range(3):
+        moved = torques(np.eye(3)[axis]) - torques(np.zeros(3))
+        assert moved == pytest.approx(STANDARD * 2.0 * slopes[:, :, link - 1, axis], abs=1e-12)

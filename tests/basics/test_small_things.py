@@ -1,0 +1,85 @@
+"""Tables of notebooks, files that grow, optima at ends, and quantities that are stated twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.basics.inputs import read_bytes
+from rpim_opt.basics.late import Late
+from rpim_opt.basics.scalar import least
+from rpim_opt.basics.shown import LONGEST, as_html, shortened
+from rpim_opt.robot.plain import write_robot
+from tests.simulate import ARM
+
+
+def test_a_table_has_no_column_without_a_value_and_blanks_where_one_lacks() -> None:
+    rows = [{"name": "a", "std": None, "note": None}, {"name": "b", "std": 0.123456789, "note": None}]
+    html = as_html(rows, [], "Table")
+    assert "note" not in html
+    assert html.count("<td") == 2
+    assert "0.123457" in html
+    assert "None" not in html
+    empty = as_html([], ["Nothing was found."], "Table")
+    assert "Nothing was found." in empty
+    assert "<td" not in empty
+
+
+def test_a_long_title_is_cut() -> None:
+    assert shortened("x" * LONGEST) == "x" * LONGEST
+    cut = shortened("x" * LONGEST + "y")
+    assert len(cut) == LONGEST
+    assert cut.endswith("x...")
+
+
+def test_a_file_that_states_no_size_is_read_no_further_than_it_may_be() -> None:
+    endless = Path("/proc/self/status")  # of zero bytes, says the system
+    if not endless.is_file():
+        pytest.skip("no such files on this system")
+    with pytest.raises(ro.InputError, match="more than 10 bytes"):
+        read_bytes(endless, 10)
+    assert read_bytes(endless)
+
+
+def test_a_module_that_waits_has_no_private_names() -> None:
+    """What inspect and doctest ask every module for does not import it."""
+    late = Late("a_module_that_is_nowhere")
+    assert not hasattr(late, "__wrapped__")
+    with pytest.raises(ModuleNotFoundError):
+        late.anything  # noqa: B018
+
+
+def test_a_minimum_that_is_never_near_enough_ends() -> None:
+    """Of a function without any shape, at an accuracy that numbers do not have."""
+    asked: list[float] = []
+
+    def flat(x: float) -> float:
+        asked.append(x)
+        return 1.0
+
+    x, value = least(flat, 1.0, 2.0, 0.0)
+    assert 1.0 <= x <= 2.0
+    assert value == 1.0
+    assert len(asked) < 200
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("theta_deg", "theta_rad = 0.1\ntheta_deg", "the same quantity twice, accepted: one of them"),
+        ('type = "revolute"', 'type = "revolute"\nlimits_deg = [10, -10]', "[lower, upper]"),
+        ('type = "revolute"', 'type = "revolute"\nlimits_deg = [10]', "[lower, upper]"),
+    ],
+)
+def test_a_robot_whose_joints_say_two_things(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "robot.toml"
+    write_robot(ARM, path)
+    text = path.read_text()
+    if old not in text:
+        text = text.replace("[[joint]]\n", f"[[joint]]\n{old}{' = 0.0' if '=' not in old else ''}\n", 1)
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ro.InputError) as error:
+        ro.read_robot(path)
+    assert said in str(error.value)

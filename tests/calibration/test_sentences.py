@@ -1,0 +1,228 @@
+"""What is said of a requirement, of what is left, of what was learned: every case has its words, and only its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.calibration import learned_words
+from rpim_opt.calibration.acceptance import Acceptance, _wide
+from rpim_opt.calibration.alike import Alike, alike
+from rpim_opt.calibration.certificate import Certificate, certified
+from rpim_opt.calibration.checked import Checked
+from rpim_opt.calibration.intervals import checked as interval
+from rpim_opt.calibration.lack_of_fit import LackOfFit
+from rpim_opt.calibration.learned import Learned, LeftOut, Size, Trial
+from rpim_opt.calibration.left_over import Effect
+from rpim_opt.calibration.reaching import Share, share
+from rpim_opt.data.requirement import Requirement
+
+LIMIT = Requirement(1e-4)
+
+
+# --- acceptance ----------------------------------------------------------------------------------------------------
+
+
+def test_an_acceptance_says_what_it_rests_on() -> None:
+    bare = Acceptance(LIMIT, "undecided", ("Lacking: rows.",))
+    assert bare.sentences() == [
+        "Cannot be decided: limit 0.1 mm with 95 % at every configuration of the region.",
+        "Region: joints within the measured ranges.",
+        "Lacking: rows.",
+    ]
+    assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "scatter", "box")] == [None] * 4
+    free = Acceptance(LIMIT, "undecided", (), 500, np.inf, 5e-5, 2e-5)
+    assert "The position reached" not in str(free)
+    assert free.content()["bound_mm"] is None
+    assert free.content()["typical_mm"] == pytest.approx(0.05)
+    seen = Checked(3, 8e-5, (), 4, (), 0.9)
+    whole = Acceptance(LIMIT, "accepted", (), 500, 9e-5, 5e-5, 2e-5, checked=seen)
+    assert whole.sentences()[2:] == [
+        "The position reached is within 0.090 mm of the predicted one even at the worst of 500 configurations and a "
+        "search from there; 0.050 mm in the middle.",
+        "Kept apart: 4 rows, 3 of them in the region, the largest error there 0.080 mm as the instrument reads it; "
+        "90 % of the coordinates lie in their 95 % intervals.",
+    ]
+
+
+def test_rows_that_were_kept_apart_may_say_little() -> None:
+    none = Checked(0, 0.0, (), 4, (), None)
+    assert none.sentence() == "None of the 4 rows that were kept apart is in the region."
+    unknown = Checked(2, 1e-4, (), 4, (), None)
+    assert unknown.sentence().endswith("0.100 mm as the instrument reads it.")
+
+
+def test_a_bound_above_the_limit_says_what_would_lower_it() -> None:
+    assert _wide(1e-4, 1e-4, Share(5e-5, 1e-5)) == []
+    (open_directions,) = _wide(1e-4, np.inf, Share(5e-5, 1e-5))
+    assert "directions that neither data nor penalty decide" in open_directions
+    (scatter,) = _wide(1e-4, 3e-4, Share(2e-4, 1e-5))
+    assert scatter.startswith("Lacking: a better known scatter.")
+    (more,) = _wide(1e-4, 3e-4, Share(5e-5, 1e-5))
+    assert more.startswith("Lacking: measurements. The bound is 0.300 mm")
+
+
+def test_a_share_of_scatter_that_is_not_known_is_zero() -> None:
+    """Of a calibration whose noise's level stands for it."""
+    problem = ro.load("paper_arm").problem
+    region: Any = SimpleNamespace(marker="")
+    found = share(ro.calibrate(problem, ro.tikhonov, 1.0), region, problem.data.q[0], 0.95)
+    assert found == Share(0.0, 0.0)
+
+
+# --- what is left --------------------------------------------------------------------------------------------------
+
+PLAIN = {"configurations": 60, "equations": 180, "spare": 150.0, "dimension": "length"}
+
+LACKING = {"missing": ("gravity",), "parameters": ("compliance?",)}
+
+
+def left(rms: float, **more: Any) -> LackOfFit:
+    return LackOfFit(**PLAIN, left=rms, **more)
+
+
+LEFT: dict[str, tuple[LackOfFit, str, str]] = {
+    "none spare": (LackOfFit(3, 9, 1.0, "length", 1e-4), "1 equation is left over", "would differ"),
+    "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 equations are left over", "would differ"),
+    "effects": (
+        left(1e-4, instrument=1e-4, present={"gravity": Effect(30.0, None), "first harmonic": Effect(9.0, 2e-5)}),
+        "gravity (-2 ln L falls by 30). Joints turn unevenly (eccentric encoders or gears): 0.02 mm",
+        "imitate (-2 ln L falls by 30)",
+    ),
+    "alike": (left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0)), "Similar configurations err alike", "More reach"),
+    "alike even then": (
+        left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0), narrow=(2, 3), **LACKING),
+        "Even then similar configurations err alike (correlation 0.50, z = 9): the model lacks an effect, which more "
+        "readings will not average away. More reach would help to find it: of joints 2 and 3",
+        "Similar",
+    ),
+    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "So much is no robot's scatter", "limit"),
+    "does not repeat": (
+        left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-3),
+        "this is repeatability, backlash or drift", "Repeat five",
+    ),
+    "repeats better": (
+        left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-4, excess=9e-4),
+        "The robot, not the instrument, is the limit.", "this is repeatability",
+    ),
+    "never repeated": (left(1e-3, instrument=1e-4, position=1e-3), "Repeat five configurations", "backlash"),
+    "below the noise": (left(1e-6, instrument=1e-4), "far below the declared noise", "only a better one"),
+    "up": (left(1e-4, instrument=1e-4, upward=(2,)), "Joint 2 seems to bend upwards", "Joints"),
+    "both up": (left(1e-4, instrument=1e-4, upward=(2, 3)), "Joints 2 and 3 seem to bend upwards", "Joint 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", LEFT)
+def test_what_is_left_is_said(what: str) -> None:
+    found, said, unsaid = LEFT[what]
+    assert said in str(found)
+    assert unsaid not in str(found)
+    content = found.content()
+    assert content["text"] == found.sentences()
+    assert content["left_mm"] == pytest.approx(1e3 * found.left)
+    if found.repeated is None:
+        assert content["repeated_mm"] is None
+    else:
+        assert content["repeated_mm"] == pytest.approx(1e3 * found.repeated)
+    assert [each["rms_mm"] for each in content["present"].values()] == [
+        None if effect.rms is None else pytest.approx(1e3 * effect.rms) for effect in found.present.values()
+    ]
+
+
+def test_errors_without_any_size_are_not_alike() -> None:
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(60, 3))
+    kinds = np.zeros(60, dtype=int)
+    assert alike(q, np.zeros((60, 2)), kinds) is None
+    assert alike(q, np.ones((60, 1)), kinds) is None  # dealt out, they are the same
+    smooth = alike(q, np.sin(q), kinds)
+    assert smooth is not None
+    assert smooth.z > 5
+    noise = alike(q, rng.normal(size=(60, 2)), kinds)
+    assert noise is not None
+    assert abs(noise.z) < 4
+
+
+# --- what was learned ----------------------------------------------------------------------------------------------
+
+
+def learned(sizes: Mapping[str, Size] | None = None, noise: Mapping[str, Size] | None = None, **more: Any) -> Learned:
+    stated: dict[str, Any] = {
+        "local": np.ones(2), "trials": (), "value": 0.0, "freedom": 10.0, "left_out": (),
+        "covariance": np.eye(1), "stated": np.ones(2), "drift": np.zeros((2, 1)), **more,
+    }  # fmt: skip
+    return Learned(sizes or {}, noise or {}, **stated)
+
+
+def said(found: Learned) -> list[str]:
+    return learned_words.sentences(found, ("theta2", "d3"), np.zeros(2))
+
+
+def test_what_was_learned_is_said_and_nothing_else() -> None:
+    assert said(learned()) == []
+    assert learned().families == ()
+    assert learned().gain("gravity") is None
+    sized = learned({"geometry": Size(2.0, 0.1)}, {"position": Size(5e-5, 0.1)})
+    assert said(sized) == [
+        "Learned from the data: deviations are 2 times as large as expected (1.8 to 2.2).",
+        "Beside the instrument's noise the robot scatters by " + said(sized)[1].partition("scatters by ")[2],
+    ]
+
+
+def test_parts_of_the_scatter_that_are_not_worth_a_word() -> None:
+    """Beside the largest; a size that is hardly known has an upper end."""
+    only = said(learned(noise={"position": Size(1e-3, 0.1), "joint": Size(1e-6, 0.1)}))
+    assert len(only) == 1
+    assert "joint" not in only[0]
+    assert "mm" in only[0]
+    vague = said(learned(noise={"position": Size(1e-3, 0.6)}))[0]
+    assert "at most 1.8 mm" in vague
+
+
+def test_families_are_compared_with_the_best_model_without_them() -> None:
+    trials = (Trial(("gravity",), 10.0), Trial((), 40.0), Trial(("gravity", "moments"), 12.0))
+    found = learned(trials=trials)
+    assert found.families == ("gravity",)
+    assert found.gain("gravity") == 30.0
+    assert found.gain("moments") == -2.0
+    assert found.gain("compliance") is None
+    assert said(found) == ["Model: geometry with gravity (-2 ln L falls by gravity 30)."]
+    alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
+    assert said(alone) == ["Model: geometry alone; no family is worth its parameters."]
+
+
+@pytest.mark.parametrize(("count", "more"), [(1, ""), (5, ""), (7, " and 2 more")])
+def test_blunders_are_named_and_the_others_counted(count: int, more: str) -> None:
+    (text,) = said(learned(left_out=tuple(LeftOut(f"r{k}", 9.0) for k in range(count))))
+    assert text.startswith("Left out as blunders: r0 (9 times the median error)")
+    assert text.endswith(f"median error){more}.")
+    assert text.count("times") == min(count, 5)
+
+
+# --- certificates --------------------------------------------------------------------------------------------------
+
+
+def test_a_program_that_cannot_be_solved_again_certifies_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = ro.load("paper_arm").problem
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    model = problem.linearize(result.x)
+
+    def fails(self: Any, weight: float) -> Any:
+        raise ro.NoSolutionFound("own", weight, "solver_error")
+
+    assert certified(ro.tikhonov, model, 1.0, result.z, 1.0).holds(result.z)
+    monkeypatch.setattr("rpim_opt.convex.program.Program.proven", fails)
+    found = certified(ro.tikhonov, model, 1.0, result.z, 1.0)
+    assert found.decrease is None
+    assert not found.holds(result.z)
+    assert found == Certificate(found.gradient, float("inf"), 0.0, None)
+
+
+def test_an_interval_is_one_of_those_that_are_known() -> None:
+    with pytest.raises(ro.InputError, match="of: found 'sigma', accepted: "):
+        interval("sigma")

@@ -1,0 +1,105 @@
+"""Priors, drawings and functions that say nothing or contradict themselves: one sentence that names what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.convex.combination import combination
+from rpim_opt.convex.prior import Prior, family_of
+from tests.convex.test_formulation import model
+
+MODEL = model()
+
+
+def posed(**functions: Any) -> ro.convex.Program:
+    stated = {"loss": cp.sum_squares, "penalty": cp.sum_squares, **functions}
+    return ro.convex.pose(ro.Formulation("own", **stated), MODEL)
+
+
+def drawn(text: str, **identify: Any) -> ro.calibration.Calibration:
+    problem = ro.load("paper_arm").problem
+    if identify:
+        problem = problem.with_parameters(problem.parameters.identify(identify["identify"]))
+    stated = ro.Formulation("drawn", penalty=cp.sum_squares, constraints=ro.constraints.parse(text))
+    return ro.calibrate(problem, stated, 1.0)
+
+
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "a statement that is a number": (lambda: combination(3), "prior: found 3"),  # type: ignore[arg-type]
+    "a value beside a text that has one": (
+        lambda: Prior.known("a2 = 0.1 +- 0.1 mm", value=1.0), "a value or sd besides, accepted: the text alone"
+    ),
+    "a value that is none": (lambda: Prior.known("a2 - a3", value=np.nan, sd=1.0), "value nan, accepted: a finite"),
+    "no deviation": (lambda: Prior.known("a2 - a3", value=0.0, sd=0.0), "sd 0.0, accepted: a standard deviation"),
+    "a mean of nothing": (lambda: Prior.gaussian({}, sd=1.0), "no parameter, accepted: mean="),
+    "a mean that is none": (lambda: Prior.gaussian({"a2_mm": np.inf}, sd=1.0), "a mean that is not finite"),
+    "a mean without a unit": (lambda: Prior.gaussian({"a2": 1.0}, sd=1.0), "key a2: found no unit, accepted: a2_mm"),
+    "too many deviations": (lambda: Prior.gaussian({"a2_mm": 1.0}, sd=[1.0, 2.0]), "sd of shape (2,)"),
+    "a deviation of zero": (lambda: Prior.gaussian({"a2_mm": 1.0}, sd=0.0), "an sd that is not above zero"),
+    "a covariance with nothing on its diagonal": (
+        lambda: Prior.gaussian({"a2_mm": 1.0, "a3_mm": 1.0}, [[1.0, 0.0], [0.0, 0.0]]), "not positive definite"
+    ),
+    "groups of nothing": (lambda: Prior(groups=((),)), "names or patterns of parameters"),
+    "two centres": (lambda: Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 2.0}), "'d5_mm' as 1 and 2"),
+    "places in a list": (
+        lambda: ro.constraints.parse("move at most 2 mm: home", [0]), "places as list"  # type: ignore[arg-type]
+    ),
+    "two relations of a size": (lambda: ro.constraints.parse("1 mm <= |a3| <= 2 mm"), "one relation after"),
+    "a pattern that nothing identified fits": (
+        lambda: drawn("|d? - nominal| <= 1 mm", identify=["a?"]), "found 'd?', accepted: identified parameters"
+    ),
+    "constraints that are a number": (lambda: posed(constraints=3), "constraints: found a int, accepted: functions"),
+    "a loss that is a text": (lambda: posed(loss=lambda r: "small"), "a str, accepted: a convex scalar expression"),
+    "a loss without a return": (lambda: posed(loss=lambda r: None), "is a 'return' missing?"),
+    "a constraint of two concave sides": (
+        lambda: posed(constraints=lambda z, p: cp.sqrt(cp.norm(z)) <= 1).solve(1.0), "a program that is not convex"
+    ),
+    "a constraint with the sides exchanged": (
+        lambda: posed(constraints=lambda z, p: cp.sum_squares(z) >= 1).solve(1.0), "whose sides are"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_meant_is_named(what: str) -> None:
+    make, said = REFUSED[what]
+    with pytest.raises(ro.InputError) as error:
+        make()
+    assert said in str(error.value)
+
+
+def test_the_innermost_part_that_breaks_the_rules_is_named() -> None:
+    with pytest.raises(ro.InputError, match="CVXPY cannot tell that it is convex") as error:
+        posed(constraints=lambda z, p: 1 + cp.sqrt(cp.sum_squares(z)) <= 2).solve(1.0)
+    assert "1 +" not in str(error.value)
+
+
+def test_a_prior_and_something_else_are_no_prior() -> None:
+    with pytest.raises(TypeError):
+        Prior() & 3  # type: ignore[operator]
+    assert Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 1.0}) == Prior(centre={"d5_mm": 1.0})
+
+
+def test_a_parameter_of_no_family_is_its_own() -> None:
+    assert family_of("_anchor") == "_anchor"
+
+
+def test_a_statement_without_a_unit_is_in_si() -> None:
+    bare = ro.constraints.parse("a3 = a4")
+    assert bare.unit == ("SI", 1.0)
+    assert bare.step == pytest.approx(0.01)
+    near = ro.constraints.parse("|a3 - a4| <= 2 mm")
+    assert near.unit == ("mm", 1e-3)
+    assert near.step == pytest.approx(2e-4)
+
+
+def test_one_constraint_may_stand_alone() -> None:
+    alone = ro.Formulation("own", constraints=ro.constraints.at_nominal(["a3"]))
+    assert alone.constraints == ro.Formulation("own", constraints=[ro.constraints.at_nominal(["a3"])]).constraints
+    assert "1 constraint" in repr(alone)

@@ -1,0 +1,247 @@
+"""Raw tables whose names, sheets, units or rows are odd: understood as meant, or one sentence says what not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pandas as pd
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.basics.grids import text_grid
+from rpim_opt.basics.layouts import Layout
+from rpim_opt.data.models import pose, position
+from rpim_opt.data.several import together
+from rpim_opt.data.spelling import parse_units
+from rpim_opt.data.understanding import Understood, understand
+
+ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+ROWS = "P1,1,2,401,5,6\nP2,3,4,402,6,7\n"
+HEAD = "Point,J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm]\n"
+
+
+def write(folder: Path, text: str | bytes, name: str = "raw.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def read(path: Path, joints: Any = (), robot: Any = ARM, kind: Any = position, **asked: Any) -> Understood:
+    layout = {name: asked.pop(name) for name in list(asked) if name in ("sheet", "separator", "decimal", "encoding")}
+    return understand(path, robot, kind, ro.data.Asked(Layout(**layout), **asked), joints)
+
+
+def book(folder: Path) -> Path:
+    made = openpyxl.Workbook()
+    empty = made.active
+    assert empty is not None
+    empty.title = "notes"
+    sheet = made.create_sheet("points")
+    for row in (HEAD + ROWS).splitlines():
+        sheet.append([*row.split(","), "", None])
+    path = folder / "raw.xlsx"
+    made.save(path)
+    return path
+
+
+REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
+    "a sign that is two": (HEAD + ROWS, {"separator": "::"}, "--separator: found '::'"),
+    "a decimal mark": (HEAD + ROWS, {"decimal": "'"}, "a comma or a point"),
+    "a decimal mark that numbers do not have": (
+        HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the mark that the numbers have"
+    ),
+    "nothing": ("\n\n", {}, "an empty file"),
+    "a sheet of a text": (HEAD + ROWS, {"sheet": "1"}, "an Excel workbook"),
+    "angles that no file has": (HEAD + ROWS, {"rotation": "euler"}, "--rotation: found 'euler'"),
+    "no row with values": (HEAD + "P1,1,2,-,-,-\nP2,-,-,3,4,5\n", {}, "no row with values"),
+    "a quote that does not end": (HEAD + 'P1,1,2,3,4,"5\nP2,1,2,3,4,5\n', {}, "line "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_one_sentence_names_what_is_wrong(tmp_path: Path, what: str) -> None:
+    text, asked, said = REFUSED[what]
+    with pytest.raises(ro.InputError) as error:
+        read(write(tmp_path, text), **asked)
+    assert said in str(error.value)
+
+
+def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match=r"found 'raw\.pdf', accepted: a name ending in .*\.parquet"):
+        read(write(tmp_path, HEAD + ROWS, "raw.pdf"))
+
+
+def test_the_first_sheet_with_cells_is_read_and_another_one_by_name_or_number(tmp_path: Path) -> None:
+    path = book(tmp_path)
+    found = read(path)
+    assert "sheet 'points' of notes, points: the first with cells" in found.notes[0]
+    for sheet in ("points", "2"):
+        assert dict(read(path, sheet=sheet).columns) == dict(found.columns)
+    with pytest.raises(ro.InputError, match=r"found 'poinst', accepted: .*points"):
+        read(path, sheet="poinst")
+    with pytest.raises(ro.InputError, match="an empty file"):
+        read(path, sheet="notes")
+
+
+def test_a_workbook_that_is_none_is_one_sentence(tmp_path: Path) -> None:
+    path = write(tmp_path, b"PK\x05\x06" + bytes(18), "raw.xlsx")
+    with pytest.raises(ro.InputError, match="a readable Excel workbook"):
+        read(path)
+
+
+def test_parquet_says_what_the_text_says(tmp_path: Path) -> None:
+    text = read(write(tmp_path, HEAD + ROWS))
+    names, *rows = [line.split(",") for line in (HEAD + ROWS).splitlines()]
+    pd.DataFrame(rows, columns=names).to_parquet(tmp_path / "raw.parquet")
+    found = read(tmp_path / "raw.parquet")
+    assert {name: [str(cell) for cell in cells] for name, cells in found.columns.items()} == dict(text.columns)
+
+
+def test_blank_cells_at_the_end_of_a_row_are_none(tmp_path: Path) -> None:
+    found = read(write(tmp_path, HEAD + ROWS.replace("6\n", "6,,\n")), separator=",")
+    assert dict(found.columns) == dict(read(write(tmp_path, HEAD + ROWS)).columns)
+
+
+def test_many_lines_between_rows_are_counted_beyond_those_that_are_shown(tmp_path: Path) -> None:
+    between = "".join(f"P{i},{i},2,40{i},5,6\npause {i},,,,,\n" for i in range(1, 10))
+    found = read(write(tmp_path, HEAD + between + "P10,1,2,3,4,5\n"))
+    assert len(found.columns["label"]) == 10
+    assert any(note.endswith("more lines are no rows of the table: left out.") for note in found.notes)
+
+
+@pytest.mark.parametrize("name", ["u(x)", "u x", "u_x"])
+def test_a_small_u_is_a_standard_uncertainty(tmp_path: Path, name: str) -> None:
+    head = HEAD.strip() + f",{name} [mm]\n"
+    found = read(write(tmp_path, head + ROWS.replace("6\n", "6,0.1\n").replace("7\n", "7,0.1\n")))
+    assert found.columns["sigma_x_mm"] == ["0.1", "0.1"]
+
+
+def test_a_path_that_names_the_robots_own_joint_is_that_joint(tmp_path: Path) -> None:
+    text = "t,/j/elbow/position,/j/foot/position,x_mm,y_mm,z_mm\n" + ROWS.replace("P1", "1").replace("P2", "2")
+    found = read(write(tmp_path, text), joints=("foot", "elbow"), units={"angle": "deg"})
+    assert found.columns["q2_deg"] == ["1", "3"]
+    assert found.columns["q1_deg"] == ["2", "4"]
+
+
+NAMED = "name0,name1,position0,position1,x_mm,y_mm,z_mm\n"
+
+
+def test_columns_of_joints_names_say_the_order(tmp_path: Path) -> None:
+    path = write(tmp_path, NAMED + "elbow,foot,1,2,401,5,6\nelbow,foot,3,4,402,6,7\n")
+    found = read(path, joints=("foot", "elbow"), units={"angle": "deg"})
+    assert found.columns["q2_deg"] == ["1", "3"]
+    assert found.columns["q1_deg"] == ["2", "4"]
+
+
+def test_a_joint_of_another_robot_is_no_joint_of_this_one(tmp_path: Path) -> None:
+    text = NAMED.replace("name1,", "name1,name2,").replace("position1,", "position1,position2,")
+    path = write(tmp_path, text + "foot,gripper,elbow,1,9,2,401,5,6\nfoot,gripper,elbow,3,9,4,402,6,7\n")
+    found = read(path, joints=("foot", "elbow"), units={"angle": "deg"})
+    assert found.columns["q1_deg"] == ["1", "3"]
+    assert found.columns["q2_deg"] == ["2", "4"]
+
+
+@pytest.mark.parametrize(
+    ("cells", "joints", "said"),
+    [
+        (
+            "elbow,foot,1,2,401,5,6\nfoot,elbow,3,4,402,6,7\n",
+            ("foot", "elbow"),
+            "2 names, accepted: one joint a column",
+        ),
+        ("elbow,foot,1,2,401,5,6\nelbow,foot,3,4,402,6,7\n", (), "a robot from a URDF, which names its joints"),
+    ],
+)
+def test_names_of_joints_that_change_or_that_nobody_knows(tmp_path: Path, cells: str, joints: Any, said: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        read(write(tmp_path, NAMED + cells), joints=joints, units={"angle": "deg"})
+    assert said in str(error.value)
+
+
+def test_q0_to_q3_are_a_quaternion_where_other_columns_are_all_joints(tmp_path: Path) -> None:
+    """And joints where no others are there."""
+    text = "Point,J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm],Q0,Q1,Q2,Q3\nP1,1,2,401,5,6,1,0,0,0\nP2,3,4,402,6,7,1,0,0,0\n"
+    found = read(write(tmp_path, text), kind=pose)
+    assert [found.columns[name] for name in ("qw", "qx", "q1_deg")] == [["1", "1"], ["0", "0"], ["1", "3"]]
+    four = ro.robot.Robot("four", np.array([[0, 0.1, 0, 0, 0]] * 4))
+    text = "Point,Q0 [deg],Q1 [deg],Q2 [deg],Q3 [deg],X [mm],Y [mm],Z [mm]\nP1,1,2,3,4,401,5,6\n"
+    found = read(write(tmp_path, text), robot=four)
+    assert [found.columns[f"q{i}_deg"] for i in range(1, 5)] == [["1"], ["2"], ["3"], ["4"]]
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [("cm", "10"), ("in", "25.4")])
+def test_units_of_others_are_lengths_and_are_converted(tmp_path: Path, unit: str, millimetres: str) -> None:
+    assert parse_units(unit) == {"length": unit}
+    text = HEAD.replace("[mm]", f"[{unit}]")
+    found = read(write(tmp_path, text + "P1,1,2,1,5,6\n"))
+    assert float(found.columns["x_mm"][0]) == pytest.approx(float(millimetres))
+
+
+def test_two_bytes_and_fewer_than_four_are_read_as_text(tmp_path: Path) -> None:
+    assert text_grid(write(tmp_path, b"a,b")).rows == [["a", "b"]]
+    assert text_grid(write(tmp_path, "x,y\n1,2\n".encode("utf-16"))).rows == [["x", "y"], ["1", "2"]]
+
+
+JOINTS = "name,J1 [deg],J2 [deg]\na,1,2\nb,3,4\n"
+VALUES = "name,X [mm],Y [mm],Z [mm]\nb,402,6,7\na,401,5,6\n"
+
+
+def two(folder: Path, joints: str = JOINTS, values: str = VALUES) -> list[Understood]:
+    return [read(write(folder, joints, "joints.csv")), read(write(folder, values, "values.csv"))]
+
+
+def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
+    found = together(two(tmp_path), ARM, position)
+    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([402, 401])
+    assert list(found.columns["q1_deg"]) == ["3", "1"]
+    by_row = together(two(tmp_path), ARM, position, "row")
+    assert list(by_row.columns["q1_deg"]) == ["1", "3"]
+
+
+@pytest.mark.parametrize(
+    ("joints", "values", "key", "said"),
+    [
+        (JOINTS, VALUES + "c,1,2,3\n", "row", "2 rows of joints and 3 measured, accepted: as many of both"),
+        (JOINTS.replace("b,3", "a,3"), VALUES, "", "'a' twice in"),
+        (JOINTS, VALUES, "time", "found 'time'"),
+        (JOINTS.replace("name", "one"), VALUES.replace("name", "other"), "", "no column in both"),
+    ],
+)
+def test_tables_that_cannot_be_joined(tmp_path: Path, joints: str, values: str, key: str, said: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        together(two(tmp_path, joints, values), ARM, position, key)
+    assert said in str(error.value)
+
+
+def test_the_column_of_the_times_may_have_any_name(tmp_path: Path) -> None:
+    joints = "stamp,J1 [deg],J2 [deg]\n0.0,1,2\n1.0,3,4\n"
+    values = "stamp,X [mm],Y [mm],Z [mm]\n1.001,402,6,7\n"
+    found = together(two(tmp_path, joints, values), ARM, position, "stamp", within=0.01)
+    assert list(found.columns["q1_deg"]) == ["3"]
+    for key, said in (("clock", "no column 'clock'"), ("", "no column of times")):
+        with pytest.raises(ro.InputError, match=said):
+            together(two(tmp_path, JOINTS, VALUES), ARM, position, key, within=0.01)
+
+
+def test_files_of_one_name_are_told_apart_by_their_numbers(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    tables = [read(write(tmp_path, HEAD + ROWS)), read(write(tmp_path / "other", HEAD + ROWS))]
+    assert list(together(tables, ARM, position).columns["label"]) == ["1:P1", "1:P2", "2:P1", "2:P2"]
+
+
+def test_files_below_each_other_are_in_the_units_of_the_first(tmp_path: Path) -> None:
+    other = HEAD.replace("[mm]", "[m]") + "P3,5,6,0.4,0.005,0.006\n"
+    tables = [read(write(tmp_path, HEAD + ROWS)), read(write(tmp_path, other, "later.csv"))]
+    assert float(together(tables, ARM, position).columns["x_mm"][2]) == pytest.approx(400)
+    lacking = read(write(tmp_path, "Point,J1 [deg],X [mm],Y [mm],Z [mm]\nP4,1,2,3,4\n", "lacking.csv"))
+    with pytest.raises(ro.InputError, match=r"q2 in one of raw\.csv and lacking\.csv alone"):
+        together([tables[0], lacking], ARM, position)
+
+
+def test_a_table_without_columns_and_one_whose_names_are_no_texts() -> None:
+    for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: texts as names")):
+        with pytest.raises(ro.InputError, match=said):
+            ro.read_data(table, ARM, {"position_mm": 0.1})

@@ -1,0 +1,155 @@
+"""How badly points fit a robot when base and reflectors are placed anew: known motions come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.misfit import (
+    FEWEST_ROWS,
+    Points,
+    _registered,
+    _weights,
+    lever_arms,
+    misfit,
+    misfits,
+    placed,
+    points_of,
+)
+from tests.simulate import ARM
+
+TOOLS = np.array([[0.05, -0.02, 0.1], [-0.04, 0.06, 0.08]])
+BASE = np.eye(4)
+BASE[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 2.0]).as_matrix()
+BASE[:3, 3] = [1.0, -2.0, 0.4]
+
+
+def measured(count: int = 24, moved: float = 0.0, seed: int = 0) -> Points:
+    """Return points of two reflectors that an instrument sees exactly; they are stated at most `moved` away [m]."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(-2, 2, (count, 6))
+    marker = np.arange(count) % 2
+    flange = BASE @ ro.robot.forward_kinematics(ARM, q)
+    y = np.einsum("nij,nj->ni", flange[:, :3, :3], TOOLS[marker]) + flange[:, :3, 3]
+    return Points(q, y, marker, TOOLS + moved * rng.uniform(-1, 1, (2, 3)), None, np.arange(count))
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.003])
+def test_base_and_reflectors_come_back(moved: float) -> None:
+    points = measured(moved=moved)
+    found = placed(ARM, points)
+    assert found.error.max() < 1e-4 * (moved > 0) + 1e-9
+    assert found.base == pytest.approx(BASE, abs=1e-4 * (moved > 0) + 1e-9)
+    assert found.tools == pytest.approx(TOOLS, abs=1e-4 * (moved > 0) + 1e-9)
+    assert found.modelled == pytest.approx(points.y, abs=1e-4)
+
+
+def test_blunders_stand_out_and_move_nothing() -> None:
+    points = measured(40)
+    y = points.y.copy()
+    y[[4, 17, 30]] += [0.3, -0.4, 0.2]
+    found = placed(ARM, replace(points, y=y))
+    far = np.linalg.norm([0.3, -0.4, 0.2])
+    assert found.error[[4, 17, 30]] == pytest.approx(far, abs=1e-3)
+    assert np.delete(found.error, [4, 17, 30]).max() < 1e-3
+    assert misfit(ARM, replace(points, y=y)) < 1e-3
+
+
+def test_the_misfit_is_of_the_best_three_quarters_over_the_extent() -> None:
+    points = measured(30)
+    noisy = replace(points, y=points.y + 1e-3 * np.random.default_rng(2).normal(size=(30, 3)))
+    error = np.sort(placed(ARM, noisy).error)[: int(np.ceil(0.75 * 30))]
+    extent = np.linalg.norm(np.std(noisy.y, axis=0))
+    assert misfit(ARM, noisy) == pytest.approx(np.sqrt(np.mean(error**2)) / extent, rel=1e-9)
+
+
+def test_many_readings_are_judged_as_each_alone() -> None:
+    """Whatever their sizes, and whatever stands beside them."""
+    rng = np.random.default_rng(3)
+    tries = [measured(count, seed=k) for k, count in enumerate([24, 30, 24, 12, 30])]
+    tries = [replace(each, y=each.y + 1e-2 * rng.normal(size=each.y.shape)) for each in tries]
+    assert misfits(ARM, tries) == pytest.approx([misfit(ARM, each) for each in tries], rel=1e-6)
+
+
+def test_orientations_count_with_their_median_angle() -> None:
+    problem = ro.load("pose").problem
+    points = points_of(problem)
+    assert points is not None
+    assert points.turns is not None
+    alone = misfit(problem.robot, replace(points, turns=None))
+    turned = misfit(problem.robot, points)
+    angle = np.sqrt(turned**2 - alone**2)
+    assert 0 < angle < 0.05  # of a robot as drawn
+    back = replace(points, turns=np.swapaxes(points.turns, 1, 2))
+    assert misfit(problem.robot, back) > 0.5
+
+
+def test_only_poses_of_one_reflector_have_orientations() -> None:
+    has = {}
+    for name in ("pose", "position", "markers", "mixed"):
+        points = points_of(ro.load(name).problem)
+        assert points is not None
+        has[name] = points.turns is not None
+        assert points.y.shape == (len(points.row), 3)
+    assert has == {"pose": True, "position": False, "markers": False, "mixed": False}
+    assert points_of(ro.load("distance").problem) is None
+
+
+def test_a_few_rows_are_too_few_and_many_are_taken_evenly() -> None:
+    problem = ro.load("position").problem
+    few = [problem.on(problem.data.take(np.arange(count))) for count in (FEWEST_ROWS - 1, FEWEST_ROWS)]
+    assert points_of(few[0]) is None
+    enough = points_of(few[1])
+    assert enough is not None
+    assert enough.row.tolist() == list(range(FEWEST_ROWS))
+    some = points_of(problem, most=14)
+    assert some is not None
+    assert some.row.tolist() == [3 * k for k in range(14)]
+    assert some.y == pytest.approx(problem.data.blocks[0].y[::3])
+
+
+def test_motions_of_many_sets_are_those_of_each() -> None:
+    rng = np.random.default_rng(5)
+    source, weights = rng.normal(size=(4, 9, 3)), rng.uniform(0.1, 1, (4, 9))
+    turns = Rotation.random(4, rng=rng).as_matrix()
+    target = np.einsum("bij,bnj->bni", turns, source) + rng.normal(size=(4, 1, 3))
+    noisy = target + 0.1 * rng.normal(size=target.shape)
+    assert _registered(source, target, weights)[:, :3, :3] == pytest.approx(turns, abs=1e-12)
+    for T, p, y, w in zip(_registered(source, noisy, weights), source, noisy, weights, strict=True):
+        about, to = np.average(p, axis=0, weights=w), np.average(y, axis=0, weights=w)
+        best = Rotation.align_vectors(y - to, p - about, w)[0].as_matrix()
+        assert T[:3, :3] == pytest.approx(best, abs=1e-9)
+        assert T[:3, 3] == pytest.approx(to - best @ about, abs=1e-9)
+    flat = source * [1, 1, 0]  # in a plane a reflection fits as well: it is none that is returned
+    assert np.linalg.det(_registered(flat, noisy, weights)[:, :3, :3]) == pytest.approx(np.ones(4))
+
+
+def test_rows_beyond_three_medians_lose_their_weight() -> None:
+    error = np.array([[1.0, 1.0, 2.0, 3.0, 6.0]])
+    assert _weights(error) == pytest.approx(np.array([[1.0, 1.0, 1.0, 1.0, 1.0]]))
+    assert _weights(error * [1, 1, 1, 4, 5]) == pytest.approx(np.array([[1.0, 1.0, 1.0, 0.5, 0.2]]))
+    assert (_weights(np.zeros((1, 4))) == 1).all()
+
+
+def test_arms_are_how_far_a_joint_moves_a_point() -> None:
+    """Of an arm in a plane: distances from the axes."""
+    flat = ro.robot.Robot("flat", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
+    found = lever_arms(flat, np.array([[0.3, 0.0], [0.0, np.pi / 2]]), np.array([0.3, 0.0, 0.1]))
+    assert found == pytest.approx(np.array([[0.7, 0.3], [0.5, 0.3]]), rel=1e-6)
+
+
+def test_directions_that_only_rounding_sees_have_no_rank() -> None:
+    def of(A: Array) -> LinearModel:
+        model = ro.load("position").problem.linearize(np.zeros(34))
+        return LinearModel(A, np.ones(len(A)), np.arange(len(A)), model.parameters)
+
+    rows = np.random.default_rng(6).normal(size=(8, 2))
+    tiny = np.column_stack([rows[:, 0], rows[:, 0] + 1e-15 * rows[:, 1]])
+    assert [of(rows).rank, of(tiny).rank] == [2, 1]
+    assert of(1e-9 * rows).rank == 2

@@ -1,0 +1,98 @@
+"""What is said of touches, rows and units before a calibration, and where there is nothing to say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.problem.contact import contact_sentences
+from rpim_opt.problem.inspection import _angle_units
+from rpim_opt.problem.suspects import moved_far, rounded_joints, shared_rows
+from tests.simulate import ARM, simulated
+
+
+def sockets(names: tuple[str, ...], stated: bool = False) -> ro.CalibrationProblem:
+    """Return touches of some sockets of a plate, with or without what the drawing knows of them."""
+    problem = ro.load("contact").problem
+    data = problem.data
+    kept = [
+        label
+        for block in data.blocks
+        if block.measurement.touching and block.point is not None
+        for label, (point,) in zip(np.array(data.label)[block.row], block.point, strict=True)
+        if point in names
+    ]
+    ties = [data.label[i] for block in data.blocks if not block.measurement.touching for i in block.row]
+    return problem.without(set(data.label) - set(kept) - (set(ties) if stated else set()))
+
+
+def test_the_scale_that_touches_show_is_said() -> None:
+    many = " ".join(contact_sentences(sockets(("A", "B", "C", "D"))))
+    assert "24 touches of 4 points" in many
+    assert "a known distance between two of them ([[known_distance]]) would show how large the robot is." in many
+    single = list(contact_sentences(sockets(("A",))))
+    assert single[1] == "All that was touched is in one place: the robot's scale is that of the drawing."
+    planes = " ".join(contact_sentences(ro.load("datum_cube").problem))
+    assert " planes: " in planes
+    assert " points" not in planes.partition(":")[0]
+    assert list(contact_sentences(ro.load("position").problem)) == []
+    assert ro.load("position").problem.touched == ()
+
+
+def test_rows_of_the_validation_set_that_are_copies_are_named() -> None:
+    data = simulated(("theta2",), 12)[0].data
+    copied = replace(data.take(np.array([2, 5])), label=("3", "again"))
+    (said,) = shared_rows(data, copied)
+    assert said.startswith("2 of 2 rows of the validation set are identification rows as well: 3, again (6).")
+    assert list(shared_rows(data, None)) == []
+    assert list(shared_rows(data, simulated(("theta2",), 12, seed=3)[0].data)) == []
+
+
+def test_where_no_points_are_measured_nothing_is_suspected() -> None:
+    distance = ro.load("distance").problem
+    assert list(rounded_joints(distance, 1e-3)) == []
+    assert list(moved_far(distance)) == []
+    few = simulated(("theta2",), 8)[0]
+    assert list(moved_far(few)) == []
+
+
+def test_rounded_joints_are_named_where_that_explains_the_fit() -> None:
+    problem, _ = simulated(("theta2",), 30)
+    q = np.radians(np.degrees(problem.data.q).round(1))
+    rounded = problem.on(ro.Dataset.of(q, problem.data.blocks[0].y, 5e-5))
+    assert list(rounded_joints(rounded, 10.0)) == []  # metres are not explained by tenths of a degree
+    made = [size for size in np.geomspace(1e-5, 1e-1, 60) if list(rounded_joints(rounded, float(size)))]
+    assert made
+    assert 1e-4 < np.median(made) < 3e-3
+    assert list(rounded_joints(problem, float(np.median(made)))) == []
+
+
+def test_sliding_joints_have_no_degrees() -> None:
+    gantry = ro.robot.Robot("gantry", np.zeros((2, 5)), ("prismatic", "prismatic"))
+    assert list(_angle_units(gantry, np.array([[100.0, 3.0]]))) == []
+    assert list(_angle_units(ARM, np.full((2, 6), 100.0))) == ["joints reach 5730 deg: degrees given as radians?"]
+    assert list(_angle_units(ARM, np.full((2, 6), 0.01))) == ["no joint leaves 6.3 deg: radians given as degrees?"]
+
+
+def test_readings_of_one_configuration_are_said_to_agree() -> None:
+    problem, _ = simulated(("theta2", "tool_x", "base_*"), 12)
+    y = problem.data.blocks[0].y
+    q = problem.data.q
+    again = ro.Dataset.of(np.vstack([q, q[:2]]), np.vstack([y, y[:2] + 1e-4]), 5e-5)
+    said = str(ro.problem.inspect(problem.on(again)))
+    assert "Measured more than once in the same configuration, repeatable to " in said
+    assert "1, 13" in said
+    assert "more than once" not in str(ro.problem.inspect(problem))
+
+
+def test_machines_of_several_robots_have_no_positions() -> None:
+    left, right = (simulated(("theta2", "tool_x"), 8, seed=seed)[0] for seed in (1, 2))
+    both = ro.together(left=left, right=right, shared=("tool_x",))
+    near = ro.Formulation(
+        "near", penalty=ro.tikhonov.penalty, constraints=ro.constraints.parse("move at most 5 mm: workspace")
+    )
+    with pytest.raises(ro.InputError, match="several robots in one problem"):
+        ro.calibrate(both, near, 1.0)

@@ -1,0 +1,186 @@
+"""What a comparison says of its rows, in words, as a page and as a figure, and what it is asked on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.study.computing import computed
+from rpim_opt.study.grid import files_of, load_study
+from rpim_opt.study.page import lead
+from rpim_opt.study.replicate import UNCONVERGED
+from rpim_opt.study.report import Report, write
+from rpim_opt.study.sources import sources
+from rpim_opt.study.splits import splits_of
+from rpim_opt.study.standing import number
+from tests import ROOT
+from tests.study.test_comparison import POSITION, rows_of
+
+Errors = dict[str, dict[str, float | None]]
+SIX = [f"p{k}" for k in range(6)]
+
+
+def compared(errors: Errors, **changed: Any) -> ro.study.Comparison:
+    """Return a comparison of given errors, of which some rows may be changed."""
+    return ro.study.Comparison(tuple({**row, **changed} for row in rows_of(errors)), ("rms_mm",))
+
+
+def even(size: float) -> dict[str, float | None]:
+    return dict.fromkeys(SIX, size)
+
+
+def test_a_better_method_is_named_with_its_interval() -> None:
+    found = compared({"a": even(1.0), "b": even(0.5)})
+    said = lead(found.summary())
+    assert (
+        said == "b has the lowest rms_mm: 0.500 times that of a in the geometric mean (95 % interval 0.500 to 0.500)."
+    )
+
+
+def test_a_difference_that_may_be_chance_is_said_to_be_none() -> None:
+    sizes = [0.2, 5.0, 0.3, 2.0, 0.4, 1.0]
+    found = compared({"a": even(1.0), "b": dict(zip(SIX, sizes, strict=True))})
+    assert lead(found.summary()).endswith("That is no difference that these replicates can tell from none.")
+
+
+def test_without_intervals_none_is_said() -> None:
+    found = compared({"a": {"p": 1.0}, "b": {"p": 0.5}})
+    assert "interval" not in lead(found.summary())
+    assert any("There are no intervals" in note for note in found.summary().notes)
+    alone = compared({"a": {"p": 1.0}}).summary()
+    assert not any("There are no intervals" in note for note in alone.notes)
+    assert lead(alone) == "No method is better than a in the geometric mean of rms_mm."
+
+
+def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
+    broken = compared({"a": {"p": None}})
+    assert str(broken) == repr(broken) == "Comparison: 1 method on 1 problem, 1 replicates (1 failed)"
+    assert broken._repr_html_() is None
+    some = compared({"a": {"p": 1.0}, "b": {"p": None}})
+    assert str(some).startswith(f"{some!r}\n\n")
+    for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no figures")):
+        with pytest.raises(ro.InputError, match=said):
+            some.summary(against=against)
+    with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: rms_mm"):
+        some.summary("max_mm")
+
+
+def test_replicates_that_did_not_converge_are_counted() -> None:
+    found = compared({"a": even(1.0), "b": even(0.5)}, status=UNCONVERGED, reason="")
+    assert "12 replicates did not converge; their figures count (column status)." in found.summary().notes
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, ""), (0.0123, "0.0123"), (1.0, "1.00"), (1234.5, "1234"), (2e5, "2e+05"), (1e-5, "1e-05")],
+)
+def test_figures_have_the_digits_that_matter(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_path: Path) -> None:
+    some = {**even(0.5), "p4": None, "p5": None}
+    found = compared({"a": even(1.0), "b": even(50.0), "c": some})
+    page = found.report(tmp_path / "out").read_text(encoding="utf-8")
+    assert "3 methods on 6 problems" in page
+    assert "p4, p5" in page
+    assert '<td class="none">-</td>' in page
+    assert '<td class="shade5">50.0</td>' in page  # five times the best and more
+    all_of_them = compared({"a": even(1.0), "b": even(0.5) | dict.fromkeys(SIX)}).report(tmp_path / "all")
+    assert "<td>all</td>" in all_of_them.read_text(encoding="utf-8")
+
+
+def test_ratios_beyond_the_figure_are_arrows_at_its_edge() -> None:
+    far = compared({"a": even(1.0), "b": even(1e4), "c": even(1e-4)})
+    near = compared({"a": even(1.0), "b": even(2.0), "c": even(0.5)})
+    arrows = [
+        sorted((line.get_marker(), float(line.get_xdata()[0])) for line in each.plot().axes[0].lines
+               if line.get_marker() in "<>")
+        for each in (far, near)
+    ]  # fmt: skip
+    assert arrows == [[("<", pytest.approx(1 / 30)), (">", pytest.approx(30))], []]
+
+
+def test_of_many_methods_the_best_have_a_profile_of_their_own() -> None:
+    found = compared({f"m{k}": even(1.0 + 0.1 * k) for k in range(9)})
+    axes = found.plot().axes[1]
+    assert axes.get_title() == "performance profiles (the best 6; grey: 3 others)"
+    few = compared({f"m{k}": even(1.0 + 0.1 * k) for k in range(3)})
+    assert few.plot().axes[1].get_title() == "performance profiles"
+    lost = compared({"a": even(1.0), "b": dict.fromkeys(SIX)})
+    assert [text.get_text() for text in lost.plot().axes[0].get_yticklabels()] == ["a"]
+
+
+# --- what it is asked on -------------------------------------------------------------------------------------------
+
+
+def test_problems_come_as_a_pair_or_as_a_file() -> None:
+    pair = (POSITION.problem, POSITION.validation)
+    (alone,) = sources(pair)
+    assert (alone.label, alone.made(0).problem) == ("problem", POSITION.problem)
+    (file,) = sources(ROOT / "problems" / "position" / "problem.toml")
+    assert file.label == "position"
+
+
+def test_what_is_no_problem_is_said(tmp_path: Path) -> None:
+    for given, said in (([], "problems: found none"), (tmp_path, "no problem.toml in")):
+        with pytest.raises(ro.InputError, match=said):
+            sources(given)
+    (family,) = sources({"mine": lambda seed: seed})
+    with pytest.raises(ro.InputError, match=r"problem mine: found a function of a seed that returns no problem \(7\)"):
+        family.made(7)
+
+
+def test_folds_need_as_many_configurations() -> None:
+    (five,) = splits_of([5])
+    data = POSITION.problem.data
+    few = data.take(np.flatnonzero(data.configuration < 4))
+    with pytest.raises(ro.InputError, match="splits: found 4 configurations, accepted: at least 5 for 5 folds"):
+        five.held(few, 1, 0)
+    with pytest.raises(ro.InputError, match=r"splits: found \[\]"):
+        splits_of([])
+
+
+def test_a_scheduler_is_an_address_or_a_client() -> None:
+    with pytest.raises(ro.InputError, match="scheduler: found a int, accepted: the address of a Dask scheduler"):
+        list(computed([("a", dict)], 1, 3))
+
+
+def test_a_study_follows_from_the_files_that_it_imports(tmp_path: Path) -> None:
+    """Whatever way they are imported, and however they import each other; no others of its folder."""
+    (tmp_path / "parts").mkdir()
+    texts = {
+        "mine.py": "import helper\nfrom parts import first\ndef run():\n    import late\n",
+        "helper.py": "import mine, numpy\n",
+        "late.py": "",
+        "parts/__init__.py": "",
+        "parts/first.py": "x = (",
+        "other.py": "",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    found = {str(file.relative_to(tmp_path)) for file in files_of(tmp_path / "mine.py")}
+    assert found == set(texts) - {"other.py"}
+    with pytest.raises(ro.InputError, match="a Python file"):
+        load_study(tmp_path / "study.txt")
+
+
+def test_figures_of_a_study_stand_beside_its_text(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figures = []
+    for _ in range(2):
+        figure = Figure(figsize=(2, 1))
+        figure.subplots().plot([0, 1])
+        figures.append(figure)
+    for folder, figure in zip(("one", "two"), figures, strict=True):
+        write(tmp_path / folder, "Why?", Report("Because.", {"n": 1}, {"curve": figure}), "", {})
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == [
+        "README.md", "curve.png", "curve.svg", "metrics.json",
+    ]  # fmt: skip
+    assert "![curve](curve.svg)" in (tmp_path / "one" / "README.md").read_text()
+    assert (tmp_path / "one" / "curve.svg").read_bytes() == (tmp_path / "two" / "curve.svg").read_bytes()

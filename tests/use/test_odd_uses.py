@@ -1,0 +1,258 @@
+"""Results that are asked for what they cannot do, and verdicts in words for whatever came out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.problem.parts import PartitionedProblem
+from rpim_opt.problem.scatter import Scatter
+from rpim_opt.use.changes import Cause
+from rpim_opt.use.cusum import since
+from rpim_opt.use.drifts import Drift
+from rpim_opt.use.export import _require_different, export_ur_calibration, export_urdf
+from rpim_opt.use.targets import read_targets
+from rpim_opt.use.validation import read_measurements
+from tests.simulate import ARM, simulated
+
+
+@cache
+def calibrated(formulation: str = "tikhonov") -> ro.calibration.Calibration:
+    problem, _ = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 20, 5e-5, 3)
+    return ro.calibrate(problem, formulation, 1.0)
+
+
+def checks(count: int = 8, moved: float = 0.0) -> ro.Dataset:
+    """Return readings of the robot as calibrated, with one joint moved by an angle [rad]."""
+    result = calibrated()
+    q = np.random.default_rng(7).uniform(-2, 2, (count, 6))
+    x = result.x.copy()
+    x[result.problem.parameters.free.names.index("theta2")] += moved
+    empty = ro.Dataset.of(q, np.zeros((count, 3)), 5e-5)
+    return ro.Dataset.of(q, result.problem.on(empty).modelled(x)[0], 5e-5)
+
+
+@cache
+def updated() -> Any:
+    return ro.use.update(calibrated(), checks())
+
+
+@cache
+def monitored() -> Any:
+    return ro.use.monitor(calibrated(), checks())
+
+
+READING = Cause("c1", "reading", ("c1",), 40.0, 1e-9, 0.9)
+JOINT = Cause("theta2", "joint offset", ("theta2",), 50.0, 1e-9, 0.6)
+RIVAL = Cause("theta3", "joint offset", ("theta3",), 45.0, 1e-8, 0.4)
+
+
+def unlikely(fit: Any) -> Any:
+    return fit._replace(squares=1e4, probability=1e-12)
+
+
+def test_an_update_says_what_came_out() -> None:
+    found = updated()
+    assert str(found).startswith("The robot has not changed, as far as 8 readings can tell: chi-squared")
+    assert found.explained
+    lost = replace(found, before=unlikely(found.before), after=unlikely(found.after), changes=())
+    assert "8 readings miss the last calibration by more than it allows" in str(lost)
+    assert "No few changes of parameters, frames or readings explain the rest: is it the same robot?" in str(lost)
+    wrong = replace(found, before=unlikely(found.before), changes=(READING,), causes=(READING,))
+    assert str(wrong).startswith("The robot has not changed, but readings are wrong: ")
+    assert "reading c1: chi-squared falls by 40.0, belief 0.9, left out." in str(wrong)
+    assert not wrong.changed
+    moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
+    assert str(moved).startswith("The robot has changed: ")
+    assert "These readings do not tell it apart from a change of theta3: measure more." in str(moved)
+    assert "left out" not in str(moved)
+    sure = replace(moved, causes=(JOINT,))
+    assert "do not tell it apart" not in str(sure)
+
+
+@pytest.mark.parametrize(
+    ("drift", "said"),
+    [
+        (None, "No parameter and no frame explains it alone."),
+        (Drift(JOINT, 0, True, 1e-3, 1e-4, "angle"), "theta2, +0.0573 deg (standard deviation 0.0057), steadily from"),
+        (Drift(JOINT, 0, False, 1e-3, 1e-4, "angle"), "before the first check"),
+        (Drift(JOINT, 3, False, None, None, "angle"), "theta2, at once before '4'"),
+    ],
+)
+def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
+    quiet = monitored()
+    assert str(quiet).startswith("No drift in 8 checks.")
+    sums = np.array([0.0, 0.0, 1.0, 2.0, 9e9, 9e9, 9e9, 9e9])
+    found = replace(quiet, sums=sums, drift=drift)
+    lines = str(found).splitlines()
+    assert lines[0] == "The robot is not where its calibration says, in 8 checks."
+    assert lines[1] == "What checks miss adds up: alarm at '5', since '3'."
+    assert said in lines[2]
+    assert found.content()["since"] == "3"
+    only = replace(quiet, sigmas=quiet.sigmas + 100.0 * (np.arange(8) == 5), drift=drift)
+    assert "Beyond the interval of a new reading: '6', " in str(only)
+    assert "adds up" not in str(only)
+    assert only.content()["alarm"] is None
+    moved = found.content()["moved"]
+    assert (moved is None) == (drift is None)
+    if drift is not None and drift.change is None:
+        assert moved["moved"] is None
+
+
+def test_sums_that_never_were_zero_began_at_the_first_check() -> None:
+    assert since(np.array([1.0, 2.0, 5.0]), 2) == 0
+
+
+def test_two_checks_show_no_course() -> None:
+    """A change at once is all that two can show; nothing is found where nothing moved."""
+    found = ro.use.monitor(calibrated(), checks(2))
+    assert found.drift is None
+    moved = ro.use.monitor(calibrated(), checks(2, 0.02))
+    assert moved.drifts
+    assert moved.drift is None or not moved.drift.steady
+
+
+def test_what_a_formulation_cannot_do_is_said() -> None:
+    with pytest.raises(ro.InputError, match="monitor: found formulation 'lasso'"):
+        ro.use.monitor(calibrated("lasso"), checks())
+
+
+def test_compensation_knows_no_spread_where_the_formulation_has_none() -> None:
+    """A tool that is known exactly, with and without a covariance: the same corrections, intervals for one alone."""
+    tool = [0.0, 0.0, 0.1, 0.0, 0.0, 0.0]
+    q = checks().q
+    found = {name: ro.use.compensate(calibrated(name), q=q, tool=tool) for name in ("tikhonov", "lasso")}
+    assert np.isfinite(found["tikhonov"].position_before).all()
+    assert np.isfinite(found["lasso"].position_before).all()
+    with pytest.raises(ro.InputError, match="robot: found 'left'"):
+        ro.use.compensate(calibrated(), q=q, robot="left")
+    with pytest.raises(ro.InputError, match="a payload that bends nothing"):
+        ro.use.compensate(calibrated(), q=q, payload=3.0)
+
+
+def test_scatter_is_at_the_robot_that_was_found() -> None:
+    result = calibrated()
+    scattered = replace(result, problem=replace(result.problem, scatter=Scatter(1e-4, 0.0, 0.0)))
+    found = ro.use.compensate(scattered, q=checks().q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    plain = ro.use.compensate(result, q=checks().q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    assert np.allclose(found.q, plain.q, atol=1e-12)
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+Q = {f"q{i}_deg": [0.0, 5.0] for i in range(1, 7)}
+PLACES = {"x_mm": [1.0, 2.0], "y_mm": [1.0, 2.0], "z_mm": [1.0, 2.0]}
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({**Q, **PLACES, "marker": ["A", "B"]}, "several reflectors, accepted: targets of one"),
+        ({**Q, **PLACES} | {f"approach{i}": [1, -1] for i in range(1, 7)}, "none: joints are in the middle"),
+    ],
+)
+def test_targets_that_are_none(table: dict[str, Any], said: str) -> None:
+    with pytest.raises(ro.InputError) as error:
+        read_targets(table, calibrated().robot)
+    assert said in str(error.value)
+
+
+def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match="measurement: found 'pose'"):
+        read_measurements(calibrated(), {**Q, **PLACES}, "pose")
+    pose = ro.load("pose")
+    path = tmp_path / "raw.csv"
+    head = [*(f"J{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "Q0", "Q1", "Q2", "Q3"]
+    path.write_text(",".join(head) + "\n" + ",".join(["1"] * 9 + ["1", "0", "0", "0"]) + "\n")
+    with pytest.raises(
+        ro.InputError, match="a quaternion whose components are numbered, accepted: names qw, qx, qy, qz"
+    ):
+        read_measurements(pose.calibrate(weight=1.0), path)
+
+
+APPROACHES = {"Pose": ["P1", "P1"], "X [mm]": [0.0, 1.0], "Y [mm]": [0.0, 0.0], "Z [mm]": [0.0, 0.0]}
+
+
+def test_approaches_with_other_columns() -> None:
+    found = ro.use.read_approaches({**APPROACHES, "RMS": [1.0, 2.0], "Operator": ["a", "b"], "dX": [0.1, 0.2]})
+    assert 1e3 * found.repeatability == pytest.approx(0.5)  # both are as far from their middle
+    assert found.content()["accuracy_mm"] is None
+    assert found.content()["poses"][0]["AP_p_mm"] is None
+    assert "AP_p" not in str(found)
+    for table, said in (
+        ({**APPROACHES, "Measured X [mm]": [0.0, 0.0]}, "'X [mm]' and 'Measured X [mm]'"),
+        ({name: cells for name, cells in APPROACHES.items() if name != "Pose"}, "the header"),
+        ({name: cells for name, cells in APPROACHES.items() if name != "Z [mm]"}, "the header"),
+    ):
+        with pytest.raises(ro.InputError) as error:
+            ro.use.read_approaches(table)
+        assert said in str(error.value)
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+def test_files_of_controllers_are_for_robots_that_have_them(tmp_path: Path) -> None:
+    problem, _ = simulated(("theta[23]",), 5, robot=ro.robot.Robot("bent", np.add(ARM.mdh, [0.1, 0, 0, 0, 0])))
+    with pytest.raises(
+        ro.InputError, match="alpha1 or a1 that are not zero, accepted: a ready robot of Universal Robots"
+    ):
+        export_ur_calibration(ro.calibrate(problem, weight=1.0), tmp_path / "none.conf", tmp_path / "out.conf")
+    with pytest.raises(ro.InputError, match=r"none\.urdf"):
+        export_urdf(calibrated(), tmp_path / "none.urdf", tmp_path / "out.urdf")
+
+
+def test_what_no_file_holds_is_named_and_counted() -> None:
+    problem, _ = simulated(("ecc?*", "compliance?"), 40)
+    result = ro.calibrate(problem, weight=1.0)
+    with pytest.raises(ro.InputError, match=r"and \d+ more, accepted: MDH parameters"):
+        ro.use.identified(replace(result, x=np.full(len(result.x), 1e-6)))
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ro.InputError, match="a folder, accepted: a name of its own for every file"):
+        _require_different([tmp_path])
+    with pytest.raises(ro.InputError):
+        _require_different([tmp_path / "a", tmp_path / "a"])
+
+
+def test_validation_says_what_it_knows_and_what_not() -> None:
+    bare = str(ro.use.validate(calibrated("lasso"), checks()))
+    assert "has no covariance for these rows: how large errors may be is not known." in bare
+    assert "orientation" not in bare
+    pose = ro.load("pose")
+    assert pose.validation is not None
+    said = str(ro.use.validate(pose.calibrate(weight=1.0), pose.validation))
+    assert "orientation, identified [mrad]" in said
+    assert "95 % intervals of a reading" in said
+
+
+def test_everything_may_be_let_go() -> None:
+    """Nothing of the last calibration but its widths is then left."""
+    data = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 30, 5e-5, 3)[0].data
+    found = ro.use.update(calibrated(), data, anew=["*"])
+    anew = ro.calibrate(calibrated().problem.on(data), ro.least_squares)
+    assert found.result.x == pytest.approx(anew.x, abs=2e-5)
+    halves = [data.take(np.arange(k, k + 15)) for k in (0, 15)]
+    p = calibrated().problem
+    parts = PartitionedProblem(p.robot, p.parameters, halves[0], tuple(lambda each=each: each for each in halves))
+    with pytest.raises(ro.InputError, match="a calibration of measurements in parts, accepted: one of measurements in"):
+        ro.use.update(ro.calibrate(parts, ro.tikhonov, 1.0), checks())
+
+
+def test_one_of_several_robots_is_compensated_as_it_alone() -> None:
+    """Without a covariance, too: of a lasso nothing is said of intervals."""
+    other = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 20, 5e-5, 3)[0]
+    both = ro.together(left=calibrated().problem, right=other, shared=())
+    q = checks().q
+    for formulation in (ro.tikhonov, ro.lasso):
+        whole = ro.calibrate(both, formulation, 1.0)
+        alone = ro.calibrate(other, formulation, 1.0)
+        found = ro.use.compensate(whole, q=q, robot="right")
+        assert found.q == pytest.approx(ro.use.compensate(alone, q=q).q, abs=1e-4)
