@@ -65,11 +65,12 @@ def minimum_between(
         what the data do not see would stay where it is.
     """
     lower, upper = bounds
-    if free is None and (near is None or weight == 0):
-        free = minimum(objective, weight, None)
-    if free is not None and damping is None and weight > 0 and bool(np.all((lower <= free) & (free <= upper))):
-        return free, np.zeros_like(free)
-    start = near if near is not None and weight > 0 else free
+    start = near if weight > 0 else None
+    if start is None or free is not None:
+        outside = minimum(objective, weight, None) if free is None else free
+        if damping is None and weight > 0 and bool(np.all((lower <= outside) & (outside <= upper))):
+            return outside, np.zeros_like(outside)
+        start = outside if start is None else start
     A, b = objective.stacked(weight, damping)
     return minimum_in_box(A, b, lower, upper, np.clip(start, lower, upper))
 

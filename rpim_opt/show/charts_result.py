@@ -88,11 +88,11 @@ def along_axes(result: Calibration, data: Dataset) -> dict[str, Array]:
     return {when: each[seen] for when, each in vectors.items()}
 
 
-def frame_of(data: Dataset) -> str:
-    """Say whose axes the errors of positions are along."""
+def directed(data: Dataset) -> tuple[str, str]:
+    """Say whose axes the errors of positions are along, and what they are."""
     if any(block.measurement.touching for block in data.blocks):
-        return "the robot's base"  # a touch is compared with others of its point, where no instrument stands
-    return "the instrument"
+        return "the robot's base", "mean of the point minus touch"  # no instrument stands there
+    return "the instrument", "measured minus modelled"
 
 
 def axes_chart(result: Calibration, data: Dataset) -> Chart:
@@ -111,8 +111,9 @@ def axes_chart(result: Calibration, data: Dataset) -> Chart:
         marks.append(Segments(np.column_stack([place, place]), spread, when))
         marks.append(Dots(place, mean, when, when, hints))
         ends += [float(spread.min()), float(spread.max())]
-    x = Axis(f"axis of {frame_of(data)}", names=("x", "y", "z"))
-    y = Axis("measured minus modelled [mm]", (min(ends), max(ends)), linear_to=LINEAR_MM)
+    frame, what = directed(data)
+    x = Axis(f"axis of {frame}", names=("x", "y", "z"))
+    y = Axis(f"{what} [mm]", (min(ends), max(ends)), linear_to=LINEAR_MM)
     return Chart("Errors along x, y and z", x, y, marks)
 
 

@@ -11,7 +11,7 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.contact_words import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.charts_result import along_axes, axes_chart, frame_of, histogram_chart, lengths_of, rows_chart
+from rpim_opt.show.charts_result import along_axes, axes_chart, directed, histogram_chart, lengths_of, rows_chart
 from rpim_opt.show.pieces import figure, sets
 from rpim_opt.show.scales import mm
 
@@ -97,6 +97,7 @@ def _axes(result: Calibration, data: Dataset) -> list[Element]:
     rows = []
     for i, axis in enumerate("xyz"):
         rows.append([axis, *(f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values())])
-    caption = "Measured minus modelled, mean ± standard deviation [mm]"
-    said = f"Along the axes of {frame_of(data)}: mean, and where 95 % of the rows are."
+    frame, what = directed(data)
+    caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
+    said = f"Along the axes of {frame}: mean, and where 95 % of the rows are."
     return [figure(axes_chart(result, data), said), data_table(caption, ["axis", "before", "after"], rows)]

@@ -115,4 +115,5 @@ def test_errors_of_touches_are_along_the_axes_of_the_robot() -> None:
     assert ro.plot.error_axes(arm).get_xlabel() == "axis of the instrument"
     axes = ro.plot.error_axes(ro.calibrate(touched, ro.tikhonov, 1.0))
     assert axes.get_xlabel() == "axis of the robot's base"
+    assert axes.get_ylabel() == "mean of the point minus touch [mm]"
     plt.close("all")
