@@ -11,12 +11,19 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.select import Selection, Selector
-from rpim_opt.convex.selection import require_weight
+from rpim_opt.convex.select_scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
+from rpim_opt.convex.selection import SAME_WEIGHT, require_weight
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this part of the solution, then stays."""
 SAME = 0.01
 """Two weights are the same when their logarithms differ by no more."""
+NEUTRAL = 1.0
+"""The weight that takes declared noise and scales at their word."""
+QUICK = (reml, gcv, robust_gcv, discrepancy, quasi_optimality, ncp)
+"""Rules that solve a few programs at most."""
+RUNS = 0.1
+"""A lower end of weights below this part of the last one has run away."""
 PATIENCE = 10
 """How many different answers a selector may give in turn."""
 
@@ -35,6 +42,8 @@ class Choosing:
         The selector's last answer.
     answers
         All its answers, in turn.
+    inside
+        The last of them that was inside the weights that it tried.
     settled
         Whether the weight stays while the loop comes to rest.
     final
@@ -47,9 +56,19 @@ class Choosing:
     weight: float = 0.0
     selection: Selection | None = None
     answers: tuple[float, ...] = ()
+    inside: Selection | None = None
     settled: bool = False
     final: bool = False
     note: str = ""
+
+    def begun(self, program: Program) -> Choosing:
+        """Return the choice where the loop begins: of a loss over rows, a dear rule is asked where weight 1 leads.
+
+        At nominal its answer would be about another linear model, and about blunders that no fit has shown yet.
+        """
+        if self.settled or self.rule in QUICK or program.separated is None:
+            return self
+        return replace(self, weight=NEUTRAL, settled=True)
 
     def asked(self, program: Program) -> Choosing:
         """Return what the selector makes of a program, unless the weight is settled."""
@@ -64,9 +83,15 @@ class Choosing:
             raise InputError(f"selector {selection.name}", f"weight {selection.weight}", "a number, zero or more")
         answers = (*self.answers, float(selection.weight))
         chosen = replace(self, weight=float(selection.weight), selection=selection, answers=answers)
-        if not program.closed_form:  # whose paths are dear: the next answer is asked for where this one leads
-            chosen = replace(chosen, settled=True)
-        return chosen._checked()
+        if selection.interior:
+            chosen = replace(chosen, inside=selection)
+        if program.closed_form:
+            return chosen._checked()
+        ended = self._ended(selection)
+        if ended is not None:
+            return ended
+        # whose paths are dear: the next answer is asked for where this one leads
+        return replace(chosen, settled=True)._checked()
 
     def after(self, step: float) -> Choosing:
         """Return the choice after a step of that length, relative to the solution."""
@@ -79,8 +104,8 @@ class Choosing:
         if self.final:
             return self
         again = replace(self, settled=False).asked(program)
-        if _same(again.weight, self.weight):
-            return replace(self, settled=True, final=True)
+        if self.answers and _same(again.weight, self.weight, _told_apart(again.selection)):
+            return replace(self, settled=True, final=True, note=again.note)
         return again
 
     def _checked(self) -> Choosing:
@@ -94,6 +119,22 @@ class Choosing:
             return self._settled_between(last[-2], last[-1])
         return self
 
+    def _ended(self, selection: Selection) -> Choosing | None:
+        """End a rule that left an answer inside its weights for their lower end, and then does not stay there."""
+        if self.inside is None or self.selection is None or not _lowest(self.selection):
+            return None
+        before = self.selection.weight
+        if _same(selection.weight, self.inside.weight):
+            return replace(self._settled_between(selection.weight, before), selection=selection)
+        if not _lowest(selection) or selection.weight > RUNS * before:
+            return None
+        weight = self.inside.weight
+        note = (
+            f"The rule {selection.name} wants ever less penalty, {before:.2g} and then {selection.weight:.2g}: "
+            f"its last answer inside the weights that it tried, {weight:.2g}, is used."
+        )
+        return replace(self, weight=weight, selection=self.inside, settled=True, final=True, note=note)
+
     def _settled_between(self, one: float, other: float) -> Choosing:
         low, high = sorted((one, other))
         name = self.selection.name if self.selection else "selector"
@@ -104,10 +145,27 @@ class Choosing:
         return replace(self, weight=weight, settled=True, final=True, note=note)
 
 
-def _same(one: float, other: float) -> bool:
+def _same(one: float, other: float, apart: float = SAME) -> bool:
     if one <= 0 or other <= 0:
         return one == other
-    return abs(np.log(one / other)) <= SAME
+    return abs(np.log(one / other)) <= apart
+
+
+def _told_apart(selection: Selection | None) -> float:
+    """Return by how much logarithms of weights differ that a rule tells apart: an answer from a grid is no closer."""
+    if selection is None or not selection.interior:
+        return SAME
+    order = np.sort(selection.weights)
+    place = int(np.searchsorted(order, selection.weight))
+    if not 0 < place < len(order) - 1 or order[place] != selection.weight or order[place - 1] <= 0:
+        return SAME
+    between = 0.5 * float(np.log(order[place + 1] / order[place - 1]))
+    return float(np.clip(between, SAME, np.log(SAME_WEIGHT)))
+
+
+def _lowest(selection: Selection) -> bool:
+    """Whether an answer is the smallest weight that was tried, as that is where the search ended."""
+    return not selection.interior and selection.weight <= np.min(selection.weights)
 
 
 def choosing(weight: float | str | Selector, penalized: bool) -> Choosing:

@@ -46,6 +46,8 @@ MANY = 6
 """Refused steps in a row after which a small promise is taken for the solver's noise; the certificate judges that."""
 LONG = 10
 """Passes after which an objective that did not fall is taken to be the least; the certificate judges that."""
+FEW = 10
+"""Passes that are too few to begin with a weight that no selector was asked for."""
 QUIET = 3
 """Passes in a row in which a program promises nothing beyond its accuracy: then it will not."""
 PENALTY = 10.0
@@ -123,6 +125,8 @@ class Loop:
     def chosen(self, state: State) -> State:
         """Ask for the weight; the objective follows it."""
         choice = state.choice
+        if not choice.answers and self.most > FEW:
+            choice = choice.begun(state.program)
         if not choice.settled:
             choice = choice.asked(self._judged(state))
         if choice.weight == state.choice.weight and state.history:
@@ -138,6 +142,14 @@ class Loop:
             return replace(state, choice=choice)
         merit = _merit(state.program, state.z, choice.weight)
         return replace(state, choice=choice, merit=merit, quiet=0, outcome="")
+
+    def answered(self, state: State) -> State:
+        """Ask a selector that was not asked yet when the passes ran out."""
+        choice = state.choice
+        if choice.final or choice.answers:
+            return state
+        choice = replace(choice, settled=False).asked(self._judged(state))
+        return replace(state, choice=choice, merit=_merit(state.program, state.z, choice.weight))
 
     def _judged(self, state: State) -> Program:
         """Return the program that a selector sees: of squares that stand for a robust loss, those that it trusts."""
@@ -327,6 +339,7 @@ def run(
             state = loop.confirmed(loop.advanced(loop.chosen(state)))
             if progress and len(state.history) > passes:
                 progress(state.history[-1])
+        state = loop.answered(state)
         evidence = _certified(loop, formulation, problem, state)
     except NoSolutionFound as error:
         raise error.naming(_names(source)) from None

@@ -40,11 +40,18 @@ class Near(NamedTuple):
 
 
 class Met:
-    """The last minima at some weights, from which those of another weight or linearization are near."""
+    """The last minima at some weights, from which those of another weight or linearization are near.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    whole
+        What was met of all data, where these are of some of them: it hears of every minimum, too.
+    """
+
+    def __init__(self, whole: Met | None = None) -> None:
         self._at: dict[float, Near] = {}
         self.in_box: Array | None = None  # (n,), of a quadratic program
+        self._whole = whole
 
     def nearest(self, weight: float) -> Near | None:
         """Return the minimum at the nearest weight."""
@@ -53,7 +60,16 @@ class Met:
         return self._at[min(self._at, key=lambda other: abs(np.log((other + TINY) / (weight + TINY))))]
 
     def near(self, weight: float) -> list[Near]:
-        """Return the minimum at the nearest weight, and the last one, which may be of a program more like this one."""
+        """Return the minimum at the nearest weight, and the last one, which may be of a program more like this one.
+
+        Of some of the data the nearest one of the same data, too.
+        """
+        if self._whole is not None:
+            found = self._whole.near(weight)
+            own = self.nearest(weight)
+            if own is not None and all(own is not each for each in found):
+                found.append(own)
+            return found
         nearest = self.nearest(weight)
         if nearest is None:
             return []
@@ -64,6 +80,8 @@ class Met:
 
     def keep(self, weight: float, near: Near) -> None:
         """Keep a minimum; of too many weights the one that was met first goes."""
+        if self._whole is not None:
+            self._whole.keep(weight, near)
         self._at.pop(weight, None)
         self._at[weight] = near
         if len(self._at) > MOST:
@@ -98,7 +116,7 @@ def by_rows(
     box = objective.box if objective.constrained else None
     method: Newton | Worst
     if isinstance(loss, Largest):
-        method = Worst(loss, at, weight, box)
+        method = Worst(loss, at, weight, box, rough)
     else:
         method = Newton(loss, at, weight, box, rough)
     if not at.rows.shape[1] or (box is not None and not method.whole):

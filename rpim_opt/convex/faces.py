@@ -217,30 +217,37 @@ class Faces:
             return self.price
         return self.price + self.groups @ self.picks
 
-    def gap(self, y: Array, slope: Array, weight: float) -> float:
-        """Return by how much the objective at y may lie above its minimum: the least of some bounds of it."""
+    def gap(self, y: Array, slope: Array, weight: float, step: Array | None = None) -> float:
+        """Return by how much the objective at y may lie above its minimum: the least of some bounds of it.
+
+        The first one, if given, is by a step (n,) that the slope at y (n,) was answered with.
+        """
         gap = np.inf
         ridge = RIDGE
         value = self.value(y, weight)
+        C = self.curvature(weight)
+        if step is not None:
+            gap = self._gap(y, slope, weight, C, step)
         while ridge < FIRM and not gap <= CERTAIN * value:
-            gap = min(gap, self._gap(y, slope, weight, ridge))
+            gap = min(gap, self._gap(y, slope, weight, C, self._newton(y, slope, C, weight, ridge)[0]))
             ridge = STIFFER * ridge
         return gap
 
-    def _gap(self, y: Array, slope: Array, weight: float, ridge: float) -> float:
+    def _gap(self, y: Array, slope: Array, weight: float, C: Array, step: Array) -> float:
         """Return by how much the objective at y may lie above its minimum: Fenchel's and Young's inequality.
 
         The tangent of the smooth part at any point is a lower bound of it, and with the kinks, whose minimum is known,
         one of the objective. It is taken where Newton's step leads, whose curvature counts: on the face the slope there
         is what the kinks need, whatever rounding made of it at y.
         """
-        C = self.curvature(weight)
-        step = self._newton(y, slope, C, weight, ridge)[0]
         left = slope + C @ step
         price = weight * self.price
-        below, above = np.isfinite(self.lower), np.isfinite(self.upper)
-        excess = np.where(above, 0.0, np.minimum(left + price, 0.0))
-        excess = excess + np.where(below, 0.0, np.maximum(left - price, 0.0))
+        excess = np.minimum(left + price, 0.0)
+        rest = np.maximum(left - price, 0.0)
+        if self.bounded:
+            excess[np.isfinite(self.upper)] = 0.0
+            rest[np.isfinite(self.lower)] = 0.0
+        excess += rest
         if len(self.groups):
             excess = np.where(self.grouped, self._over(left, weight), excess)
         left = left - excess
@@ -260,6 +267,8 @@ class Faces:
     def _young(self, y: Array, left: Array, price: Array, groups: Array) -> float:
         """Return left'y and the kinks at y, less the least that both together are anywhere in the box."""
         here = left * y + price * np.abs(y)
+        if not self.bounded and not len(self.groups):  # left is at most the price: zero is where both are least
+            return float(here.sum())
         nearest = np.minimum(np.maximum(0.0, self.lower), self.upper)
         least = left * nearest + price * np.abs(nearest)
         for bound in (self.lower, self.upper):
@@ -311,17 +320,18 @@ class Faces:
         y = np.minimum(np.maximum(self.snapped(start, NEAR), self.lower), self.upper)
         C = self.curvature(weight)
         ridge = RIDGE
+        value = self.value(y, weight)
+        step = np.zeros(len(y))
         for _ in range(50 + len(y)):
             slope = self.slope(y, weight)
             if len(self.groups):
                 slope = self._emptied(y, slope, C, weight)
-            value = self.value(y, weight)
+                value = self.value(y, weight)
             step, fall = self._newton(y, slope, C, weight, ridge)
             if fall > VANISHED * abs(value):
-                ahead = self._ahead(y, step, fall, value, C, weight)
-                lower = self.value(ahead, weight) - value
-                if lower < 0 or (lower == 0 and self.free(ahead).sum() < self.free(y).sum()):
-                    y = ahead
+                ahead, there = self._ahead(y, step, fall, value, C, weight)
+                if there < value or (there == value and self.free(ahead).sum() < self.free(y).sum()):
+                    y, value = ahead, there
                     ridge = RIDGE
                     continue
                 if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
@@ -331,17 +341,19 @@ class Faces:
             wrong = self._wrong(y, slope, weight)
             if not wrong.any():
                 break
-            before = y
-            y = self._moved(y, slope, wrong, C, weight)
-            if not self.value(y, weight) < value:
-                y = before
+            moved = self._moved(y, slope, wrong, C, weight)
+            there = self.value(moved, weight)
+            if not there < value:
                 break
+            y, value = moved, there
         slope = self.slope(y, weight)
-        return Face(y, self.free(y), self.gap(y, slope, weight), self.value(y, weight))
+        return Face(y, self.free(y), self.gap(y, slope, weight, step), value)
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
-        free = (y > self.lower) & (y < self.upper) & ((y != 0) | ~self.kinked)
+        free = (y != 0) | ~self.kinked
+        if self.bounded:
+            free &= (y > self.lower) & (y < self.upper)
         if len(self.groups):
             free &= ~self.grouped | ((self.lengths(y) > 0) @ self.picks > 0)
         return free
@@ -402,28 +414,31 @@ class Faces:
             y = np.where(self.grouped & ((self.lengths(y) <= room) @ self.picks > 0), 0.0, y)
         return y
 
-    def _ahead(self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float) -> Array:
-        """Return the point after a step, and where that comes short, after groups were moved one by one."""
-        ahead = self._stepped(y, step, value, weight)
-        if len(self.groups) and self.value(ahead, weight) > value - SHORT * fall:
+    def _ahead(self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float) -> tuple[Array, float]:
+        """Return the point after a step, and where that comes short, after groups were moved one by one; its value."""
+        ahead, there = self._stepped(y, step, value, weight)
+        if len(self.groups) and there > value - SHORT * fall:
             # where a group is nearly zero, the norm bends more than Newton's step sees
-            return self._moved(ahead, self.slope(ahead, weight), self.grouped, C, weight)
-        return ahead
+            ahead = self._moved(ahead, self.slope(ahead, weight), self.grouped, C, weight)
+            return ahead, self.value(ahead, weight)
+        return ahead, there
 
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
-        step = np.zeros_like(y)
-        free = self.free(y)
-        if not free.any():
+        step = np.zeros(len(y))
+        F = np.flatnonzero(self.free(y))
+        if not len(F):
             return step, 0.0
-        kink, bend = self.bent(y, weight)
-        F = np.flatnonzero(free)
-        K = C[F[:, None], F]
+        K = C.take(F, 0).take(F, 1)
+        g = slope[F]
         if len(self.groups):
-            K = K + bend[F[:, None], F]
-        g = (slope + kink)[F]
-        diagonal = K.flat[:: len(F) + 1]
-        own = np.maximum(diagonal, UNSEEN * np.max(diagonal))
+            kink, bend = self.bent(y, weight)
+            K += bend.take(F, 0).take(F, 1)
+            g += kink[F]
+        else:
+            g += weight * self.price[F] * np.sign(y[F])
+        diagonal = K.diagonal().copy()
+        own = np.maximum(diagonal, UNSEEN * diagonal.max())
         for _ in range(20):
             K.flat[:: len(F) + 1] = diagonal + ridge * own
             _, found, info = _posv(K, -g, lower=1)
@@ -435,43 +450,53 @@ class Faces:
         step[F] = found
         return step, float(-g @ found)
 
-    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> Array:
-        """Return the point after a step: over all kinks where that lowers the objective, else to the first."""
+    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> tuple[Array, float]:
+        """Return the point after a step and its value: over all kinks where that is lower, else to the first."""
         full = self._stopped(y, y + step)
-        if self.value(full, weight) < value:
-            return full
+        there = self.value(full, weight)
+        if there < value:
+            return full, there
         share = self._first(y, step)
         for _ in range(40):
             ahead = self._stopped(y, y + share * step)
             if share < 1:
                 ahead = self._snapped(y, step, ahead, share)
-            if self.value(ahead, weight) <= value:
-                return ahead
+            there = self.value(ahead, weight)
+            if there <= value:
+                return ahead, there
             share = share / 2
-        return y
+        return y, value
 
     def _stopped(self, y: Array, ahead: Array) -> Array:
         """Return a point with components that passed a kink or a bound put on it."""
         ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
-        ahead[self.kinked & (ahead * y < 0)] = 0.0
+        ahead[(ahead * y < 0) & self.kinked] = 0.0
         return ahead
 
     def _first(self, y: Array, step: Array) -> float:
         """Return how far along a step (at most 1) the first kink or bound is."""
-        share = 1.0
-        for place in self.places:
-            gap = place - y
-            passed = (gap * step > 0) & (np.abs(gap) < np.abs(share * step))
-            if passed.any():
-                share = min(share, float(np.min(gap[passed] / step[passed])))
-        return share
+        gap = self._stops - y
+        passed = (gap * step > 0) & (np.abs(gap) < np.abs(step))
+        if not passed.any():
+            return 1.0
+        return float(np.min(np.divide(gap, step, out=np.ones_like(gap), where=passed)))
 
     @cached_property
-    def places(self) -> tuple[Array, Array, Array]:
-        """Lower and upper bounds and kinks (n,), far away where there is none."""
-        far = FAR
-        kink = np.where(self.kinked, 0.0, far)
-        return np.maximum(self.lower, -far), np.minimum(self.upper, far), kink
+    def _stops(self) -> Array:
+        """`places` as rows (k, n)."""
+        return np.array(self.places).reshape(-1, len(self.g))
+
+    @cached_property
+    def bounded(self) -> bool:
+        """Whether some component has a bound."""
+        return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    @cached_property
+    def places(self) -> list[Array]:
+        """Lower and upper bounds and kinks (n,), far away where there is none; those that no component has left out."""
+        kink = np.where(self.kinked, 0.0, FAR)
+        every = (np.maximum(self.lower, -FAR), np.minimum(self.upper, FAR), kink)
+        return [place for place in every if (np.abs(place) < FAR).any()]
 
     def _snapped(self, y: Array, step: Array, ahead: Array, share: float) -> Array:
         """Put what reached its kink or bound but for rounding exactly there."""
@@ -500,9 +525,12 @@ class Faces:
         """Return which held components (n,) the objective falls along."""
         room = self.rounding(y, weight)
         price = weight * self.price
-        right = slope + np.where(y >= 0, price, -price)
-        left = slope + np.where(y > 0, price, -price)
-        wrong = ((y < self.upper) & (right < -room)) | ((y > self.lower) & (left > room))
+        if self.bounded:
+            right = slope + np.where(y >= 0, price, -price)
+            left = slope + np.where(y > 0, price, -price)
+            wrong = ((y < self.upper) & (right < -room)) | ((y > self.lower) & (left > room))
+        else:  # what is held is zero
+            wrong = np.abs(slope) > price + room
         wrong &= ~self.free(y)
         if len(self.groups):
             steep = self.lengths(slope) - weight * self.groups

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,9 +71,9 @@ class Newton(Whitened):
     box
         Lower and upper (n,), or None.
     rough
-        Whether, where second derivatives are dear, it will do that a quadratic promises to lower the objective by no
-        more than `PROMISED` of it: a point that a rule compares with others. (Of small weights, a gap asks for far
-        more: it knows of the penalty's curvature alone.)
+        Whether it will do that a quadratic promises to lower the objective by no more than `PROMISED` of it: a point
+        that a rule compares with others. (Of small weights, a gap asks for far more: it knows of the penalty's
+        curvature alone.)
     """
 
     loss: Separated
@@ -88,7 +89,7 @@ class Newton(Whitened):
         if kinked is None or not self.loss.kinks:
             return self._descent(self._placed(z, kinked), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
-        if ended.good:
+        if ended.good or ended.close:
             return ended
         point = self._placed(ended.z, ended.kinked)
         sharpness = min(BLUNT * self._begun(point.r).sharpness, kinked.sharpness)
@@ -97,19 +98,20 @@ class Newton(Whitened):
     def _descent(self, point: Point, most: int, hasty: bool = False) -> Ended:
         """Return the best point of so many steps; a hasty one ends where some lower the gap no more."""
         slope = self._slope(point)
-        best = Best(self._judged(point, slope, 0))
-        gap = best.ended.gap
+        ended = self._judged(point, slope, 0)
+        best = Best(ended)
         for steps in range(1, most):
             if best.will_do(hasty=hasty):
                 break
-            ahead = self._next(point, slope, gap)
+            ahead = self._next(point, slope, ended)
+            if ahead is None:
+                return ended._replace(close=True)
             if ahead is point:  # a kink that nothing told of: no step leads anywhere
                 break
             point = ahead
             slope = self._slope(point)
             ended = self._judged(point, slope, steps)
             best.meets(ended)
-            gap = ended.gap
         return best.ended
 
     @property
@@ -133,7 +135,7 @@ class Newton(Whitened):
             fresh = bent is None
             if bent is None:
                 bent = self._hessian(point)
-            if self.rough and self._promised(slope, bent) <= PROMISED * abs(ended.objective):
+            if self._close(slope, bent, ended):
                 return self._with(ended._replace(close=True), bent)
             ahead = self._stepped(point, slope, bent)
             if fresh and ahead is point:
@@ -194,18 +196,26 @@ class Newton(Whitened):
         """Return the same point with kinks in another state."""
         return point._replace(kinked=kinked, smooth=self.loss.smoothed(point.r, *kinked[:2]))
 
-    def _next(self, point: Point, slope: Array, gap: float) -> Point:
-        """Return the point after a step of Newton's, or of the multipliers where little else is left of the gap."""
-        if not self.loss.kinks:
-            return self._stepped(point, slope, self._hessian(point))
-        missing = point.smooth.missing
-        sharpness = point.kinked.sharpness
-        if gap - missing <= SETTLED * missing:
-            return self._about(point, Kinked(point.smooth.multipliers, min(SHARPER * sharpness, SHARPEST)))
-        ahead = self._stepped(point, slope, self._hessian(point))
-        if ahead is point:  # no step is short enough for kinks so sharp
-            return self._about(point, point.kinked._replace(sharpness=sharpness / SHARPER))
+    def _next(self, point: Point, slope: Array, ended: Ended) -> Point | None:
+        """Return the point after a step of Newton's, or of the multipliers where little else is left of the gap.
+
+        None where the point will do for a rule.
+        """
+        if ended.missing > 0 and ended.gap - ended.missing <= SETTLED * ended.missing:
+            sharpness = min(SHARPER * point.kinked.sharpness, SHARPEST)
+            return self._about(point, Kinked(point.smooth.multipliers, sharpness))
+        bent = self._hessian(point)
+        if self._close(slope, bent, ended):
+            return None
+        ahead = self._stepped(point, slope, bent)
+        if ahead is point and self.loss.kinks:  # no step is short enough for kinks so sharp
+            return self._about(point, point.kinked._replace(sharpness=point.kinked.sharpness / SHARPER))
         return ahead
+
+    def _close(self, slope: Array, bent: Array, ended: Ended) -> bool:
+        """Whether a point will do for a rule that compares it with others."""
+        room = PROMISED * abs(ended.objective) - ended.missing
+        return self.rough and room > 0 and self._promised(slope, bent) <= room
 
     def _begun(self, r: Array) -> Kinked:
         """Return multipliers of zero, and kinks as blunt as the residuals are large."""
@@ -222,10 +232,11 @@ class Newton(Whitened):
 
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
         gap, by_z = self.bound(point.z, point.a, slope)
-        objective = point.smooth.loss + float(self.pull @ point.a**2)
-        state = point.kinked._replace(multipliers=point.smooth.multipliers)
         smooth = point.smooth
-        return Ended(point.z, gap + smooth.missing, objective, smooth.loss, steps, state, by_z, smooth.slope)
+        loss, missing = self.loss.missed(point.r, smooth)
+        objective = loss + float(self.pull @ point.a**2)
+        state = Kinked(smooth.multipliers, point.kinked.sharpness, point.kinked.curved)
+        return Ended(point.z, gap + missing, objective, loss, steps, state, by_z, smooth.slope, missing)
 
     def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
         """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""
@@ -245,27 +256,39 @@ class Newton(Whitened):
 
     def _whole(self, bent: Array) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
-        H = self.unit[:, None] * bent * self.unit
-        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + FLAT
+        units, diagonal = self._units
+        H = units * bent
+        H.flat[:: len(H) + 1] += diagonal
         return H
+
+    @cached_property
+    def _units(self) -> tuple[Array, Array]:
+        """Units (p, p) of second derivatives by the coordinates, and what penalties add to them (p,)."""
+        return np.multiply.outer(self.unit, self.unit), 2 * self.pull * self.unit**2 + FLAT
 
     def _hessian(self, point: Point) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
         curvatures = self.loss.curvature(point.r, *point.kinked[:2])
-        rows = self.at.rows
-        across = sum(c.across for c in curvatures) + np.zeros(len(rows))
-        usual = np.partition(across, len(across) // 2)[len(across) // 2]
-        other = np.flatnonzero(across != usual)
-        if 2 * len(other) > len(rows):
-            X = np.sqrt(across)[:, None] * rows
-            H = X.T @ X
-        else:
-            X = rows[other]
-            H = usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+        across = sum(c.across for c in curvatures[1:]) + curvatures[0].across
+        H = self._across(across)
         for curvature in curvatures:
             if len(curvature.along):
                 H += self._along(curvature)
         return H
+
+    def _across(self, across: Array) -> Array:
+        """Return what curvatures of the equations add."""
+        rows = self.at.rows
+        usual = 0.0
+        other = np.arange(len(rows))
+        if rows.size >= DEAR:  # most of them may have the same
+            usual = float(np.partition(across, len(across) // 2)[len(across) // 2])
+            other = np.flatnonzero(across != usual)
+        if 2 * len(other) > len(rows):
+            X = np.sqrt(across)[:, None] * rows
+            return X.T @ X
+        X = rows[other]
+        return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
 
     def _along(self, curvature: Curvature) -> Array:
         """Return what the curvatures along the groups' directions add."""
@@ -277,19 +300,26 @@ class Newton(Whitened):
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""
         ahead = self.at.rows @ step
+        of_penalty = 2 * self.pull * step
 
         def at(t: float) -> Point:
-            a = point.a + t * step
             r = point.r + t * ahead
-            place = self.at.offset + self.at.B @ a
-            if self.box is not None:
-                place = np.clip(point.z + t * (z - point.z), *self.box)
-            return Point(place, a, r, point.kinked, self.loss.smoothed(r, *point.kinked[:2]))
+            smooth = self.loss.smoothed(r, *point.kinked[:2])
+            return Point(point.z + t * (z - point.z), point.a + t * step, r, point.kinked, smooth)
 
         def rise(p: Point) -> float:
-            slope = float(p.smooth.slope @ ahead + 2 * (self.pull * p.a) @ step)
-            if np.isfinite(slope) and np.isfinite(p.smooth.value):
+            slope = float(p.smooth.slope @ ahead + p.a @ of_penalty)
+            if np.isfinite(slope) and np.isfinite(p.smooth.without_kinks):
                 return slope
             return np.inf
 
-        return searched(at, rise, point, self.box is None)
+        found = searched(at, rise, point, self.box is None)
+        if found is point:
+            return point
+        return found._replace(z=self._place(found))
+
+    def _place(self, point: Point) -> Array:
+        """Return z (n,) of a point that a search has found: free of rounding, or inside the box."""
+        if self.box is None:
+            return self.at.offset + self.at.B @ point.a
+        return np.clip(point.z, *self.box)

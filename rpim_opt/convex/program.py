@@ -130,7 +130,7 @@ class Program(Objective):
         >>> some.solve(1.0).loss < program.solve(1.0).loss
         True
         """
-        left = self.on(self.model.scaled(np.where(out, 0.0, 1.0)))
+        left = replace(self, model=self.model.scaled(np.where(out, 0.0, 1.0)), _met=Met(self._met))
         if self.separated is not None or self.worst is not None:  # unknowns that whiten all whiten most
             vars(left)["coordinates"] = self.coordinates.of(~out[self.order])
         return left
@@ -253,8 +253,8 @@ class Program(Objective):
         near
             A point (n,) near the solution at the largest weight, if one is known.
         rough
-            Whether of many equations points will do whose objective Newton's method expects to be within 1e-10 of the
-            minimum, without a gap that says so: for a rule that compares them.
+            Whether points will do whose objective Newton's method expects to be within 1e-10 of the minimum, without a
+            gap that says so: for a rule that compares them.
 
         Examples
         --------

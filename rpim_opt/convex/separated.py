@@ -15,6 +15,10 @@ NEAR_ZERO = 1e-150
 """Norms below have no direction."""
 
 
+MANY = 500
+"""Groups from which their norms are summed column by column."""
+PLAIN = Affine(1.0, 0.0)
+"""Of the norms themselves."""
 NONE: Array = np.empty(0)
 
 
@@ -30,16 +34,11 @@ class Curvature(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """A loss with kinks smoothed: value, slope (m,), the kinks' multipliers anew, and what the kinks miss by them.
+    """A loss with kinks smoothed: its slope (m,), the kinks' multipliers anew, and the value of what is no kink."""
 
-    ``loss`` is its value without smoothing.
-    """
-
-    value: float
-    loss: float
     slope: Array
     multipliers: list[Array]
-    missing: float
+    without_kinks: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +100,7 @@ class Separated:
             return list(self.rows.kinks)
         if np.all(self.at_zero == 0):
             return []
-        return [Kink(self.at_zero, Affine(1.0, 0.0))]
+        return [Kink(self.at_zero, PLAIN)]
 
     @property
     def holds(self) -> bool:
@@ -115,14 +114,29 @@ class Separated:
         """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
         sizes = self._sizes
         if np.ptp(sizes) == 0:
-            k = sizes[0]
-            return np.einsum("nk,nkp->np", u.reshape(-1, k)[groups], rows.reshape(len(sizes), k, -1)[groups])
+            by_group = u.reshape(len(sizes), -1), rows.reshape(len(sizes), sizes[0], -1)
+            if 2 * len(groups) > len(sizes):  # most of them: picked out afterwards
+                return np.einsum("nk,nkp->np", *by_group)[groups]
+            return np.einsum("nk,nkp->np", *(each[groups] for each in by_group))
         return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
+
+    @cached_property
+    def _columns(self) -> int:
+        """Equations of every group, of many that have the same number; else 0."""
+        sizes = self._sizes
+        if len(sizes) < MANY or np.ptp(sizes) > 0:
+            return 0
+        return int(sizes[0])
 
     def _norms(self, s: Array) -> Array:
         if self.starts is None:
             return np.abs(s)
-        return np.sqrt(np.add.reduceat(s * s, self.starts))
+        if not self._columns:
+            return np.sqrt(np.add.reduceat(s * s, self.starts))
+        total = s[:: self._columns] ** 2
+        for k in range(1, self._columns):
+            total += s[k :: self._columns] ** 2
+        return np.sqrt(total, out=total)
 
     def _spread(self, v: Any) -> Any:
         """Return numbers of groups (N,) by equation (m,)."""
@@ -165,37 +179,38 @@ class Separated:
 
     def at(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
-        bent = [float((factor * self._norms(a * r + c)).sum()) for factor, (a, c) in self.kinks]
-        return self._smooth(r)[0] + sum(bent)
+        return self._smooth(r)[0] + sum(self._bent(r))
+
+    def _bent(self, r: Array) -> list[float]:
+        """Return the value of every kink at a residual (m,)."""
+        return [float((factor * self._norms(_along(of, r))).sum()) for factor, of in self.kinks]
 
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
         value, slope = self._smooth(r)
         anew = []
-        missing = 0.0
-        loss = value
-        for (factor, (a, c)), old in zip(self.kinks, y, strict=True):
-            s = a * r + c
-            t = sharpness * s + old
-            length = self._norms(t)
-            new = self._spread(np.minimum(1.0, factor / np.maximum(length, NEAR_ZERO))) * t
+        for (factor, of), old in zip(self.kinks, y, strict=True):
+            t = sharpness * _along(of, r) + old
+            new = t * self._spread(np.minimum(1.0, factor / np.maximum(self._norms(t), NEAR_ZERO)))
             anew.append(new)
-            slope = slope + a * new
-            value += float(new @ s - (new - old) @ (new - old) / (2 * sharpness))
-            bent = float((factor * self._norms(s)).sum())
-            loss += bent
-            missing += bent - float(new @ s)
-        return Smoothed(value, loss, slope, anew, missing)
+            slope = slope + of.a * new
+        return Smoothed(slope, anew, value)
+
+    def missed(self, r: Array, smoothed: Smoothed) -> tuple[float, float]:
+        """Return the loss of a residual (m,), and what the multipliers there miss of its kinks."""
+        bent = sum(self._bent(r))
+        reached = sum(float(y @ _along(of, r)) for (_, of), y in zip(self.kinks, smoothed.multipliers, strict=True))
+        return smoothed.without_kinks + bent, bent - reached
 
     def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
         """Return the second derivative of the smoothed loss, as a sum."""
         found = [self._smooth_curvature(r)]
-        for (factor, (a, c)), old in zip(self.kinks, y, strict=True):
-            t = sharpness * (a * r + c) + old
+        for (factor, of), old in zip(self.kinks, y, strict=True):
+            t = sharpness * _along(of, r) + old
             length = np.maximum(self._norms(t), NEAR_ZERO)
             inside = length <= factor
             if self.starts is None:
-                found.append(Curvature(a**2 * sharpness * inside))
+                found.append(Curvature(of.a**2 * sharpness * inside))
                 continue
             across = sharpness * np.minimum(1.0, factor / length)
             found.append(Curvature(self._spread(across), np.where(inside, 0.0, -across), t / self._spread(length)))
@@ -212,3 +227,10 @@ class Separated:
         small = v <= NEAR_ZERO
         across = np.where(small, bend, slope / np.where(small, 1.0, v))
         return Curvature(self._spread(across), bend - across, r / self._spread(np.where(small, 1.0, v)))
+
+
+def _along(of: Affine, r: Array) -> Array:
+    """Return a r + c of residuals (m,)."""
+    if of is PLAIN:
+        return r
+    return of.a * r + of.c

@@ -42,7 +42,7 @@ class Ended(NamedTuple):
     """Where a method ended.
 
     z (n,), duality gap, objective and loss, steps, what a neighbour may begin with, the slope by z (n,) in a box, the
-    loss's (m,), and whether it is close enough for a rule.
+    loss's (m,), what kinks miss of the gap, and whether it is close enough for a rule.
     """
 
     z: Array
@@ -53,6 +53,7 @@ class Ended(NamedTuple):
     kinked: Kinked
     slope: Array | None
     of_loss: Array
+    missing: float = 0.0
     close: bool = False
 
     @property

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.epigraph import Epigraph, Least
 from rpim_opt.convex.largest import Largest
-from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import ACCEPTED, FLAT, SOUGHT, Best, Ended, Kinked, Whitened
 
 MOST, CHANGES = 40, 1000
 """Quadratic programs, and changes of the set in each, after which another method is asked."""
@@ -57,9 +57,12 @@ class Worst(Whitened):
         Whose groups.
     at, weight, box
         As for `Whitened`.
+    rough
+        Whether a gap will do that is small enough for a rule, which compares points.
     """
 
     loss: Largest
+    rough: bool = False
 
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the shares of a neighbour."""
@@ -72,8 +75,9 @@ class Worst(Whitened):
         point = self._point(z, a, r, shares, 0)
         best = Best(point.ended)
         most = MOST if kinked is None else SOON
+        sought = ACCEPTED if self.rough else SOUGHT
         for steps in range(1, most + 1):
-            if best.will_do():
+            if best.will_do(sought):
                 break
             ahead = self._next(point, steps)
             if ahead is None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration import loop
 from rpim_opt.calibration.choosing import PATIENCE, SETTLED, Choosing, choosing
 
 PROGRAM: Any = SimpleNamespace(closed_form=True)
@@ -25,6 +26,27 @@ def rule(*answers: float) -> Callable[[Any], ro.select.Selection]:
         return ro.select.Selection(left.pop(0), "mine", np.ones(1), np.ones(1), interior=True)
 
     return mine
+
+
+def ending(*answers: float) -> Callable[[Any], ro.select.Selection]:
+    """A selector that gives these answers in turn; a negative one is that weight at the lower end of those tried."""
+    left = list(answers)
+
+    def mine(_: Any) -> ro.select.Selection:
+        weight = left.pop(0)
+        inside = weight > 0
+        weights = abs(weight) * np.array([0.5, 1.0, 2.0])[int(not inside) :]
+        return ro.select.Selection(abs(weight), "mine", weights, np.ones(len(weights)), inside)
+
+    return mine
+
+
+def followed(*answers: float) -> Choosing:
+    """The choice after all answers about a program without a formula, or after the one that ended it."""
+    choice = choosing(ending(*answers), True).asked(DEAR)
+    for _ in answers[1:]:
+        choice = choice.confirmed(DEAR)
+    return choice
 
 
 def asked(count: int, *answers: float) -> Choosing:
@@ -82,6 +104,55 @@ def test_a_weight_settles_when_steps_are_short() -> None:
     assert choice.after(SETTLED).settled
     assert not choice.after(SETTLED).final
     assert pytest.approx(1e-3) == SETTLED
+
+
+@pytest.mark.parametrize(("answer", "same"), [(2.19, True), (2.21, False), (2 / 1.09, True), (2 / 1.11, False)])
+def test_without_a_formula_answers_are_the_same_within_what_a_search_tells_apart(answer: float, same: bool) -> None:
+    end = followed(2.0, answer)
+    assert end.final == same
+    assert end.weight == (2.0 if same else answer)
+
+
+def test_what_a_search_tells_apart_is_no_more_than_its_weights_are_apart() -> None:
+    def near(weight: float, refined: float, ratio: float) -> Choosing:
+        """The choice after an answer of 2 and another one, of a grid of that ratio, refined by that factor."""
+        grid = weight / refined * np.array([1 / ratio, 1.0, ratio])
+        answers = [rule(2.0)(None), ro.select.Selection(weight, "mine", grid, np.ones(3), interior=True)]
+        return choosing(lambda _: answers.pop(0), True).asked(DEAR).confirmed(DEAR)
+
+    assert near(2.0 * 1.029, 1.0, 1.03).final
+    assert not near(2.0 * 1.031, 1.0, 1.03).final
+    assert not near(2.0 * 1.02, 1.001, 1.03).final  # refined between the weights
+
+
+def test_a_lower_end_that_runs_away_is_left_for_the_last_answer_inside() -> None:
+    assert not followed(30.0, -1e-3).final
+    end = followed(30.0, -1e-3, -1e-9)
+    assert (end.weight, end.settled, end.final) == (30.0, True, True)
+    assert end.selection is not None
+    assert (end.selection.weight, end.selection.interior) == (30.0, True)
+    assert end.note == (
+        "The rule mine wants ever less penalty, 0.001 and then 1e-09: "
+        "its last answer inside the weights that it tried, 30, is used."
+    )
+    assert end.confirmed(DEAR) is end
+    still = followed(30.0, -1e-3, -0.9e-3)  # the end that it was: the data want no penalty
+    assert (still.weight, still.final, still.note) == (0.9e-3, False, "")
+    assert followed(30.0, -1e-3, -0.995e-3).final
+
+
+def test_a_lower_end_with_no_answer_inside_before_it_is_followed() -> None:
+    assert not followed(-1e-3, -1e-9).final
+    assert followed(-1e-3, -1e-9).weight == 1e-9
+
+
+def test_an_answer_that_comes_back_from_the_lower_end_is_an_alternation() -> None:
+    end = followed(-1e-3, 30.0, -1e-9, 30.1)
+    assert (end.weight, end.settled, end.final) == (30.1, True, True)
+    assert end.note == (
+        "The rule mine alternates between 30 and 1e-09: the larger one, which holds back more, is used."
+    )
+    assert not followed(-1e-3, 30.0, -1e-9, 40.0).final
 
 
 @pytest.mark.parametrize(("answer", "same"), [(2.0, True), (2.0 * np.exp(0.0099), True), (2.0 * np.exp(0.0101), False)])
@@ -164,3 +235,47 @@ def test_an_answer_that_is_no_weight_is_refused(answer: float) -> None:
 
 def test_a_weight_of_zero_is_an_answer() -> None:
     assert asked(1, 0.0).weight == 0.0
+
+
+def test_of_a_loss_over_rows_a_dear_rule_is_first_asked_where_weight_one_leads() -> None:
+    over_rows: Any = SimpleNamespace(closed_form=False, separated=object())
+    begun = choosing(rule(5.0), True).begun(over_rows)
+    assert (begun.weight, begun.settled, begun.final, begun.answers) == (1.0, True, False, ())
+    first = begun.confirmed(over_rows)
+    assert (first.weight, first.final, first.answers) == (5.0, False, (5.0,))
+    same = choosing(rule(1.0), True).begun(over_rows).confirmed(over_rows)  # its own answer, which is to be shown
+    assert (same.weight, same.final) == (1.0, False)
+    assert same.selection is not None
+
+
+def test_other_programs_and_quick_rules_are_asked_at_once() -> None:
+    for choice, separated in [(choosing(rule(5.0), True), None), (choosing("reml", True), object())]:
+        program: Any = SimpleNamespace(closed_form=False, separated=separated)
+        assert choice.begun(program) is choice
+    number = choosing(3.0, True)
+    assert number.begun(DEAR) is number
+
+
+@pytest.mark.parametrize("passes", [2, 50])
+def test_a_rule_is_asked_however_few_the_passes(passes: int) -> None:
+    """With few of them at once; with more, not at nominal."""
+    problem = ro.load("blunders").problem
+    nominal: list[bool] = []
+
+    def mine(program: Any) -> ro.select.Selection:
+        nominal.append(bool(np.allclose(program.model.A, at_nominal.A)))
+        return ro.select.Selection(3.0, "mine", np.ones(1), np.ones(1), interior=True)
+
+    at_nominal = problem.linearize(np.zeros(len(problem.parameters.free)))
+    result = ro.calibrate(problem, ro.robust, mine, max_iterations=passes)
+    assert result.weight == 3.0
+    assert nominal[0] == (passes == 2)
+    assert result.converged == (passes == 50)
+
+
+def test_a_rule_is_asked_at_last_where_passes_run_out_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "FEW", 1)
+    result = ro.calibrate(ro.load("blunders").problem, ro.robust, rule(3.0), max_iterations=2)
+    assert not result.converged
+    assert result.selection is not None
+    assert result.weight == 3.0

@@ -330,6 +330,15 @@ def test_points_for_a_rule_are_within_what_newton_promises(
         assert program.solve(one.weight).objective == pytest.approx(other.objective, rel=1e-9)
 
 
+@pytest.mark.parametrize(("name", "over"), [*SMOOTH[-2:], ("norms", "configuration"), ("quantile", "equation")])
+def test_points_for_a_rule_are_as_close_of_few_equations(name: str, over: str) -> None:
+    """Kinks, too, are missed by no more."""
+    weights = np.geomspace(1e2, 1e-3, 6)
+    rough = ro.convex.pose(stated(name, over), MODEL).path(weights, rough=True)
+    for one, other in zip(rough, ro.convex.pose(stated(name, over), MODEL).path(weights), strict=True):
+        assert other.objective * (1 - 1e-10) <= one.objective <= other.objective * (1 + 1e-9)
+
+
 class Counted:
     """How often a method is called."""
 
@@ -354,3 +363,15 @@ def test_a_program_without_some_configurations_is_that_of_the_others() -> None:
         alone = program.on(MODEL.scaled(np.where(out, 0.0, 1.0)))
         for weight in (1e-3, 1.0):
             assert without.solve(weight).objective == pytest.approx(alone.solve(weight).objective, rel=1e-9)
+
+
+def test_some_of_the_data_begin_where_they_were() -> None:
+    """And all of the data hear of it, which is where others of them begin."""
+    program = ro.convex.pose(stated("norms", "configuration"), MODEL)
+    one, other = (program.without(MODEL.group % 4 == k) for k in (1, 2))
+    z = one.solve(1.0).z
+    for each in (one, other, program):
+        assert any(np.array_equal(near.z, z) for near in each._met.near(1.0))
+    other.solve(1.0)
+    assert any(np.array_equal(near.z, z) for near in one._met.near(1.1))
+    assert not any(np.array_equal(near.z, z) for near in other._met.near(1.1))
