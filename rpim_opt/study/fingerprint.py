@@ -97,12 +97,7 @@ def _of_code(thing: Any, seen: Seen) -> Iterator[bytes]:
     if isinstance(thing, ModuleType):
         module = thing.__name__
     yield getattr(thing, "__qualname__", module).encode()
-    known = _of_library(module)
-    if isinstance(thing, FunctionType):  # what a script executes may say that it is of any module
-        known = thing.__code__.co_filename.startswith(LIBRARIES)
-    elif isinstance(thing, ModuleType):  # one that a script loaded by its path is known by that alone
-        known = known and not _is_own(thing)
-    if isinstance(thing, BuiltinFunctionType) or known:
+    if _is_known(thing, module):
         yield module.encode()
     elif isinstance(thing, ModuleType):
         yield sha256(Path(str(thing.__file__)).read_bytes()).digest()
@@ -146,6 +141,17 @@ def _of_object(thing: Any, seen: Seen) -> Iterator[bytes]:
         yield from _parts(getattr(thing, "value", None), seen)
     else:
         yield from _parts(dict(getattr(thing, "__dict__", {})), seen)
+
+
+def _is_known(thing: Any, module: str) -> bool:
+    """Whether a journal knows a function, class or module by its name."""
+    if isinstance(thing, BuiltinFunctionType):
+        return True
+    if isinstance(thing, FunctionType):  # what a script executes may say that it is of any module
+        return thing.__code__.co_filename.startswith(LIBRARIES)
+    if isinstance(thing, ModuleType) and _is_own(thing):  # one that a script loaded by its path
+        return False
+    return _of_library(module)
 
 
 def _is_own(module: ModuleType) -> bool:
