@@ -62,7 +62,7 @@ class Acceptance:
     >>> result = ro.load("position").calibrate()
     >>> found = ro.calibration.accept(result, ro.data.Requirement(limit=1e-4))
     >>> print(found.verdict, f"{1e3 * found.bound:.2f} mm")
-    accepted 0.09 mm
+    accepted 0.08 mm
     >>> print(found.sentences()[1])
     Region: joints within the measured ranges.
     >>> ro.calibration.accept(result, ro.data.Requirement(limit=5e-5)).content()["verdict"]

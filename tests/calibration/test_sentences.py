@@ -167,9 +167,10 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
     assert said(learned()) == []
     assert learned().families == ()
     assert learned().gain("gravity") is None
-    sized = learned({"geometry": Size(2.0, 0.1)}, {"position": Size(5e-5, 0.1)})
+    sized = learned({"lengths": Size(2.0, 0.1), "angles": Size(1.0, 0.1)}, {"position": Size(5e-5, 0.1)})
     assert said(sized) == [
-        "Learned from the data: deviations are 2 times as large as expected (1.8 to 2.2).",
+        "Learned from the data: "
+        "lengths deviate 2 times as much as expected (1.8 to 2.2) and angles 1 times (0.9 to 1.1).",
         "Beside the instrument's noise the robot scatters by " + said(sized)[1].partition("scatters by ")[2],
     ]
 

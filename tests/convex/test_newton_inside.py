@@ -16,6 +16,7 @@ from rpim_opt.convex.interior import _whitened
 from rpim_opt.convex.newton import Newton, Point
 from rpim_opt.convex.objective import Damping
 from tests.convex.test_newton import CASES, MODEL, SMOOTH, stated
+from tests.convex.test_separated import smoothed_value
 
 RNG = np.random.default_rng(4)
 N = MODEL.A.shape[1]
@@ -32,7 +33,7 @@ def made(name: str, over: str, weight: float = 0.7, **more: Any) -> tuple[Newton
 def value(method: Newton, point: Point, a: Array) -> float:
     """The smoothed objective at other coordinates, multipliers as they are."""
     r = method.at.rows @ a - method.at.b
-    return method.loss.smoothed(r, *point.kinked[:2]).value + float(method.pull @ a**2)
+    return smoothed_value(method.loss, r, *point.kinked[:2]) + float(method.pull @ a**2)
 
 
 def slope_at(method: Newton, point: Point, a: Array) -> Array:

@@ -130,11 +130,12 @@ def test_beyond_the_radius_everything_is_worse() -> None:
 
 @pytest.mark.parametrize("angle", [0.05, 1.0, 3.0])
 def test_the_radius_is_where_the_bound_alone_allows_no_more(angle: float) -> None:
-    """A rotation off by an angle has at least a third of |R - R_best|^2 across the best, times the steepness."""
+    """Of x = (1, vec R), whose square is 4, what lies across the best is 4 (1 - c^2), times the steepness."""
     best = smallest(np.hstack([-np.ones((9, 1)), np.eye(9)]))
     steep = replace(best, steepness=2.5, value=1.0, bound=0.75)
     turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
-    across = np.sum((turn - np.eye(3)) ** 2) / 3
+    c = (1 + np.trace(turn)) / 4
+    across = 4 * (1 - c**2)
     assert steep.radius(2.5 * across - 0.25) == pytest.approx(angle, rel=1e-9)
     assert steep.radius(100.0) == pytest.approx(np.pi)
     assert replace(best, steepness=0.0).radius(0.0) == pytest.approx(np.pi)
