@@ -106,6 +106,21 @@ def by_rows(
     rough
         Whether a point that a rule compares with others will do.
     """
+    method = _method(objective, weight, damping, rough)
+    if method is None:
+        return None
+    with phase("solve"), np.errstate(all="ignore"):
+        ended = _ended(method, near)
+    if ended is None or not (ended.good or ended.close):
+        return None
+    duals = ()
+    if method.box is not None:
+        duals = shares(objective, method.box, ended.z, method.multipliers(ended))
+    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss, ended.loss)
+
+
+def _method(objective: Objective, weight: float, damping: Damping | None, rough: bool) -> Newton | Worst | None:
+    """Return what minimizes the program; None where its loss is no sum and no largest, or nothing is to be moved."""
     loss = objective.separated or objective.worst
     if loss is None:
         return None
@@ -121,14 +136,7 @@ def by_rows(
         method = Newton(loss, at, weight, box, rough)
     if not at.rows.shape[1] or (box is not None and not method.whole):
         return None
-    with phase("solve"), np.errstate(all="ignore"):
-        ended = _ended(method, near)
-    if ended is None or not (ended.good or ended.close):
-        return None
-    duals = ()
-    if box is not None:
-        duals = shares(objective, box, ended.z, method.multipliers(ended))
-    return Found("optimal", ended.z, duals, max(ended.steps, 1)), Near(ended.z, ended.kinked, ended.of_loss, ended.loss)
+    return method
 
 
 def _ended(method: Newton | Worst, near: Sequence[Near]) -> Ended | None:

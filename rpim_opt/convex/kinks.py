@@ -139,31 +139,33 @@ class _Reduced:
         """Return the norms that the priced variables stand for, and add to g what they have of a line."""
         price = self.price.copy()
         starts = (self.single + np.cumsum([0, *self.cones]))[:-1]
-        cone_rows = np.zeros(len(self.r), dtype=bool)
-        cone_rows[self.single :] = True
         cone_of = self._cones(starts)
         if cone_of is None:
             return None
+        found = self._absolute(price, cone_of, g)
+        if found is None:
+            return None
+        for t, place in cone_of.items():
+            if price[t] <= 0:
+                return None
+            top = starts[place]
+            below = slice(top + 1, top + self.cones[place])
+            found.append((-self.B[below], -self.r[below], float(price[t])))
+        return found
+
+    def _absolute(self, price: Array, cone_of: dict[int, int], g: Array) -> list[tuple[Array, Array, float]] | None:
+        """Return the absolute values that variables bounded by no cone stand for; None where one is something else."""
         found: list[tuple[Array, Array, float]] = []
         used = np.zeros(self.single, dtype=bool)
         for t in range(len(price)):
-            rows = np.flatnonzero(self.E[: self.single, t])
-            if t in cone_of or not len(rows):
+            if t in cone_of:
                 continue
+            rows = np.flatnonzero(self.E[: self.single, t])
             if price[t] < 0 or not self._pair(t, rows, price, cone_of, g, found):
                 return None
             used[rows] = True
         if not used.all():
             return None  # inequalities of v alone: a domain
-        for t, place in cone_of.items():
-            if price[t] < 0 or price[t] == 0:
-                return None
-            top = starts[place]
-            below = slice(top + 1, top + self.cones[place])
-            found.append((-self.B[below], -self.r[below], float(price[t])))
-        unbounded = [t for t in range(len(price)) if t not in cone_of and not self.E[: self.single, t].any()]
-        if unbounded:
-            return None
         return found
 
     def _cones(self, starts: np.ndarray) -> dict[int, int] | None:

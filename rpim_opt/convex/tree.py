@@ -219,23 +219,31 @@ class _Reading:
             return Affine(1.0, 0.0)
         if e.is_constant():
             return self._constant(e)
-        kind = type(e).__name__
         if e.shape != self.shape:
             return None
+        kind = type(e).__name__
         if kind == "AddExpression":
-            parts = [self.affine(arg) for arg in e.args]
-            if any(part is None for part in parts):
+            terms = [(1.0, arg) for arg in e.args]
+        elif kind == "NegExpression":
+            terms = [(-1.0, e.args[0])]
+        else:
+            multiple = _multiple(e)
+            if multiple is None:
                 return None
-            return Affine(sum(p.a for p in parts if p), sum(p.c for p in parts if p))
-        factor, inner = -1.0, e.args[0]
-        if kind != "NegExpression":
-            factor, inner = _multiple(e) or (None, None)
-        if inner is None:
-            return None
-        of = self.affine(inner)
-        if of is None:
-            return None
-        return Affine(factor * of.a, factor * of.c)
+            terms = [multiple]
+        return self._combined(terms)
+
+    def _combined(self, terms: list[tuple[Any, Any]]) -> Affine | None:
+        """Return the sum of factors times expressions."""
+        a: Any = 0.0
+        c: Any = 0.0
+        for factor, expression in terms:
+            of = self.affine(expression)
+            if of is None:
+                return None
+            a = a + factor * of.a
+            c = c + factor * of.c
+        return Affine(a, c)
 
     def _constant(self, e: Any) -> Affine | None:
         value = np.asarray(e.value, dtype=float)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from itertools import chain
 from string import ascii_uppercase
 
 import numpy as np
@@ -138,16 +139,21 @@ def _joined(parts: Mapping[str, CalibrationProblem], common: Sequence[str]) -> P
         if number > 0:
             table = table.take(np.flatnonzero([own not in common for own in table.names]))
         tables.append(_called(table, name, common))
+    values = {what: np.concatenate([getattr(table, what) for table in tables]) for what in VALUES}
     return Parameters(
-        names=tuple(name for table in tables for name in table.names),
-        dimensions=tuple(dimension for table in tables for dimension in table.dimensions),
-        nominal=np.concatenate([table.nominal for table in tables]),
-        scale=np.concatenate([table.scale for table in tables]),
-        tolerance=np.concatenate([table.tolerance for table in tables]),
-        identified=np.concatenate([table.identified for table in tables]),
-        own_frames=tuple(dict.fromkeys(prefix for table in tables for prefix in table.own_frames)),
-        terms=tuple(dict.fromkeys(name for table in tables for name in table.terms)),
+        names=_listed(tables, "names"),
+        dimensions=_listed(tables, "dimensions"),
+        own_frames=tuple(dict.fromkeys(_listed(tables, "own_frames"))),
+        terms=tuple(dict.fromkeys(_listed(tables, "terms"))),
+        **values,
     )
+
+
+VALUES = ("nominal", "scale", "tolerance", "identified")
+
+
+def _listed(tables: Sequence[Parameters], what: str) -> tuple[str, ...]:
+    return tuple(chain.from_iterable(getattr(table, what) for table in tables))
 
 
 def _called(table: Parameters, robot: str, common: Sequence[str]) -> Parameters:

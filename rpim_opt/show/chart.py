@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ class Axis:
     Parameters
     ----------
     label
-        What is drawn, with its unit; of names what they are, said where there is no room for them.
+        What is drawn, with its unit; empty where names speak for themselves.
     ends
         The least and the largest value that have to be seen; what lies beyond stands at the edge.
     log
@@ -171,6 +171,6 @@ class Chart:
     alike: bool = False
 
     @property
-    def legend(self) -> Iterator[tuple[Role, str]]:
-        """What colours stand for, each text once."""
-        return iter({mark.label: (mark.role, mark.label) for mark in self.marks if mark.label}.values())
+    def legend(self) -> list[tuple[Role, str]]:
+        """What colours stand for, each once."""
+        return list(dict.fromkeys((mark.role, mark.label) for mark in self.marks if mark.label))

@@ -148,4 +148,4 @@ def deviations_chart(result: Calibration, dimension: str, half: Array, confidenc
     across = Axis(f"deviation from nominal [{unit}]", (-reach, reach))
     cut = "Intervals beyond the edge are cut." if (np.abs(x) + spread > reach).any() else ""
     title = f"Deviations of the {dimension} parameters"
-    return Chart(title, across, Axis("parameter", names=names), marks, cut, 60 + 17 * len(own))
+    return Chart(title, across, Axis("", names=names), marks, cut, 60 + 17 * len(own))

@@ -66,7 +66,7 @@ def choices_chart(chosen: Mapping[str, Selection]) -> Chart:
             marks.append(Dots(weight[at], at + 1.0, "after", said, hints, hollow=hollow))
     names = [name for name, _ in ordered]
     x = Axis("weight", (weight.min(), weight.max()), log=True)
-    return Chart("Weights that selectors choose", x, Axis("selector", names=names), marks, height=60 + 17 * len(names))
+    return Chart("Weights that selectors choose", x, Axis("", names=names), marks, height=60 + 17 * len(names))
 
 
 def picard_chart(program: Program, weight: float) -> Chart:

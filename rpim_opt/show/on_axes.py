@@ -72,25 +72,23 @@ def _scaled(ax: Axes, which: str, axis: Axis) -> None:
     if axis.log or axis.linear_to:
         getattr(ax, f"{which}axis").set_major_formatter("{x:g}")  # 0.1 in the place of powers of ten
     limits = axis.limits
-    label = axis.label
-    if axis.names and _named(ax, which, axis.names) and len(axis.names) > 3:
-        label = ""
-    if which == "y" and axis.names:
-        limits = limits[::-1]
-    ax.set(**{f"{which}lim": limits, f"{which}label": label})
+    if axis.names:
+        _name(ax, which, axis.names)
+        if which == "y":
+            limits = limits[::-1]
+    ax.set(**{f"{which}lim": limits, f"{which}label": axis.label})
 
 
-def _named(ax: Axes, which: str, names: Sequence[str]) -> bool:
+def _name(ax: Axes, which: str, names: Sequence[str]) -> None:
     """Write names at 1, 2, ... where there is room for letters that can be read."""
     box = ax.get_window_extent()
     room, largest = (box.width, FONT) if which == "x" else (box.height, UPRIGHT)
     size = room * 72 / ax.figure.dpi / (APART * len(names))
     if size < SMALLEST:
-        return False
+        return
     turned = 90 if which == "x" and len(names) > 3 else 0
     ticks = range(1, len(names) + 1)
     getattr(ax, f"set_{which}ticks")(ticks, names, fontsize=max(min(size, largest), SMALLEST), rotation=turned)
-    return True
 
 
 def _draw(ax: Axes, mark: Mark) -> None:

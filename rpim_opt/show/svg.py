@@ -100,11 +100,10 @@ class Picture:
         longest = max(map(len, names), default=0)
         self.named = len(names) <= MANY and longest <= LONG
         self.upright = self.named and sum(len(name) + 1 for name in names) * LETTER > WIDTH - 80
-        self.label = "" if self.named and names and len(names) > 3 else chart.x.label
         below = 16
         if self.upright:
             below = 4 + 8 * longest
-        below += 24 if self.label else 8
+        below += 24 if chart.x.label else 8
         self.x.start = 30.0 + LETTER * max((len(text) for _, text in self.y.ticks()), default=1)
         self.x.end = float(WIDTH - RIGHT)
         tall = chart.height - below - TOP
@@ -154,9 +153,7 @@ class Picture:
 
     def _labels(self) -> Iterator[Element]:
         middle = f"{(self.x.start + self.x.end) / 2:g}"
-        yield tag("text", self.label, x=middle, y=self.height - 6, text_anchor="middle", class_="name")
-        if self.chart.y.names:
-            return
+        yield tag("text", self.chart.x.label, x=middle, y=self.height - 6, text_anchor="middle", class_="name")
         aside = f"{(TOP + self.floor) / 2:g}"
         turned = f"rotate(-90 12 {aside})"
         yield tag("text", self.chart.y.label, x=12, y=aside, text_anchor="middle", transform=turned, class_="name")

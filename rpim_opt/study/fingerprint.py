@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import sysconfig
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import partial
 from hashlib import sha256
@@ -57,20 +57,27 @@ def _parts(thing: Any, seen: Seen) -> Iterator[bytes]:
     yield type(thing).__qualname__.encode()
     if isinstance(thing, np.ndarray | np.generic):
         yield from _of_array(np.asarray(thing))
-    elif isinstance(thing, Mapping):
-        yield from _all([each for pair in thing.items() for each in pair], seen)
     elif isinstance(thing, set | frozenset):
         yield from sorted(fingerprint(each).encode() for each in thing)
-    elif isinstance(thing, list | tuple):
-        yield from _all(thing, seen)
-    elif isinstance(thing, partial):
-        yield from _all([thing.func, thing.args, thing.keywords], seen)
-    elif isinstance(thing, MethodType):
-        yield from _all([thing.__func__, thing.__self__], seen)
     elif isinstance(thing, FunctionType | BuiltinFunctionType | type | ModuleType | CodeType):
         yield from _of_code(thing, seen)
     else:
-        yield from _of_object(thing, seen)
+        held = _held(thing)
+        yield from _of_object(thing, seen) if held is None else _all(held, seen)
+
+
+def _held(thing: Any) -> Sequence[Any] | None:
+    """Return what is all there is to a container or a bound function; None for anything else."""
+    match thing:
+        case Mapping():
+            return [each for pair in thing.items() for each in pair]
+        case list() | tuple():
+            return thing
+        case partial():
+            return [thing.func, thing.args, thing.keywords]
+        case MethodType():
+            return [thing.__func__, thing.__self__]
+    return None
 
 
 def _all(things: Any, seen: Seen) -> Iterator[bytes]:
