@@ -45,6 +45,8 @@ def ratios(problem: CalibrationProblem, x: Array) -> Array:
         components[block.row] = [dimensions.count("length"), dimensions.count("angle")]
     found = np.zeros(len(problem.data))
     for dimension, counts in zip(("length", "angle"), components.T, strict=True):
+        if not counts.any():
+            continue
         errors = np.nan_to_num(problem.errors(x, dimension))
         for k in np.unique(counts[counts > 0]):
             rows = np.flatnonzero(counts == k)
@@ -79,8 +81,9 @@ def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     scale
         (n,) their expected sizes [SI].
     """
-    X = problem.jacobian(x) * scale
-    y = problem.residual(x) + problem.jacobian(x) @ x
+    residual, jacobian = problem.slopes(x)
+    X = jacobian * scale
+    y = residual + jacobian @ x
     rows = np.concatenate([np.repeat(b.row, len(b.measurement.components)) for b in problem.data.blocks])
     kinds = np.concatenate([_kinds(b.measurement.components.values(), len(b.row)) for b in problem.data.blocks])
     z = x / scale

@@ -326,12 +326,42 @@ def run(
     Positions that constraints ask for are linear about deviations ``about`` (n,) [SI]; of regions also those that move
     farthest at ``farthest`` (n,) [SI].
     """
+    loop, state = _rested(
+        problem, formulation, weight, start, max_iterations, tolerance, progress, how, (about, farthest)
+    )
+    try:
+        evidence = _certified(loop, formulation, problem, state)
+    except NoSolutionFound as error:
+        raise error.naming(_names(loop.source)) from None
+    converged = state.outcome == "rest" and evidence.holds(state.z)
+    message = _message(state, evidence, converged, max_iterations)
+    return Ended(state, evidence, loop.source.parameters.free.scale * state.z, converged, message)
+
+
+def nearby(problem: Source, formulation: Formulation, weight: float, start: Array, tolerance: float) -> Array:
+    """Return deviations (n,) [SI] near to a minimum, on the way to another: nothing certifies them."""
+    loop, state = _rested(problem, formulation, weight, start, tolerance=tolerance)
+    return loop.source.parameters.free.scale * state.z
+
+
+def _rested(
+    problem: Source,
+    formulation: Formulation,
+    weight: float | str | Selector,
+    start: Array | None,
+    max_iterations: int = 500,
+    tolerance: float = 1e-8,
+    progress: Callable[[Iteration], None] | None = None,
+    how: Mapping[str, Any] = MappingProxyType({}),
+    about: tuple[Array | None, Array | None] = (None, None),
+) -> tuple[Loop, State]:
+    """Return the loop and the state that it ends in."""
     source = in_parts(problem.frozen())
     solved = formulation
     reweigh = None
     if not source.keeps_rows:
         solved, reweigh = on_triangles(formulation, _equations(source))
-    loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations, (about, farthest))
+    loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations, about)
     try:
         state = _begun(loop, solved, choosing(weight, formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= max_iterations:
@@ -339,13 +369,9 @@ def run(
             state = loop.confirmed(loop.advanced(loop.chosen(state)))
             if progress and len(state.history) > passes:
                 progress(state.history[-1])
-        state = loop.answered(state)
-        evidence = _certified(loop, formulation, problem, state)
+        return loop, loop.answered(state)
     except NoSolutionFound as error:
         raise error.naming(_names(source)) from None
-    converged = state.outcome == "rest" and evidence.holds(state.z)
-    message = _message(state, evidence, converged, max_iterations)
-    return Ended(state, evidence, source.parameters.free.scale * state.z, converged, message)
 
 
 def _floor(merit: float) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
-from rpim_opt.calibration.loop import require_finite, run
+from rpim_opt.calibration.loop import nearby, require_finite
 from rpim_opt.convex.evidence import Believed, Evidence, Linearized, Point, alike
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.prior import Prior
@@ -169,7 +169,7 @@ class Learning:
         mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
         if _moved(mean, x, laid) > CLOSE:  # too far for one linearization
             penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-            mean = run(laid, penalized, 1.0, x, tolerance=NEAR).x
+            mean = nearby(laid, penalized, 1.0, x, NEAR)
         return Fit(problem, evidence, point, others, laid, mean)
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:

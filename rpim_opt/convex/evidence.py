@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, get_lapack_funcs
@@ -131,6 +131,15 @@ class _Whitened:
     logdet: float
 
 
+class _Informed(NamedTuple):
+    """The stacks at some noise, and what they and what is known say of the deviations: H (p, p) and h (p,)."""
+
+    noise: bytes
+    parts: Sequence[_Whitened]
+    H: Array
+    h: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """The evidence of one linearization as a function of sizes.
@@ -185,12 +194,7 @@ class Evidence:
     def at(self, logs: Array, before: Point | None = None, settled: float = SETTLED) -> Point:
         """Return the evidence at logarithms of sizes (s,); local variances are looked for from those of a point on."""
         b = self.believed
-        whitened = self._whiten(self.scatter(logs))
-        H = b.rows.T @ b.rows
-        h = b.rows.T @ b.values
-        for part in whitened:
-            H = H + part.X.T @ part.X
-            h = h + part.X.T @ part.y
+        _, whitened, H, h = self._informed(logs)
         size2 = self._size2(logs)
         v = size2
         if before is not None:
@@ -216,6 +220,25 @@ class Evidence:
         heavy = np.flatnonzero(b.heavy & ~b.replaced)
         size = np.sqrt(self._size2(point.logs)[heavy])
         return added(point.z, point.C, point.v, heavy, size, b.tails)
+
+    def _informed(self, logs: Array) -> _Informed:
+        """Return what the data say at a noise; the last one is kept, as often only sizes of deviations change."""
+        b = self.believed
+        noise = logs[len(b.names) :].tobytes()
+        if self._last and self._last[0].noise == noise:
+            return self._last[0]
+        parts = self._whiten(self.scatter(logs))
+        H = b.rows.T @ b.rows
+        h = b.rows.T @ b.values
+        for part in parts:
+            H = H + part.X.T @ part.X
+            h = h + part.X.T @ part.y
+        self._last[:] = [_Informed(noise, parts, H, h)]
+        return self._last[0]
+
+    @cached_property
+    def _last(self) -> list[_Informed]:
+        return []
 
     def _whiten(self, scatter: Scatter) -> list[_Whitened]:
         p = self.data.X.shape[1]
@@ -296,6 +319,8 @@ class Evidence:
         """Return the gradient by the logarithms of the noise: 2 s^2 [tr(Q K) - u'K u], Q = R^-1 - R^-1 X C X'R^-1."""
         variance = np.exp(2 * logs[len(self.believed.names) :])
         total = np.zeros(len(self.noise))
+        if not self.noise:
+            return total
         for part in whitened:
             N, k = part.stack.index.shape
             back = part.inverse.transpose(0, 2, 1)
