@@ -27,8 +27,9 @@ MOST = 1000
 """Configurations that sizes are learned from, drawn at random where there are more."""
 ROUNDS = 6
 """Linearizations at which sizes are looked for."""
-ASKED = 3.0
-"""By how much -2 ln L must fall for a doubted prior: on simulated fleets no arm of another kind was harmed then."""
+ASKED = 6.0
+"""By how much -2 ln L must fall for a doubted prior: a likelihood ratio of twenty, which by Markov's inequality an arm
+of another kind shows once in twenty times at most."""
 LOOKS = 4
 """How often blunders are looked for again without those that were found: they hide behind each other."""
 STEP = 0.05
