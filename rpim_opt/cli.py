@@ -667,7 +667,9 @@ def study(
     quick: Annotated[bool, typer.Option(help="The small version.")] = False,
     workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on where an interrupted run was.")] = False,
+    resume: Annotated[
+        bool | None, typer.Option(help="Go on where an interrupted run was, or begin anew in spite of it.")
+    ] = None,
     redraw: Annotated[bool, typer.Option(help="Only write the report anew, from the last run's replicates.")] = False,
     gate: Annotated[bool, typer.Option(help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the results.")] = None,
@@ -712,7 +714,10 @@ def compare(
     against: Annotated[str | None, typer.Option(help="Method that others are compared with: 'tikhonov, reml'.")] = None,
     workers: Annotated[int, typer.Option(help="Processes on this machine.")] = 1,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to compute on.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on where an interrupted run with the same --out was.")] = False,
+    resume: Annotated[
+        bool | None,
+        typer.Option(help="Go on where an interrupted run with the same --out was, or begin anew in spite of it."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page, the replicates and the figure.")] = None,
     as_json: Json = False,
 ) -> None:

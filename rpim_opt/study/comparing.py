@@ -41,7 +41,7 @@ def compare(
     workers: int = 1,
     scheduler: Any = None,
     journal: str | Path | None = None,
-    resume: bool = True,
+    resume: bool | None = True,
     progress: bool | Callable[[int, int], None] = True,
 ) -> Comparison:
     """Compare formulations, selectors and anybody's methods on problems, by what they say of data they did not see.
@@ -88,7 +88,7 @@ def compare(
         A file that every finished replicate is written to at once. A call with the same code and arguments goes on
         with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused.
     resume
-        False to begin the journal anew.
+        False to begin the journal anew; None refuses to drop what an interrupted run has computed.
     progress
         Whether a bar with the time left is shown where a person is watching; or a function that is told how many
         replicates of how many are done.

@@ -20,16 +20,25 @@ Row = dict[str, Any]
 class Journal:
     """A file with one line a finished replicate, written at once: what was computed is not lost.
 
-    Its first line says which code computes; only that code goes on with it. Without a path nothing is written.
+    Its first line says which code computes; only that code goes on with it. Without a path nothing is written. What an
+    interrupted run left there is gone on with where ``resume`` is true, is dropped where it is false, and is refused
+    where it is None: nobody has said what is to become of it.
     """
 
-    def __init__(self, path: Path | None, cases: Sequence[Mapping[str, Any]], code: Mapping[str, str], resume: bool):
+    def __init__(
+        self, path: Path | None, cases: Sequence[Mapping[str, Any]], code: Mapping[str, str], resume: bool | None
+    ):
         self.path = path
         self.code = dict(code)
         self.cases = [(json.dumps(case, sort_keys=True), case) for case in cases]
         self.done: dict[str, Row] = {}
-        if path is not None and resume and (path.exists() or path.is_symlink()):
-            self.done = self._finished(path)
+        before = None
+        if path is not None and (path.exists() or path.is_symlink()):
+            before = path
+        if before is not None and resume is None:
+            require_nothing_computed(before)
+        if before is not None and resume:
+            self.done = self._finished(before)
         else:
             self.close()
             self._write({"code": self.code})
@@ -109,6 +118,14 @@ class Journal:
             return
         with refused(self.path):
             self.path.unlink(missing_ok=True)
+
+
+def require_nothing_computed(path: Path) -> None:
+    """Refuse to drop what an interrupted run has computed."""
+    count = read_bytes(path, LARGEST_DATA).count(b"\n") - 1  # the first line is on the code
+    if count > 0:
+        accepted = "resume, to go on with them, or no-resume, to begin anew"
+        raise InputError("resume", f"{count} replicates of an interrupted run", accepted, path)
 
 
 def table_of(rows: Sequence[Row], made: str) -> bytes:

@@ -20,7 +20,7 @@ def run_study(
     quick: bool = False,
     workers: int = 1,
     scheduler: Any = None,
-    resume: bool = False,
+    resume: bool | None = None,
     redraw: bool = False,
     out: Path | None = None,
     progress: Progress = silent,
@@ -41,7 +41,8 @@ def run_study(
     scheduler
         Address of a Dask scheduler to compute on instead, or a client of one.
     resume
-        Go on where an interrupted run was; otherwise everything is computed anew.
+        Go on where an interrupted run was; if false everything is computed anew. With None that is refused as long as
+        replicates of an interrupted run are there.
     redraw
         Compute nothing: write the report anew from the replicates of the last run, which say what made them.
     out

@@ -112,6 +112,8 @@ def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
     assert len(journal.read_text().splitlines()) == 1 + 3
     with journal.open("a") as stream:
         stream.write('{"case": {"seed": 5}, "fou')  # cut off while it was written
+    with pytest.raises(ro.InputError, match="resume: found 3 replicates of an interrupted run"):
+        run_study("toy", out=out)  # nobody has said that they may be dropped
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out, resume=True)
     toy(stop=False)
@@ -121,6 +123,16 @@ def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
     assert not journal.exists()
     fresh, _ = run_study("toy", out=tmp_path / "fresh")
     assert resumed.metrics == fresh.metrics
+
+
+def test_a_killed_study_begins_anew_where_that_is_said(toy, tmp_path: Path) -> None:
+    folder, out = toy(stop=True), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run_study("toy", out=out)
+    toy(stop=False)
+    (folder / "log.txt").unlink()
+    run_study("toy", out=out, resume=False)
+    assert (folder / "log.txt").read_text().split() == [str(k) for k in range(12)]
 
 
 def test_the_gate(toy, tmp_path: Path) -> None:
@@ -333,7 +345,7 @@ def test_a_journal_of_other_code_is_refused(toy, tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="replicates of another set of studies"):
         run_study("toy", out=tmp_path / "out", resume=True)
     assert journal.read_text() == before
-    run_study("toy", out=tmp_path / "out")  # anew
+    run_study("toy", out=tmp_path / "out", resume=False)  # anew
 
 
 ODD = {
