@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.blunders import clustered
-from rpim_opt.calibration.families import members
+from rpim_opt.calibration.families import SESSIONS, members
 from rpim_opt.calibration.learning import sampled
 from rpim_opt.calibration.models import candidates, extended, restricted
 from rpim_opt.calibration.outcome import Outcome
@@ -23,7 +23,12 @@ SPEAK = 10.0
 """By how much -2 ln L must fall for a family to be spoken of: 4 is what a false pick gains, 10 none in many."""
 EXACT = 1e-7
 """Relative accuracy of -2 ln L: far below what decides."""
-OWNED = {"gravity": ("compliance", "bend"), "first harmonic": ("ecc",), "second harmonic": ("ecc2",)}
+OWNED = {
+    "gravity": ("compliance", "bend"),
+    "first harmonic": ("ecc",),
+    "second harmonic": ("ecc2",),
+    SESSIONS: ("session",),
+}
 """Families whose worth is asked, and what stands for them."""
 KNOWN = Prior(joint_offset=1.0, frames=1.0)
 """What is believed once scales were learned: they are as the problem says."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.family import families, family_scales
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix
 
 TURNED = 2.0
 """Harmonics are looked for in joints that turned further [rad]: over less they are curve fitting."""
@@ -23,7 +23,9 @@ CANDIDATES = (
     ("gravity", "first harmonic"),
     ("gravity", "first harmonic", "second harmonic", "moments"),
 )
-"""The models that are compared."""
+"""The models of the arm that are compared."""
+SESSIONS = "sessions"
+"""The family of what the readings of a session have in common, which is none of the arm."""
 
 
 def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
@@ -32,7 +34,21 @@ def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
     for robot in problem.arms:
         for family, names in _of_robot(problem, robot).items():
             found[family] = tuple(dict.fromkeys((*found.get(family, ()), *names)))
+    shifts = _of_sessions(problem)
+    if shifts:
+        found[SESSIONS] = shifts
     return found
+
+
+def _of_sessions(problem: CalibrationProblem) -> tuple[str, ...]:
+    """Return the shifts of sessions that are not identified yet, if sessions differ from single configurations."""
+    data = problem.data
+    known = set(problem.parameters.free.names)
+    prefixes = {session_prefix(name) for name in data.sessions}
+    if not 2 <= len(prefixes) <= len(np.unique(data.configuration)) / 2:
+        return ()
+    of_data = [name for name in problem.parameters.names if frame_of(name) in prefixes]
+    return tuple(name for name in of_data if name not in known)
 
 
 def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
@@ -59,6 +75,6 @@ def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> Calibrat
     scale = p.scale.copy()
     identified[index] = True
     for name, robot in problem.arms.items():
-        mine = [i for i in p.places_of(name) if i in index]
+        mine = [i for i in p.places_of(name) if i in index and not of_session(p.names[i])]
         scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
     return problem.with_parameters(replace(p, identified=identified, scale=scale))

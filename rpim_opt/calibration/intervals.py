@@ -11,6 +11,7 @@ from scipy.special import chdtrc, stdtrit
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.sessions import unknown_sessions
 from rpim_opt.problem.source import Source
 
 Interval = Literal["mean", "reached", "reading"]
@@ -56,7 +57,8 @@ def scattered(problem: CalibrationProblem, level: float) -> Scattered:
     """Return what robot and instrument add to the model of some measurements.
 
     A problem whose robot's scatter was learned knows its parts. Of another one the robot's is what the residuals show
-    beyond the declared noise, (level - 1) Sigma.
+    beyond the declared noise, (level - 1) Sigma. A reading of a session that the problem does not know has that
+    session's shift besides, where those of others were identified.
 
     Parameters
     ----------
@@ -65,10 +67,12 @@ def scattered(problem: CalibrationProblem, level: float) -> Scattered:
     level
         The noise's variance over the declared one, at least 1.
     """
+    robot = [(level - 1) * V for V in problem.covariances()]
+    reading = [level * V for V in problem.covariances()]
     if problem.scatter is not None:
-        return Scattered(problem.covariances(reading=False), problem.covariances())
-    stated = problem.covariances()
-    return Scattered([(level - 1) * V for V in stated], [level * V for V in stated])
+        robot = problem.covariances(reading=False)
+        reading = problem.covariances()
+    return Scattered(robot, [V + more for V, more in zip(reading, unknown_sessions(problem), strict=True)])
 
 
 def position_noise(source: Source) -> Array:

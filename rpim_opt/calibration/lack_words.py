@@ -20,11 +20,13 @@ WHAT = {
     "first harmonic": "unevenly turning joints (eccentric encoders or gears)",
     "second harmonic": "second harmonics of joints",
     "moments": "gravity on masses elsewhere than supposed",
+    "sessions": "a registration that differs from session to session",
 }
 DOES = {
     "gravity": "The arm bends under gravity",
     "first harmonic": "Joints turn unevenly (eccentric encoders or gears)",
     "second harmonic": "Joints turn unevenly twice a turn",
+    "sessions": "The registration differs from session to session",
 }
 
 

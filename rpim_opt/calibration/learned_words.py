@@ -6,10 +6,14 @@ import numpy as np
 
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.learned import Learned, Size
+from rpim_opt.convex.prior import SESSIONS
 from rpim_opt.robot.family import EXPECTED
 from rpim_opt.robot.overlay import is_joint_offset
+from rpim_opt.robot.parameter_names import of_session, own_name
 
 UNITS = {"position": ("mm", 1e3), "orientation": ("mrad", 1e3), "joint": ("mrad", 1e3), "instrument": ("times", 1.0)}
+SIZED = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}
+"""Unit in which what sessions differ by is said, and its size in SI."""
 WORDS = {
     "position": "{} in position",
     "orientation": "{} in orientation",
@@ -35,7 +39,7 @@ NEGLIGIBLE = 0.1
 
 def sentences(learned: Learned, names: tuple[str, ...], z: np.ndarray) -> list[str]:
     """Return what was learned; parameters' names (n,), and deviations z (n,) in units of the local scales."""
-    lines = [_sizes(learned), _noise(learned)]
+    lines = [_sizes(learned), _noise(learned), _sessions(learned, names)]
     lines += [_model(learned)] if learned.trials else []
     lines += _unusual(learned, names, z)
     lines += _left_out(learned)
@@ -49,10 +53,19 @@ def _range(size: Size, factor: float = 1.0) -> str:
     return f"{low:.2g} to {high:.2g}"
 
 
+def _figure(size: Size, unit: str, factor: float) -> str:
+    """Say a size in a unit with its range, or only the upper end where little is known of it."""
+    if size.spread > VAGUE:
+        return f"at most {factor * size.value * np.exp(size.spread):.2g} {unit}"
+    return f"{factor * size.value:.2g} {unit} ({_range(size, factor)})"
+
+
 def _sizes(learned: Learned) -> str:
     said = []
     much = "{} deviate {} times as much as expected ({})"
     for name, size in learned.sizes.items():
+        if name in SESSIONS.values():
+            continue
         if name in FAMILIES:
             figure = f"{1e3 * EXPECTED * size.value:.2g} mrad ({_range(size, 1e3 * EXPECTED)})"
             said.append(FAMILIES[name].format(figure))
@@ -68,15 +81,30 @@ def _noise(learned: Learned) -> str:
     largest = max((size.value for kind, size in learned.noise.items() if kind != "instrument"), default=0.0)
     said = []
     for kind, size in learned.noise.items():
-        unit, factor = UNITS[kind]
-        figure = f"{factor * size.value:.2g} {unit} ({_range(size, factor)})"
-        if size.spread > VAGUE:
-            figure = f"at most {factor * size.value * np.exp(size.spread):.2g} {unit}"
+        figure = _figure(size, *UNITS[kind])
         if kind == "instrument" or size.value > NEGLIGIBLE * largest:
             said.append(WORDS[kind].format(figure))
     if not said:
         return ""
     return f"Beside the instrument's noise the robot scatters by {joined(said)}."
+
+
+def _sessions(learned: Learned, names: tuple[str, ...]) -> str:
+    """Say by how much sessions differ, a coordinate and an axis."""
+    said = []
+    for dimension, group in SESSIONS.items():
+        if group not in learned.sizes:
+            continue
+        turn = {"length": False, "angle": True}[dimension]
+        scale = next(
+            s for name, s in zip(names, learned.stated, strict=True)
+            if of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn
+        )  # fmt: skip
+        unit, si = SIZED[dimension]
+        said.append(_figure(learned.sizes[group], unit, scale / si))
+    if not said:
+        return ""
+    return f"Sessions differ by {joined(said)}."
 
 
 def _model(learned: Learned) -> str:

@@ -156,9 +156,9 @@ def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
     if start is not None:
         return require_start(start, len(p.free))
     x = np.zeros(len(p.free))
-    frames = p.of_frames & p.identified
+    frames = p.placed & p.identified
     if frames.any():  # those stated far from there count from there already
-        x[p.of_frames[p.identified]] = settled(problem.identifying(frames))
+        x[p.placed[p.identified]] = settled(problem.identifying(frames))
     return x
 
 

@@ -7,14 +7,16 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.families import CANDIDATES, MANY, identifying, members
+from rpim_opt.calibration.families import CANDIDATES, MANY, SESSIONS, identifying, members
 from rpim_opt.calibration.learned import Trial
 from rpim_opt.calibration.sizing import Fit, Learning
 from rpim_opt.convex.evidence import Evidence, Point
 from rpim_opt.problem.problem import CalibrationProblem
 
 GAIN = 6.0
-"""By how much -2 ln L must fall for a model with families: of 306 simulated arms without them one gained more."""
+"""By how much -2 ln L must fall for a model with families: of 306 simulated arms without them one gained more.
+
+For sessions once more: they are another question."""
 LARGE = 3.0
 """By how much larger, in their logarithms, families are expected in another start."""
 COMPARED = 1e-6
@@ -55,7 +57,7 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
         used = own.union(*(families[family] for family in candidate))
         evidence = restricted(columns, np.array([name in used for name in names]))
         point = evidence.mode(_starts(evidence, fit), COMPARED)[0]
-        trials.append((point.value + GAIN * bool(candidate), candidate, point))
+        trials.append((point.value + GAIN * _questions(candidate), candidate, point))
     trials.sort(key=lambda trial: trial[0])
     _, best, point = trials[0]
     added = tuple(name for family in best for name in families[family])
@@ -68,7 +70,14 @@ def candidates(problem: CalibrationProblem, families: dict[str, tuple[str, ...]]
     if len(np.unique(problem.data.configuration)) < MANY:
         tried = CANDIDATES[:-1]
     possible = [tuple(family for family in candidate if family in families) for candidate in tried]
+    if SESSIONS in families:
+        possible += [(*candidate, SESSIONS) for candidate in possible]
     return list(dict.fromkeys(possible))
+
+
+def _questions(families: tuple[str, ...]) -> int:
+    """Return how many questions a model answers with yes: whether the arm has families, and whether sessions differ."""
+    return bool(set(families) - {SESSIONS}) + (SESSIONS in families)
 
 
 def extended(problem: CalibrationProblem, x: Array, names: tuple[str, ...]) -> tuple[CalibrationProblem, Array]:

@@ -125,7 +125,7 @@ class Grouped:
 
         How far a tripod stands says nothing about a gear. The rows are projected off their columns.
         """
-        frames = self.model.parameters.of_frames
+        frames = self.model.parameters.placed
         alone = [g for g in range(len(self.names)) if frames[self.member == g].all()]
         free = (self.own == 0) | (frames & ~np.isin(self.member, alone))
         R, r = self.triangle

@@ -20,11 +20,13 @@ from rpim_opt.convex.stated import FIXED, FRAMES, JOINT_OFFSET, Stated, default_
 from rpim_opt.convex.statement import Statement
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.overlay import Overlay, is_joint_offset
-from rpim_opt.robot.parameter_names import MDH_DIMENSION, own_name
+from rpim_opt.robot.parameter_names import MDH_DIMENSION, of_session, own_name
 from rpim_opt.robot.parameters import Parameters
 
 OFFSETS = "joint offsets"
 """The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
+SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}
+"""Groups of what the readings of a session have in common."""
 _FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
@@ -51,7 +53,7 @@ class Prior:
     groups
         Parameters of the robot that share a size of their own, as patterns: ``(("a?", "d?"), ("alpha?",))``. Of what
         they leave out of its geometry the lengths, the angles and the joint offsets share one each, and so does every
-        family of other terms (compliance, eccentricity, ...).
+        family of other terms (compliance, eccentricity, ...); the shifts of sessions share one, their turns another.
     joint_offset
         By how much the scale of a joint's theta is multiplied.
     frames
@@ -355,16 +357,18 @@ class Prior:
                 if not any(fnmatchcase(name, pattern) for name in parameters.names):
                     raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
         free = parameters.free
-        keys = [self._group_of(name) for name in free.names]
-        names = tuple(dict.fromkeys(k for k, frame in zip(keys, free.of_frames, strict=True) if not frame))
+        keys = [self._group_of(name, dimension) for name, dimension in zip(free.names, free.dimensions, strict=True)]
+        names = tuple(dict.fromkeys(k for k, frame in zip(keys, free.placed, strict=True) if not frame))
         number = {name: i for i, name in enumerate(names)}
-        found = [FIXED if frame else number[key] for key, frame in zip(keys, free.of_frames, strict=True)]
+        found = [FIXED if frame else number[key] for key, frame in zip(keys, free.placed, strict=True)]
         return np.array(found, dtype=int), names
 
-    def _group_of(self, name: str) -> str:
+    def _group_of(self, name: str, dimension: str) -> str:
         for group in self.groups:
             if any(fnmatchcase(name, pattern) for pattern in group):
                 return " ".join(group)
+        if of_session(name):
+            return SESSIONS[dimension]
         if is_joint_offset(name):
             return OFFSETS
         found = _GEOMETRY.fullmatch(own_name(name))

@@ -57,7 +57,7 @@ def reml(program: Program) -> Selection:
 def _restricted_likelihood(squared: Squared) -> Score:
     """Return the function from weights (K,) to -2 ln(restricted likelihood), up to a constant."""
     tiny = np.finfo(float).tiny
-    frames = squared.model.parameters.of_frames
+    frames = squared.model.parameters.placed
     form = squared.form
     if frames.any() and not frames.all():
         form = ridge(squared.model, robot_alone(squared.penalty, frames))

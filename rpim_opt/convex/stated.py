@@ -21,7 +21,7 @@ def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, f
     """Return the widths (P,) [SI] of deviations of which nothing but their scales is known."""
     offsets = np.array([is_joint_offset(name) for name in parameters.names])
     factor = np.where(offsets, joint_offset, 1.0)
-    factor[parameters.of_frames] = frames
+    factor[parameters.placed] = frames
     return factor * parameters.scale
 
 

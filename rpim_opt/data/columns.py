@@ -23,7 +23,7 @@ SPREADS = ("sigma", "u95")
 
 def text_columns(kind: Measurement) -> list[str]:
     """Return the columns of names that a table may have."""
-    names = ["label", "configuration", "marker", "fixture"]
+    names = ["label", "configuration", "marker", "fixture", "session"]
     if kind.points == 2:
         names.append("to_marker")
     if kind.touching:
@@ -177,7 +177,7 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
     else:
         label = texts(table["label"], "label")
         require_unique(label, "label")
-    for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane"):
+    for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane", "session"):
         for i, name in enumerate(texts(table.get(column, ()), column)):
             if not name:
                 raise InputError(f"row {label[i]}, column {column}", "''", "a name")

@@ -15,6 +15,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.models import Measurement, position
+from rpim_opt.robot.parameter_names import session_prefix
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,6 +50,8 @@ class Block(Brief):
         Whose rows these are; ``""`` for the only robot.
     point
         (N, p) names of the points that were touched or seen, or None.
+    session
+        In which session they were measured; ``""`` where nobody says.
     """
 
     measurement: Measurement
@@ -64,6 +67,7 @@ class Block(Brief):
     columns: Mapping[str, Array] = field(default_factory=dict)
     robot: str = ""
     point: np.ndarray | None = None
+    session: str = ""
 
     def _short(self) -> str:
         return f"{counted(len(self.row), 'row')} of {self.measurement.name}"
@@ -137,6 +141,8 @@ class Dataset(Tabled):
             for row, y in zip(block.row, block.y, strict=True):
                 found = {"label": self.label[row], "configuration": int(self.configuration[row])}
                 found |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
+                if block.session:
+                    found["session"] = block.session
                 for (column, (unit, si)), value in zip(units.items(), y, strict=True):
                     found[f"{column}_{unit}"] = float(value / si)
                 rows[row] = found
@@ -164,6 +170,33 @@ class Dataset(Tabled):
             for row in block.row:
                 names[row] = block.robot
         return tuple(names)
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """The sessions in which they were measured, sorted; those that nobody named are not among them."""
+        return tuple(sorted({block.session for block in self.blocks} - {""}))
+
+    def by_session(self) -> list[np.ndarray]:
+        """Return the numbers of the configurations of every session, what cross-validation by sessions leaves out.
+
+        Rows that name no session are one more. Sessions that share a configuration stand together.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> data = ro.load("position").problem.data
+        >>> days = ro.Dataset.of(data.q, data.blocks[0].y, 3e-5, session=["Monday"] * 15 + ["Tuesday"] * 25)
+        >>> [len(part) for part in days.by_session()], days.sessions
+        ([15, 25], ('Monday', 'Tuesday'))
+        """
+        parts: list[np.ndarray] = []
+        for name in dict.fromkeys(block.session for block in self.blocks):
+            mine = [self.configuration[block.row] for block in self.blocks if block.session == name]
+            part = np.unique(np.concatenate(mine))
+            shared = [other for other in parts if np.isin(other, part).any()]
+            parts = [other for other in parts if not np.isin(other, part).any()]
+            parts.append(np.unique(np.concatenate([part, *shared])))
+        return parts
 
     def of_robot(self, robot: str) -> Dataset:
         """Return the rows of one of several robots, as that robot's own."""
@@ -266,6 +299,7 @@ class Dataset(Tabled):
         payload: Array | None = None,
         approach: Array | None = None,
         columns: Mapping[str, ArrayLike] = MappingProxyType({}),
+        session: Sequence[str] = (),
     ) -> Dataset:
         """Return a dataset from arrays.
 
@@ -287,6 +321,8 @@ class Dataset(Tabled):
             (N,) mass at the flange [kg].
         columns
             Further columns by name, (N,) each [SI], which terms and measurements of your own see.
+        session
+            N names of the sessions in which they were measured.
 
         Raises
         ------
@@ -321,7 +357,10 @@ class Dataset(Tabled):
             approach=_beside(approach, "approach", q),
             columns={name: _column(values, f"column {name}", N) for name, values in columns.items()},
         )
-        return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
+        blocks = (block,)
+        if len(session):
+            blocks = in_sessions(block, session)
+        return cls(blocks, label or tuple(str(i + 1) for i in range(N)), rows)
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
@@ -355,6 +394,37 @@ class Dataset(Tabled):
             count += int(part.configuration.max()) + 1
         whole = cls(tuple(blocks), _unique_labels(parts, names), np.concatenate(configuration))
         return replace(whole, configuration=_joined(whole, count))
+
+
+def in_sessions(whole: Block, session: Sequence[str]) -> tuple[Block, ...]:
+    """Return the rows of a block by session, N names, in the order of their first rows.
+
+    Raises
+    ------
+    InputError
+        For more or fewer names than rows, and two that read the same but for signs.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.data.dataset import in_sessions
+    >>> block = ro.load("paper_arm").problem.data.blocks[0]
+    >>> [(part.session, len(part.row)) for part in in_sessions(block, ["a", "b", "a"] * 3)]
+    [('a', 6), ('b', 3)]
+    """
+    names = np.array([str(name) for name in session], dtype=object)
+    if len(names) != len(whole.row):
+        raise InputError("session", f"{len(names)} names", f"{len(whole.row)}, one a row")
+    called: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        other = called.setdefault(session_prefix(name), name)
+        if other != name:
+            raise InputError("column session", f"'{other}' and '{name}'", "names that differ in letters or digits")
+    parts = []
+    for name in called.values():
+        index = np.flatnonzero(names == name)
+        parts.append(replace(whole.take(index, whole.row[index]), session=name))
+    return tuple(parts)
 
 
 def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:

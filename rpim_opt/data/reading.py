@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.data.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.data.contact import by_points
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Block, Dataset, in_sessions
 from rpim_opt.data.models import Measurement, position, revisit, revisit_plane
 from rpim_opt.data.spread import covariances, declared_noise
 from rpim_opt.robot.mdh import Robot
@@ -29,7 +29,7 @@ def read_data(
 
     - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default);
     - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere); ``point``
-      or ``plane`` (which one was touched);
+      or ``plane`` (which one was touched); ``session`` (any text: rows of one share an error of the registration);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
     - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
@@ -97,6 +97,9 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
     if {"marker", "to_marker", "fixture"} & set(table):
         blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
+    if "session" in table:
+        session = np.array(_names(table, ["session"], N), dtype=object)
+        blocks = tuple(part for block in blocks for part in in_sessions(block, session[block.row]))
     data = Dataset(blocks, label, configuration)
     if kind.touching:
         return by_points(data)

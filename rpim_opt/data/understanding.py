@@ -21,6 +21,7 @@ from rpim_opt.data.spelling import split
 from rpim_opt.robot.mdh import Robot
 
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
+         "session": "session of the measurements",
          "to_marker": "reflector of the second point", "point": "point that was touched or seen",
          "plane": "plane that was touched", "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw",
          "u": "measured pixel, to the right", "v": "measured pixel, downwards"}  # fmt: skip

@@ -82,7 +82,7 @@ def starting_parameters(
         given = _own_values(robot, block, base, places[block.markers[0]], own)
         for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    return model_parameters(robot, base, tools, entries, own_frames(data))
+    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions)
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
@@ -217,7 +217,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
     (9, '1.13 mm')
     """
     p = problem.parameters
-    frames = p.of_frames & p.identified
+    frames = p.placed & p.identified
     if not frames.any():
         return problem, np.zeros(len(p.free))
     alone = problem.identifying(frames)

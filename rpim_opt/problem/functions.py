@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads, Stated
 from rpim_opt.robot.kinematics import FRAME, chain, frame
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameter_names import session_prefix, tool_prefix
 from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
 
@@ -33,7 +33,7 @@ class Structure(NamedTuple):
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
     ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
-    user's own; ``several`` whether other robots have rows, too.
+    user's own; ``several`` whether other robots have rows, too; ``session`` shifts the base, ``""`` where nothing does.
     """
 
     joint_types: tuple[str, ...]
@@ -45,6 +45,7 @@ class Structure(NamedTuple):
     loads: Loads
     terms: tuple[Term, ...] = ()
     several: bool = False
+    session: str = ""
 
 
 class Row(NamedTuple):
@@ -171,6 +172,8 @@ def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated:
     for point, marker in enumerate(of.markers):
         posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
         flange = chain(of.joint_types, posture, p.value, of.terms)
+        if of.session:
+            flange = p.place(session_prefix(of.session)) @ flange
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
             flange = p.place("base_") @ flange
         found.append(flange @ p.place(tool_prefix(marker)))

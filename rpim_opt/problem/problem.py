@@ -30,11 +30,11 @@ from rpim_opt.problem.loads import (
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
 from rpim_opt.robot.compiled import quickest
-from rpim_opt.robot.kinematics import call_rows
+from rpim_opt.robot.kinematics import FRAME, call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
-from rpim_opt.robot.parameter_names import own_name, tool_prefix
+from rpim_opt.robot.parameter_names import own_name, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
 SHIFTED = ("base_x", "base_y", "base_z")
@@ -836,9 +836,13 @@ class CalibrationProblem(Tabled):
         names = p.names
         if block.robot:  # those of other robots keep their long names, which nobody asks for
             names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
+        present = {name for name, gone in zip(names, absent, strict=True) if not gone}
+        session = block.session
+        if present.isdisjoint({session_prefix(session) + component for component in FRAME}):  # another's functions serve
+            session = ""
         structure = Structure(
-            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(),
-            block.markers, block.fixture, self._loads(block), tuple(robot.model.terms), len(self.arms) > 1,
+            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
+            self._loads(block), tuple(robot.model.terms), len(self.arms) > 1, session,
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 

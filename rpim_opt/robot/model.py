@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from rpim_opt.robot.joint_terms import BEND_SCALE, JOINT_TERMS
 from rpim_opt.robot.kinematics import FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.open_model import Model, entries_of
-from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, tool_prefix
+from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
 Entry = tuple[str, str, float, float]
@@ -24,6 +24,8 @@ DEFAULT_SCALE = {
     ("angle", "angle"): 1e-3,
     ("tool", "length"): 10e-3,
     ("tool", "angle"): 10e-3,
+    ("session", "length"): 1e-4,
+    ("session", "angle"): 1e-4,
     ("base", "length"): 100e-3,
     ("base", "angle"): 100e-3,
     ("camera", "pixel"): 10.0,
@@ -39,6 +41,7 @@ def model_parameters(
     tools: Mapping[str, Sequence[float] | Array] | None = None,
     own: Mapping[str, tuple[str, float]] | None = None,
     own_frames: tuple[str, ...] = (),
+    sessions: Iterable[str] = (),
 ) -> Parameters:
     """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
@@ -54,6 +57,8 @@ def model_parameters(
         Further parameters, those of the measurement: name to (dimension, nominal value [SI]).
     own_frames
         Prefixes of those that are frames, ``plane_``.
+    sessions
+        Names of sessions, by which the robot's base is shifted and turned besides.
 
     Examples
     --------
@@ -69,6 +74,8 @@ def model_parameters(
         tools = {"": (0.0,) * 6}
     for marker, tool in tools.items():
         entries += _of_frame(tool_prefix(marker), tool)
+    for prefix in dict.fromkeys(map(session_prefix, sessions)):
+        entries += _of_frame(prefix, (0.0,) * 6)
     if own is not None:
         entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
     names, dimensions, nominal, scale = zip(*entries, strict=True)

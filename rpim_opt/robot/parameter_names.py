@@ -46,15 +46,36 @@ def term_of(name: str, dof: int) -> tuple[Term, int]:
 
 
 def group_of(name: str, dimension: str) -> str:
-    """Return the group whose scale a parameter has: ``tool``, ``base``, or its dimension.
+    """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension.
 
     What a measurement adds of its own (an anchor, a plane) is placed like the instrument: ``base``.
     """
-    if own_name(name).startswith("tool_"):
-        return "tool"
+    for frame in ("tool", "session"):
+        if own_name(name).startswith(f"{frame}_"):
+            return frame
     if of_joint(name):
         return dimension
     return "base"
+
+
+def session_prefix(session: str) -> str:
+    """Return the prefix of a session's parameters: ``session_day_1_`` for "day 1"; letters, digits and _ alone.
+
+    >>> from rpim_opt.robot.parameter_names import session_prefix
+    >>> session_prefix("day 1"), session_prefix("2026-05-04")
+    ('session_day_1_', 'session_2026_05_04_')
+    """
+    return f"session_{re.sub(r'[^0-9A-Za-z]+', '_', session)}_"
+
+
+def of_session(name: str) -> bool:
+    """Return whether a parameter is by how much the readings of a session are shifted or turned."""
+    return own_name(name).startswith("session_")
+
+
+def frame_of(name: str) -> str:
+    """Return the prefix of the frame that a parameter is of: ``session_day_1_`` of ``session_day_1_rx``."""
+    return own_name(name).rpartition("_")[0] + "_"
 
 
 def tool_prefix(marker: str) -> str:

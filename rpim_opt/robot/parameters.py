@@ -17,7 +17,7 @@ from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.overlay import Overlay
-from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, own_name
+from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, of_session, own_name
 
 SHOWN = 4
 """Names in one line."""
@@ -178,12 +178,17 @@ class Parameters(Tabled):
 
     @property
     def of_frames(self) -> np.ndarray:
-        """(P,) which parameters place something (base, reflectors, anchors, ...) and are not the robot's own."""
+        """(P,) which parameters place something (base, reflectors, sessions, ...) and are not the robot's own."""
         return np.array([not of_joint(name) and name not in self.terms for name in self.names])
 
     @property
+    def placed(self) -> np.ndarray:
+        """(P,) which of these may be anywhere: all but the shifts of sessions, which are as small as their sizes."""
+        return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)
+
+    @property
     def groups(self) -> tuple[str, ...]:
-        """The P groups whose scales they have: ``base``, ``tool``, or their dimension.
+        """The P groups whose scales they have: ``base``, ``tool``, ``session``, or their dimension.
 
         >>> import rpim_opt as ro
         >>> ro.load("position").problem.parameters.identify(["d2", "ecc_sin2", "tool_x"]).free.groups

@@ -42,7 +42,7 @@ def errors_section(result: Calibration) -> list[Element]:
 
 
 def _note(result: Calibration) -> str:
-    fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
+    fitted = result.problem.parameters.placed & result.problem.parameters.identified
     note = "Before: the robot of the drawing"
     if fitted.any():
         note += ", its base, reflectors and other frames fitted to the identification data"

@@ -129,7 +129,7 @@ def _remarks(result: Calibration) -> list[str]:
     ]
     if result.record.held_out is not None:
         remarks.append(result.record.held_out.sentence(len(result.problem.data)))
-    fitted = result.problem.parameters.of_frames & result.problem.parameters.identified
+    fitted = result.problem.parameters.placed & result.problem.parameters.identified
     if fitted.any():
         remarks.insert(0, "Nominal: the drawing's robot, frames fitted.")
     return remarks

@@ -182,6 +182,7 @@ def _block_part(block: Block) -> dict[str, Any]:
         "columns": {name: values.tolist() for name, values in block.columns.items()},
         "robot": block.robot,
         "point": _optional(block.point),
+        "session": block.session,
     }
 
 
@@ -233,6 +234,7 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
         robot=part.robot,
         point=point,
+        session=part.session,
     )
 
 
