@@ -51,7 +51,7 @@ class Block(Brief):
     point
         (N, p) names of the points that were touched or seen, or None.
     session
-        In which session they were measured; ``""`` where nobody says.
+        (N,) names of the sessions in which they were measured, or None.
     """
 
     measurement: Measurement
@@ -67,7 +67,7 @@ class Block(Brief):
     columns: Mapping[str, Array] = field(default_factory=dict)
     robot: str = ""
     point: np.ndarray | None = None
-    session: str = ""
+    session: np.ndarray | None = None
 
     def _short(self) -> str:
         return f"{counted(len(self.row), 'row')} of {self.measurement.name}"
@@ -78,6 +78,13 @@ class Block(Brief):
         if self.measurement.by_camera:
             return None
         return self.point
+
+    @property
+    def session_names(self) -> np.ndarray:
+        """(N,) names of the rows' sessions, ``""`` where nobody says."""
+        if self.session is None:
+            return np.full(len(self.row), "", dtype=object)
+        return self.session
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
@@ -97,6 +104,7 @@ class Block(Brief):
             approach=rows(self.approach),
             columns={name: values[index] for name, values in self.columns.items()},
             point=rows(self.point),
+            session=rows(self.session),
         )
 
 
@@ -138,11 +146,11 @@ class Dataset(Tabled):
         rows: list[dict[str, Any]] = [{} for _ in self.label]
         for block in self.blocks:
             units = {column: display(dimension) for column, dimension in block.measurement.columns.items()}
-            for row, y in zip(block.row, block.y, strict=True):
+            for row, y, session in zip(block.row, block.y, block.session_names, strict=True):
                 found = {"label": self.label[row], "configuration": int(self.configuration[row])}
                 found |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
-                if block.session:
-                    found["session"] = block.session
+                if session:
+                    found["session"] = str(session)
                 for (column, (unit, si)), value in zip(units.items(), y, strict=True):
                     found[f"{column}_{unit}"] = float(value / si)
                 rows[row] = found
@@ -174,7 +182,7 @@ class Dataset(Tabled):
     @property
     def sessions(self) -> tuple[str, ...]:
         """The sessions in which they were measured, sorted; those that nobody named are not among them."""
-        return tuple(sorted({block.session for block in self.blocks} - {""}))
+        return tuple(sorted({str(name) for block in self.blocks for name in block.session_names} - {""}))
 
     def by_session(self) -> list[np.ndarray]:
         """Return the numbers of the configurations of every session, what cross-validation by sessions leaves out.
@@ -190,12 +198,13 @@ class Dataset(Tabled):
         ([15, 25], ('Monday', 'Tuesday'))
         """
         parts: list[np.ndarray] = []
-        for name in dict.fromkeys(block.session for block in self.blocks):
-            mine = [self.configuration[block.row] for block in self.blocks if block.session == name]
+        for name in ("", *self.sessions):
+            mine = [self.configuration[block.row[block.session_names == name]] for block in self.blocks]
             part = np.unique(np.concatenate(mine))
             shared = [other for other in parts if np.isin(other, part).any()]
             parts = [other for other in parts if not np.isin(other, part).any()]
-            parts.append(np.unique(np.concatenate([part, *shared])))
+            if len(part):
+                parts.append(np.unique(np.concatenate([part, *shared])))
         return parts
 
     def of_robot(self, robot: str) -> Dataset:
@@ -356,11 +365,9 @@ class Dataset(Tabled):
             payload=_beside(payload, "payload", q[:, 0, 0]),
             approach=_beside(approach, "approach", q),
             columns={name: _column(values, f"column {name}", N) for name, values in columns.items()},
+            session=named_sessions(session, N),
         )
-        blocks = (block,)
-        if len(session):
-            blocks = in_sessions(block, session)
-        return cls(blocks, label or tuple(str(i + 1) for i in range(N)), rows)
+        return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
@@ -396,35 +403,31 @@ class Dataset(Tabled):
         return replace(whole, configuration=_joined(whole, count))
 
 
-def in_sessions(whole: Block, session: Sequence[str]) -> tuple[Block, ...]:
-    """Return the rows of a block by session, N names, in the order of their first rows.
+def named_sessions(names: Sequence[Any], N: int) -> np.ndarray | None:
+    """Return the names (N,) of the rows' sessions; None where there are none.
 
     Raises
     ------
     InputError
-        For more or fewer names than rows, and two that read the same but for signs.
+        For more or fewer names than rows, and two that differ in signs alone.
 
     Examples
     --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.data.dataset import in_sessions
-    >>> block = ro.load("paper_arm").problem.data.blocks[0]
-    >>> [(part.session, len(part.row)) for part in in_sessions(block, ["a", "b", "a"] * 3)]
-    [('a', 6), ('b', 3)]
+    >>> from rpim_opt.data.dataset import named_sessions
+    >>> named_sessions(["day 1", "day 2"], 2)
+    array(['day 1', 'day 2'], dtype=object)
     """
-    names = np.array([str(name) for name in session], dtype=object)
-    if len(names) != len(whole.row):
-        raise InputError("session", f"{len(names)} names", f"{len(whole.row)}, one a row")
+    if not len(names):
+        return None
+    found = np.array([str(name) for name in names], dtype=object)
+    if len(found) != N:
+        raise InputError("session", f"{len(found)} names", f"{N}, one a row")
     called: dict[str, str] = {}
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys(found):
         other = called.setdefault(session_prefix(name), name)
         if other != name:
             raise InputError("column session", f"'{other}' and '{name}'", "names that differ in letters or digits")
-    parts = []
-    for name in called.values():
-        index = np.flatnonzero(names == name)
-        parts.append(replace(whole.take(index, whole.row[index]), session=name))
-    return tuple(parts)
+    return found
 
 
 def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:

@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.data.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.data.contact import by_points
-from rpim_opt.data.dataset import Block, Dataset, in_sessions
+from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.models import Measurement, position, revisit, revisit_plane
 from rpim_opt.data.spread import covariances, declared_noise
 from rpim_opt.robot.mdh import Robot
@@ -90,6 +90,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         approach=_approach(columns, robot, kind, label),
         columns=_further(columns, robot, kind),
         point=_touched(table, kind, N),
+        session=named_sessions(texts(table.get("session", ()), "session"), N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     _require_two_points(whole, markers, label)
@@ -97,9 +98,6 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
     if {"marker", "to_marker", "fixture"} & set(table):
         blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
-    if "session" in table:
-        session = np.array(_names(table, ["session"], N), dtype=object)
-        blocks = tuple(part for block in blocks for part in in_sessions(block, session[block.row]))
     data = Dataset(blocks, label, configuration)
     if kind.touching:
         return by_points(data)

@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads, Stated
 from rpim_opt.robot.kinematics import FRAME, chain, frame
-from rpim_opt.robot.parameter_names import session_prefix, tool_prefix
+from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
 
@@ -33,7 +33,8 @@ class Structure(NamedTuple):
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
     ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
-    user's own; ``several`` whether other robots have rows, too; ``session`` shifts the base, ``""`` where nothing does.
+    user's own; ``several`` whether other robots have rows, too; ``sessions`` the prefixes of what shifts the base, a column
+    of a row each, 1 where the row is of that session.
     """
 
     joint_types: tuple[str, ...]
@@ -45,7 +46,7 @@ class Structure(NamedTuple):
     loads: Loads
     terms: tuple[Term, ...] = ()
     several: bool = False
-    session: str = ""
+    sessions: tuple[str, ...] = ()
 
 
 class Row(NamedTuple):
@@ -148,12 +149,19 @@ class _Parameters(NamedTuple):
         names = [prefix + component for component in FRAME]
         return frame([self.start[name] for name in names], [self.deviation[name] for name in names])
 
+    def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> ca.SX:
+        """Return one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
+        start = [ca.dot(chosen, ca.vertcat(*(self.start.get(p + c, 0) for p in prefixes))) for c in FRAME]
+        moved = [ca.dot(chosen, ca.vertcat(*(self.deviation.get(p + c, 0) for p in prefixes))) for c in FRAME]
+        return frame(start, moved)
+
 
 def _expressions(of: Structure, measurement: Measurement) -> Row:
     p = _Parameters.of(of.names, of.identified, of.absent)
     stated = of.loads.symbols(len(of.joint_types), len(of.markers))
+    session = ca.SX.sym("session", len(of.sessions))
     y = ca.SX.sym("y", len(measurement.columns))
-    transforms = _reflectors(of, measurement, p, stated)
+    transforms = _reflectors(of, measurement, p, stated, session)
     own = _keywords(of, measurement, p, stated)
     modelled = ca.densify(measurement.model(*transforms, **own))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
@@ -163,17 +171,19 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     metres = ca.SX(1)
     if measurement.metres is not None:
         metres = measurement.metres(*transforms, **own)
-    return Row(p.x, p.nominal, ca.vertcat(*stated, y), residual, modelled, ca.densify(metres))
+    return Row(p.x, p.nominal, ca.vertcat(*stated, session, y), residual, modelled, ca.densify(metres))
 
 
-def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> list[ca.SX]:
+def _reflectors(
+    of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX
+) -> list[ca.SX]:
     """Return the transform of each point's reflector in the frame that measures."""
     found = []
     for point, marker in enumerate(of.markers):
         posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
         flange = chain(of.joint_types, posture, p.value, of.terms)
-        if of.session:
-            flange = p.place(session_prefix(of.session)) @ flange
+        if of.sessions:
+            flange = p.chosen(of.sessions, session) @ flange
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
             flange = p.place("base_") @ flange
         found.append(flange @ p.place(tool_prefix(marker)))

@@ -30,11 +30,11 @@ from rpim_opt.problem.loads import (
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
 from rpim_opt.robot.compiled import quickest
-from rpim_opt.robot.kinematics import FRAME, call_rows
+from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
-from rpim_opt.robot.parameter_names import own_name, session_prefix, tool_prefix
+from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
 SHIFTED = ("base_x", "base_y", "base_z")
@@ -836,13 +836,9 @@ class CalibrationProblem(Tabled):
         names = p.names
         if block.robot:  # those of other robots keep their long names, which nobody asks for
             names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-        present = {name for name, gone in zip(names, absent, strict=True) if not gone}
-        session = block.session
-        if present.isdisjoint({session_prefix(session) + component for component in FRAME}):  # another's functions serve
-            session = ""
         structure = Structure(
             robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
-            self._loads(block), tuple(robot.model.terms), len(self.arms) > 1, session,
+            self._loads(block), tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
         )  # fmt: skip
         return (self.asked or asked)(structure, block.measurement)
 
@@ -870,7 +866,24 @@ class CalibrationProblem(Tabled):
         robot = self.arms[block.robot]
         y = block.y[part]
         joints = (block.q[part] @ robot.joint_map.T).reshape(len(y), -1)
-        return np.hstack([joints, *columns(robot, block, part), y])
+        return np.hstack([joints, *columns(robot, block, part), self._of_sessions(block, part), y])
+
+    @cached_property
+    def _sessions(self) -> dict[str, tuple[str, ...]]:
+        """The prefixes of the sessions of every robot that shift anything."""
+        p = self.parameters
+        present = p.take(np.flatnonzero(p.identified | (p.nominal != 0)))
+        return {
+            robot: tuple(dict.fromkeys(frame_of(name) for name in present.of_robot(robot).names if of_session(name)))
+            for robot in self.arms
+        }
+
+    def _of_sessions(self, block: Block, part: slice) -> Array:
+        """Return 1 where a row is of a session that shifts anything, (N, sessions)."""
+        names = block.session_names[part]
+        prefixes = {name: session_prefix(name) for name in dict.fromkeys(names)}
+        mine = np.array([prefixes[name] for name in names], dtype=object)
+        return np.array([mine == prefix for prefix in self._sessions[block.robot]], dtype=float).reshape(-1, len(mine)).T
 
 
 def error_dimensions(block: Block) -> list[str]:

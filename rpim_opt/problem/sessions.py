@@ -41,7 +41,7 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
     looked_at = {p.called(robot, name) for robot, names in known.items() for name in names}
     identified = np.array([name in looked_at for name in p.names])
     # any session's slopes are those of one that is known
-    blocks = tuple(replace(block, session=_session(known[block.robot])) for block in data.blocks)
+    blocks = tuple(replace(block, session=_session(known[block.robot], len(block.row))) for block in data.blocks)
     as_known = replace(data, blocks=blocks)
     alone = replace(problem, parameters=replace(p, identified=identified), data=as_known, scatter=None)
     T = alone.jacobian(np.zeros(int(identified.sum()))) * p.scale[identified]
@@ -52,7 +52,7 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
         end = start + k * len(block.row)
         part = T[start:end].reshape(-1, k, T.shape[1])
         start = end
-        found.append(part @ part.transpose(0, 2, 1) * _is_unknown(block, p))
+        found.append(part @ part.transpose(0, 2, 1) * _unknown(block, p)[:, None, None])
     return found
 
 
@@ -64,13 +64,14 @@ def _first(own: Parameters) -> list[str]:
     return [name for name in names if frame_of(name) == frame_of(names[0])]
 
 
-def _session(names: list[str]) -> str:
-    """Return what stands for the session of some parameters."""
+def _session(names: list[str], N: int) -> np.ndarray | None:
+    """Return what stands for the session of some parameters, N times."""
     if not names:
-        return ""
-    return frame_of(names[0]).removeprefix("session_").removesuffix("_")
+        return None
+    return np.full(N, frame_of(names[0]).removeprefix("session_").removesuffix("_"), dtype=object)
 
 
-def _is_unknown(block: Block, parameters: Parameters) -> bool:
-    prefix = session_prefix(block.session)
-    return all(frame_of(name) != prefix for name in parameters.of_robot(block.robot).free.names)
+def _unknown(block: Block, parameters: Parameters) -> np.ndarray:
+    """Return which rows (N,) are of a session that is not identified."""
+    known = {frame_of(name) for name in parameters.of_robot(block.robot).free.names}
+    return np.array([session_prefix(name) not in known for name in block.session_names])

@@ -14,7 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.convex.selection import Selection
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.models import Measurement
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.mdh import Robot
@@ -182,7 +182,7 @@ def _block_part(block: Block) -> dict[str, Any]:
         "columns": {name: values.tolist() for name, values in block.columns.items()},
         "robot": block.robot,
         "point": _optional(block.point),
-        "session": block.session,
+        "session": _optional(block.session),
     }
 
 
@@ -220,6 +220,11 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
     point = None
     if part.point is not None:
         point = _points(part.point, f"{where}.point", N, kind.points)
+    session = None
+    if part.session is not None:
+        if len(part.session) != N:
+            raise InputError(f"{where}.session", f"{len(part.session)} names", f"{N}, one a row")
+        session = named_sessions(part.session, N)
     return Block(
         kind,
         q=_array(part.q, f"{where}.q", N, kind.points, -1),
@@ -234,7 +239,7 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
         robot=part.robot,
         point=point,
-        session=part.session,
+        session=session,
     )
 
 

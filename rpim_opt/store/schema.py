@@ -79,7 +79,7 @@ class BlockPart(Part):
     columns: dict[str, Vector] = Field(default_factory=dict)
     robot: str = ""
     point: list[list[str]] | None = None
-    session: str = ""
+    session: list[str] | None = None
 
 
 class DataPart(Part):
