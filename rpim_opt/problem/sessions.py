@@ -1,4 +1,4 @@
-"""What a session adds to a reading that nobody knows: the spread of its shift and its turn."""
+"""Sessions that a problem does not know: what they add to a reading, and the parameters that would tell them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,53 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.data.dataset import Block
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
+from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix
 from rpim_opt.robot.parameters import Parameters
 
 
-def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
-    """Return what sessions that were not identified add to the covariance of a reading, block by block (N, k, k) [SI].
+def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
+    """Return the problem that identifies the sessions of its data, too, as those that are identified already.
 
-    T diag(size^2) T' with T the slopes by the shift and the turn of a session, and the sizes that the identified ones
-    have as their scales; zero for rows of an identified session, and where no session is identified.
+    Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
+    session is identified, or all are. Rows that name no session are of one more.
+
+    Parameters
+    ----------
+    problem
+        With measurements, perhaps of other sessions.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.sessions import knowing_sessions
+    >>> problem = ro.load("position").problem
+    >>> knowing_sessions(problem) is problem  # nobody named a session
+    True
+    """
+    p = problem.parameters
+    entries: list[int] = []
+    names: list[str] = []
+    for robot in problem.arms:
+        own = p.of_robot(robot)
+        model = _first(own)
+        known = {frame_of(name) for name in own.free.names}
+        for prefix in _prefixes(problem, robot):
+            if model and prefix not in known:
+                entries += [p.names.index(p.called(robot, name)) for name in model]
+                names += [_beside(p, robot, model[0], prefix + name.rpartition("_")[2]) for name in model]
+    if not entries:
+        return problem
+    kept = p.take(np.flatnonzero(~np.isin(p.names, names)))
+    more = replace(p.take(np.array(entries)), names=tuple(names))
+    return problem.with_parameters(_joined(kept, replace(more, nominal=np.zeros(len(more)))))
+
+
+def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
+    """Return what sessions that are not identified add to the covariance of a reading, block by block (N, k, k) [SI].
+
+    T diag(size^2) T' with T the slopes by the shift and the turn of a session, and as sizes the scales of those that
+    are identified; zero for rows of an identified session, and where no session is identified.
 
     Parameters
     ----------
@@ -26,52 +62,51 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
 
     Examples
     --------
-    >>> import numpy as np
     >>> import rpim_opt as ro
     >>> from rpim_opt.problem.sessions import unknown_sessions
     >>> problem = ro.load("position").problem
     >>> float(max(V.max() for V in unknown_sessions(problem)))  # nobody named a session
     0.0
     """
-    data = problem.data
-    known = {name: _first(problem.parameters.of_robot(name)) for name in problem.arms}
-    if problem.touches is not None or not any(known.values()):
-        return [np.zeros((1, 1, 1)) for _ in data.blocks]
-    p = problem.parameters
-    looked_at = {p.called(robot, name) for robot, names in known.items() for name in names}
-    identified = np.array([name in looked_at for name in p.names])
-    # any session's slopes are those of one that is known
-    blocks = tuple(replace(block, session=_session(known[block.robot], len(block.row))) for block in data.blocks)
-    as_known = replace(data, blocks=blocks)
-    alone = replace(problem, parameters=replace(p, identified=identified), data=as_known, scatter=None)
-    T = alone.jacobian(np.zeros(int(identified.sum()))) * p.scale[identified]
+    whole = knowing_sessions(problem)
+    if whole is problem or problem.touches is not None:
+        return [np.zeros((1, 1, 1)) for _ in problem.data.blocks]
+    p = whole.parameters
+    added = p.identified & ~np.isin(p.names, problem.parameters.free.names)
+    alone = replace(whole, parameters=replace(p, identified=added), scatter=None)
+    T = alone.jacobian(np.zeros(int(added.sum()))) * p.scale[added]
     found = []
     start = 0
-    for block in data.blocks:
+    for block in problem.data.blocks:
         k = len(block.measurement.components)
         end = start + k * len(block.row)
         part = T[start:end].reshape(-1, k, T.shape[1])
         start = end
-        found.append(part @ part.transpose(0, 2, 1) * _unknown(block, p)[:, None, None])
+        found.append(part @ part.transpose(0, 2, 1))
     return found
 
 
 def _first(own: Parameters) -> list[str]:
     """Return the identified parameters of the first session of one robot, as itself calls them."""
     names = [name for name in own.free.names if of_session(name)]
-    if not names:
-        return []
     return [name for name in names if frame_of(name) == frame_of(names[0])]
 
 
-def _session(names: list[str], N: int) -> np.ndarray | None:
-    """Return what stands for the session of some parameters, N times."""
-    if not names:
-        return None
-    return np.full(N, frame_of(names[0]).removeprefix("session_").removesuffix("_"), dtype=object)
+def _prefixes(problem: CalibrationProblem, robot: str) -> list[str]:
+    """Return the prefixes of the sessions of a robot's rows, in their order."""
+    names = [name for block in problem.data.blocks if block.robot == robot for name in block.session_names]
+    return [session_prefix(name) for name in dict.fromkeys(names)]
 
 
-def _unknown(block: Block, parameters: Parameters) -> np.ndarray:
-    """Return which rows (N,) are of a session that is not identified."""
-    known = {frame_of(name) for name in parameters.of_robot(block.robot).free.names}
-    return np.array([session_prefix(name) not in known for name in block.session_names])
+def _beside(parameters: Parameters, robot: str, known: str, own: str) -> str:
+    """Return what the table calls a parameter of a robot, as it calls a known one."""
+    return parameters.called(robot, known).removesuffix(own_name(known)) + own
+
+
+def _joined(first: Parameters, second: Parameters) -> Parameters:
+    values = {
+        what: np.concatenate([getattr(first, what), getattr(second, what)])
+        for what in ("nominal", "scale", "tolerance", "identified")
+    }
+    names = first.names + second.names
+    return replace(first, names=names, dimensions=first.dimensions + second.dimensions, **values)

@@ -54,9 +54,9 @@ def likeliest(carried: Carried, problem: CalibrationProblem, rare: float) -> Dri
         Probability of a change where nothing moved.
     """
     result = carried.result
-    model = problem.linearize(result.x)
+    model = problem.linearize(carried.start(problem))
     penalty = carried.formulation(problem, ()).penalty
-    form: Quadratic = getattr(penalty, "quadratic", None) or identity(len(result.x))
+    form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
     missed = carried.missed(model, form)
     # rows of one configuration were read together: the first of them says when
     numbers, first = np.unique(problem.data.configuration, return_index=True)

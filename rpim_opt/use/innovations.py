@@ -66,8 +66,10 @@ def innovations(result: Calibration, problem: CalibrationProblem, rare: float = 
         raise InputError("monitor", f"formulation '{result.formulation.name}'", accepted)
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
+    own = problem.parameters.free.scale[len(C) :]  # of sessions that the calibration does not know
+    C = np.block([[C, np.zeros((len(C), len(own)))], [np.zeros((len(own), len(C))), np.diag(own**2)]])
     m = np.zeros(len(C))
-    rows = _rows(result, problem)
+    rows = _rows(result, problem, np.append(result.x, np.zeros(len(own))))
     freedom = max(result.freedom, 1.0)
     sigmas = np.zeros(len(rows))
     chance = np.ones(len(rows))
@@ -87,9 +89,9 @@ def innovations(result: Calibration, problem: CalibrationProblem, rare: float = 
     return Innovations(sigmas, chance, deviate)
 
 
-def _rows(result: Calibration, problem: CalibrationProblem) -> dict[int, tuple[Array, Array, Array]]:
+def _rows(result: Calibration, problem: CalibrationProblem, x: Array) -> dict[int, tuple[Array, Array, Array]]:
     """Return every row's residual (k,), slopes (k, n) and covariance (k, k) of a reading [SI]."""
-    residual, J = problem.slopes(result.x)
+    residual, J = problem.slopes(x)
     found = {}
     start = 0
     for block, V in zip(problem.data.blocks, scattered(problem, result.noise_level).reading, strict=True):

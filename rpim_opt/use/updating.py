@@ -79,7 +79,7 @@ def update(
     say("comparing with the last calibration")
     start = None  # a frame that was set up anew may be anywhere: then it is looked for
     if not let_go:
-        start = result.x
+        start = asking.start(problem)
     found = asking.calibrated(problem, let_go, start)
     first, before = _asked(asking, found, let_go)
     causes = first
@@ -96,7 +96,7 @@ def update(
         causes, after = _asked(asking, found, let_go)
     if not after.likely:
         _require_this_robot(result, found, data)
-    moved = tuple(_moved(result, found, name) for name in let_go)
+    moved = tuple(_moved(result, found, name) for name in asking.known(let_go))
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = _record(result, inflate, let_go, left_out)
     return Update(replace(found, record=record), before, after, tuple(changes), first, moved, len(data))
@@ -124,7 +124,7 @@ def _asked(asking: Carried, found: Calibration, let_go: Sequence[str]) -> tuple[
     missed = asking.missed(model, found.program.penalty_form or identity(len(found.x)))
     free = found.problem.parameters.free
     causes = possible(free, ~np.isin(free.names, let_go))
-    return weighed(missed, causes, asking.widths / free.scale, _readings(found, model.group)), missed.fit
+    return weighed(missed, causes, asking.widths(found.problem) / free.scale, _readings(found, model.group)), missed.fit
 
 
 def _readings(found: Calibration, group: np.ndarray) -> list[Reading]:
