@@ -92,7 +92,7 @@ def _how_exact(program: Program, weight: float) -> str:
     return text
 
 
-def k_fold(program: Program, folds: int = 10, seed: int = 0) -> Selection:
+def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
 
     Parameters
@@ -103,11 +103,14 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0) -> Selection:
         In how many parts the configurations are divided.
     seed
         Of the division.
+    parts
+        Instead of that, the numbers of the configurations that are left out together, each in one part:
+        `Dataset.by_session` has those of every session.
 
     Raises
     ------
     InputError
-        For fewer configurations than folds, or a formulation without penalty.
+        For fewer configurations than folds, parts that are no division of them, or a formulation without penalty.
 
     Examples
     --------
@@ -118,10 +121,22 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0) -> Selection:
     ('0.93', True)
     """
     groups = np.unique(with_rows(program, "k_fold").group)
+    if parts is not None:
+        return _held_out(program, "k_fold", _division(groups, parts))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
     return _held_out(program, "k_fold", parts)
+
+
+def _division(groups: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return parts that have each of some configurations once, without those that the program does not have."""
+    kept = [np.intersect1d(part, groups) for part in parts]
+    kept = [part for part in kept if len(part)]
+    if len(kept) < 2 or not np.array_equal(np.sort(np.concatenate(kept)), groups):
+        found = f"{len(kept)} that have {sum(map(len, kept))} of {len(groups)} configurations"
+        raise InputError("selector k_fold, parts", found, "two or more, with every configuration in one of them")
+    return kept
 
 
 COARSE = 12

@@ -33,8 +33,8 @@ class Structure(NamedTuple):
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
     ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
-    user's own; ``several`` whether other robots have rows, too; ``sessions`` the prefixes of what shifts the base, a column
-    of a row each, 1 where the row is of that session.
+    user's own; ``several`` whether other robots have rows, too; ``sessions`` the prefixes of what shifts the base, each
+    with a column that is 1 where a row is of that session.
     """
 
     joint_types: tuple[str, ...]
@@ -174,9 +174,7 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     return Row(p.x, p.nominal, ca.vertcat(*stated, session, y), residual, modelled, ca.densify(metres))
 
 
-def _reflectors(
-    of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX
-) -> list[ca.SX]:
+def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX) -> list[ca.SX]:
     """Return the transform of each point's reflector in the frame that measures."""
     found = []
     for point, marker in enumerate(of.markers):

@@ -883,7 +883,9 @@ class CalibrationProblem(Tabled):
         names = block.session_names[part]
         prefixes = {name: session_prefix(name) for name in dict.fromkeys(names)}
         mine = np.array([prefixes[name] for name in names], dtype=object)
-        return np.array([mine == prefix for prefix in self._sessions[block.robot]], dtype=float).reshape(-1, len(mine)).T
+        return (
+            np.array([mine == prefix for prefix in self._sessions[block.robot]], dtype=float).reshape(-1, len(mine)).T
+        )
 
 
 def error_dimensions(block: Block) -> list[str]:

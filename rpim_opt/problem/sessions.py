@@ -44,9 +44,12 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
                 names += [_beside(p, robot, model[0], prefix + name.rpartition("_")[2]) for name in model]
     if not entries:
         return problem
-    kept = p.take(np.flatnonzero(~np.isin(p.names, names)))
-    more = replace(p.take(np.array(entries)), names=tuple(names))
-    return problem.with_parameters(_joined(kept, replace(more, nominal=np.zeros(len(more)))))
+    kept = np.flatnonzero(~np.isin(p.names, names))
+    more = replace(p.take(np.array(entries)), names=tuple(names), nominal=np.zeros(len(names)))
+    scatter = problem.scatter
+    if scatter is not None and scatter.at is not None:
+        scatter = replace(scatter, at=np.append(scatter.at[kept], more.nominal))
+    return replace(problem, parameters=_joined(p.take(kept), more), scatter=scatter)
 
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:

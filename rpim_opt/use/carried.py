@@ -21,6 +21,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.sessions import knowing_sessions
+from rpim_opt.problem.source import Source
 from rpim_opt.use.changes import SIZES, Missed, widths
 
 OPEN = SIZES[-1]
@@ -53,7 +54,7 @@ class Carried:
         """Return the result's deviations (n,) [SI], zero for sessions that it does not know."""
         return np.append(self.result.x, np.zeros(len(problem.parameters.free) - len(self.result.x)))
 
-    def widths(self, problem: CalibrationProblem) -> Array:
+    def widths(self, problem: Source) -> Array:
         """Return how large deviations (n,) were expected before any calibration [SI]."""
         known = self._widths
         return np.append(known, problem.parameters.free.scale[len(known) :])

@@ -16,6 +16,7 @@ from rpim_opt.convex.stated import default_widths
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.robot.overlay import is_joint_offset
+from rpim_opt.robot.parameter_names import of_session
 from rpim_opt.robot.parameters import Parameters
 
 RARE = 0.01
@@ -169,7 +170,7 @@ def possible(free: Parameters, known: np.ndarray) -> list[Cause]:
     causes = []
     frames: dict[str, list[str]] = {}
     for name, frame, kept in zip(free.names, free.of_frames, known, strict=True):
-        if not kept:
+        if not kept or of_session(name):  # an earlier session is over
             continue
         if frame:
             frames.setdefault(name.rpartition("_")[0], []).append(name)

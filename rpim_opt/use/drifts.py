@@ -53,7 +53,6 @@ def likeliest(carried: Carried, problem: CalibrationProblem, rare: float) -> Dri
     rare
         Probability of a change where nothing moved.
     """
-    result = carried.result
     model = problem.linearize(carried.start(problem))
     penalty = carried.formulation(problem, ()).penalty
     form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
