@@ -10,10 +10,11 @@ from rpim_opt.basics.exceptions import InputError, choices
 
 
 class Unit(NamedTuple):
-    """A unit's dimension and its size in SI."""
+    """A unit's dimension, its size in SI, and what SI's number is where its own is zero."""
 
     dimension: str
     si: float
+    zero: float = 0.0
 
 
 UNITS = {
@@ -37,6 +38,7 @@ UNITS = {
     "rad_per_Nm": Unit("compliance", 1.0),
     "mrad_per_Nm": Unit("compliance", 1e-3),
     "K": Unit("temperature", 1.0),
+    "degC": Unit("temperature", 1.0, 273.15),
     "ppm_per_K": Unit("ratio per temperature", 1e-6),
     "m_per_K": Unit("length per temperature", 1.0),
     "mm_per_K": Unit("length per temperature", 1e-3),
@@ -51,6 +53,8 @@ UNITS = {
     "um_per_N": Unit("length per force", 1e-6),
 }
 
+CELSIUS = "temperature_C"
+"""What everybody calls a temperature in degrees Celsius."""
 LARGEST = 1e7
 """Size of what can be measured or drawn [m, rad, ...]: map coordinates in metres, a million turns. Beyond it a double
 has no digits left for micrometres."""
@@ -109,6 +113,8 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     >>> split_unit("label")
     ('label', None)
     """
+    if name == CELSIUS:  # elsewhere a letter C is a name
+        return "temperature", UNITS["degC"]
     for suffix in sorted(UNITS, key=len, reverse=True):
         if name.endswith("_" + suffix):
             return name.removesuffix("_" + suffix), UNITS[suffix]

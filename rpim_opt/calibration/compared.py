@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.blunders import clustered
-from rpim_opt.calibration.families import SESSIONS, members
+from rpim_opt.calibration.families import SESSIONS, WARMTH, members
 from rpim_opt.calibration.learning import sampled
 from rpim_opt.calibration.models import candidates, extended, restricted
 from rpim_opt.calibration.outcome import Outcome
@@ -28,6 +28,7 @@ OWNED = {
     "first harmonic": ("ecc",),
     "second harmonic": ("ecc2",),
     SESSIONS: ("session",),
+    WARMTH: ("expansion",),
 }
 """Families whose worth is asked, and what stands for them."""
 KNOWN = Prior(joint_offset=1.0, frames=1.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.family import families, family_scales
-from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix
+from rpim_opt.robot.parameter_names import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 TURNED = 2.0
 """Harmonics are looked for in joints that turned further [rad]: over less they are curve fitting."""
@@ -26,6 +26,10 @@ CANDIDATES = (
 """The models of the arm that are compared."""
 SESSIONS = "sessions"
 """The family of what the readings of a session have in common, which is none of the arm."""
+WARMTH = "temperature"
+"""The family of what grows with temperature."""
+CONDITIONS = (SESSIONS, WARMTH)
+"""Families of how and when was measured; each is a question of its own."""
 
 
 def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
@@ -37,6 +41,10 @@ def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
     shifts = _of_sessions(problem)
     if shifts:
         found[SESSIONS] = shifts
+    known = set(problem.parameters.free.names)
+    grows = tuple(name for name in problem.parameters.names if own_name(name) == EXPANSION and name not in known)
+    if grows and np.ptp(problem.data.temperatures) > 0:
+        found[WARMTH] = grows
     return found
 
 
@@ -67,6 +75,11 @@ def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
     return {family: names for family, names in found.items() if names}
 
 
+def _of_arm(name: str) -> bool:
+    """Return whether the arm says how large a parameter is expected; others have their scale."""
+    return not of_session(name) and own_name(name) != EXPANSION
+
+
 def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> CalibrationProblem:
     """Return the problem that identifies parameters of families, too, at the scales that their effects suggest."""
     p = problem.parameters
@@ -75,6 +88,6 @@ def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> Calibrat
     scale = p.scale.copy()
     identified[index] = True
     for name, robot in problem.arms.items():
-        mine = [i for i in p.places_of(name) if i in index and not of_session(p.names[i])]
+        mine = [i for i in p.places_of(name) if i in index and _of_arm(p.names[i])]
         scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
     return problem.with_parameters(replace(p, identified=identified, scale=scale))

@@ -21,12 +21,14 @@ WHAT = {
     "second harmonic": "second harmonics of joints",
     "moments": "gravity on masses elsewhere than supposed",
     "sessions": "a registration that differs from session to session",
+    "temperature": "lengths that grow with temperature",
 }
 DOES = {
     "gravity": "The arm bends under gravity",
     "first harmonic": "Joints turn unevenly (eccentric encoders or gears)",
     "second harmonic": "Joints turn unevenly twice a turn",
     "sessions": "The registration differs from session to session",
+    "temperature": "Lengths grow with temperature",
 }
 
 

@@ -9,7 +9,7 @@ from rpim_opt.calibration.learned import Learned, Size
 from rpim_opt.convex.prior import SESSIONS
 from rpim_opt.robot.family import EXPECTED
 from rpim_opt.robot.overlay import is_joint_offset
-from rpim_opt.robot.parameter_names import of_session, own_name
+from rpim_opt.robot.parameter_names import EXPANSION, of_session, own_name
 
 UNITS = {"position": ("mm", 1e3), "orientation": ("mrad", 1e3), "joint": ("mrad", 1e3), "instrument": ("times", 1.0)}
 SIZED = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}
@@ -39,7 +39,7 @@ NEGLIGIBLE = 0.1
 
 def sentences(learned: Learned, names: tuple[str, ...], z: np.ndarray) -> list[str]:
     """Return what was learned; parameters' names (n,), and deviations z (n,) in units of the local scales."""
-    lines = [_sizes(learned), _noise(learned), _sessions(learned, names)]
+    lines = [_sizes(learned), _noise(learned), _sessions(learned, names), _growth(learned, names, z)]
     lines += [_model(learned)] if learned.trials else []
     lines += _unusual(learned, names, z)
     lines += _left_out(learned)
@@ -64,7 +64,7 @@ def _sizes(learned: Learned) -> str:
     said = []
     much = "{} deviate {} times as much as expected ({})"
     for name, size in learned.sizes.items():
-        if name in SESSIONS.values():
+        if name in (*SESSIONS.values(), EXPANSION):
             continue
         if name in FAMILIES:
             figure = f"{1e3 * EXPECTED * size.value:.2g} mrad ({_range(size, 1e3 * EXPECTED)})"
@@ -105,6 +105,17 @@ def _sessions(learned: Learned, names: tuple[str, ...]) -> str:
     if not said:
         return ""
     return f"Sessions differ by {joined(said)}."
+
+
+def _growth(learned: Learned, names: tuple[str, ...], z: np.ndarray) -> str:
+    """Say by how much lengths grow."""
+    said = []
+    for name, stated, value in zip(names, learned.stated, z, strict=True):
+        if own_name(name) == EXPANSION and EXPANSION in learned.sizes:
+            said.append(f"{1e6 * stated * learned.sizes[EXPANSION].value * value:.3g} um a metre and kelvin")
+    if not said:
+        return ""
+    return f"Lengths grow by {joined(said)}."
 
 
 def _model(learned: Learned) -> str:

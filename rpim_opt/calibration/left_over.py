@@ -12,7 +12,7 @@ from scipy.special import fdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.alike import Alike, alike
 from rpim_opt.calibration.compared import OWNED, SPEAK, Comparison, Judged
-from rpim_opt.calibration.families import SESSIONS, TURNED
+from rpim_opt.calibration.families import SESSIONS, TURNED, WARMTH
 from rpim_opt.convex.prior import family_of
 from rpim_opt.problem.loads import measured_torques, repeatable
 from rpim_opt.problem.problem import CalibrationProblem
@@ -23,6 +23,7 @@ PATTERNS = {
     "second harmonic": ("ecc2_cos?", "ecc2_sin?"),
     "moments": ("bend*",),
     SESSIONS: ("session_*",),
+    WARMTH: ("expansion",),
 }
 """What `identify` says for the families."""
 FEWEST = 6

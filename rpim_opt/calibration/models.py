@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.families import CANDIDATES, MANY, SESSIONS, identifying, members
+from rpim_opt.calibration.families import CANDIDATES, CONDITIONS, MANY, identifying, members
 from rpim_opt.calibration.learned import Trial
 from rpim_opt.calibration.sizing import Fit, Learning
 from rpim_opt.convex.evidence import Evidence, Point
@@ -16,7 +16,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 GAIN = 6.0
 """By how much -2 ln L must fall for a model with families: of 306 simulated arms without them one gained more.
 
-For sessions once more: they are another question."""
+For sessions and for temperature once more each: they are other questions."""
 LARGE = 3.0
 """By how much larger, in their logarithms, families are expected in another start."""
 COMPARED = 1e-6
@@ -70,14 +70,16 @@ def candidates(problem: CalibrationProblem, families: dict[str, tuple[str, ...]]
     if len(np.unique(problem.data.configuration)) < MANY:
         tried = CANDIDATES[:-1]
     possible = [tuple(family for family in candidate if family in families) for candidate in tried]
-    if SESSIONS in families:
-        possible += [(*candidate, SESSIONS) for candidate in possible]
+    for condition in CONDITIONS:
+        if condition in families:
+            possible += [(*candidate, condition) for candidate in possible]
     return list(dict.fromkeys(possible))
 
 
 def _questions(families: tuple[str, ...]) -> int:
-    """Return how many questions a model answers with yes: whether the arm has families, and whether sessions differ."""
-    return bool(set(families) - {SESSIONS}) + (SESSIONS in families)
+    """Return how many questions a model answers with yes: whether the arm has families, and each of the conditions."""
+    conditions = set(families) & set(CONDITIONS)
+    return len(conditions) + (len(families) > len(conditions))
 
 
 def extended(problem: CalibrationProblem, x: Array, names: tuple[str, ...]) -> tuple[CalibrationProblem, Array]:

@@ -48,8 +48,8 @@ def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
 
 
 def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
-    """Return the columns that a user's own terms and measurement see, name to dimension."""
-    return {**robot.model.columns, **kind.extra}
+    """Return the columns that terms and measurement see, name to dimension: temperature, and a user's own."""
+    return {"temperature": "temperature", **robot.model.columns, **kind.extra}
 
 
 def _spread_columns(kind: Measurement) -> dict[str, list[str]]:
@@ -104,10 +104,11 @@ def _add(
     stem, unit = split_unit(name)
     dimension = unit.dimension if unit else ""
     si = unit.si if unit else 1.0
+    zero = unit.zero if unit else 0.0
     _require_known(name, stem, dimension, known, names)
     if (stem, dimension) in columns:
         raise InputError("the header", f"column '{stem}' in two units", "one of them")
-    values = si * numbers(cells, label, name)
+    values = si * numbers(cells, label, name) + zero
     _require_size(values, si, name, label)
     if stem.startswith(SPREADS):
         _require_positive(values, si, name, label)

@@ -184,6 +184,12 @@ class Dataset(Tabled):
         """The sessions in which they were measured, sorted; those that nobody named are not among them."""
         return tuple(sorted({str(name) for block in self.blocks for name in block.session_names} - {""}))
 
+    @property
+    def temperatures(self) -> Array:
+        """The temperatures [K] of the rows that state one."""
+        stated = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
+        return np.concatenate([np.zeros(0), *stated])
+
     def by_session(self) -> list[np.ndarray]:
         """Return the numbers of the configurations of every session, what cross-validation by sessions leaves out.
 

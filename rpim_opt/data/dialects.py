@@ -58,6 +58,7 @@ NAMES = (
          r"|punkt_?nr", "label"),
     Name(r"configuration|config|pose|pose_id", "configuration"),
     Name(r"marker|reflector|smr", "marker"),
+    Name(r"temp(?:erature|eratur)?", "temperature"),
     Name(r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
 )  # fmt: skip
 """What else a column may be called, in lower case and with underscores: unambiguous names alone."""

@@ -80,6 +80,8 @@ def rename(
     read = {name: _read(name, (heads or {}).get(name), [*numeric, *plain], joints) for name in table}
     read = numbered(_turns(read), table, robot.dof, quaternion)
     read = _from_one(_by_name(read, table, joints, robot.dof), robot.dof)
+    if "temperature" not in units and "temperature" not in robot.model.columns:
+        read = {name: _in_degrees(found) for name, found in read.items()}
     read, left_why = _one_of_each(read)
     ours = {name: found for name, found in read.items() if _is_ours(name, found.stem, numeric, plain)}
     new, why = _with_units(ours, numeric, units)
@@ -109,6 +111,13 @@ def _read(name: str, head: Head | None, known: Sequence[str], joints: Sequence[s
         bare = split(head.name)[0]
         found = Reading(bare, "", "named so") if bare in known else recognised(bare, joints)
     return found._replace(unit=unit)
+
+
+def _in_degrees(found: Reading) -> Reading:
+    """Return a reading that is no temperature where its unit is not there: nobody has to say it."""
+    if found.stem == "temperature" and not found.unit:
+        return Reading("", "", "a temperature whose unit is not there")
+    return found
 
 
 def _unit_of(head: Head) -> str:

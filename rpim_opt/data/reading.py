@@ -33,7 +33,7 @@ def read_data(
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
     - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
-      joint moved last, -1 or 1, 0 where it is not known);
+      joint moved last, -1 or 1, 0 where it is not known); ``temperature_C`` (of the robot, for ``expansion``);
     - what terms (`Model`) of the robot and a measurement of your own name as their columns;
     - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``, ``to_approach1``.
 
@@ -117,7 +117,7 @@ def _touched(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
 
 
 def _further(columns: Numbers, robot: Robot, kind: Measurement) -> dict[str, Array]:
-    """Return the columns that a user's own terms and measurement see, as far as the table has them."""
+    """Return the columns that terms and measurement see, as far as the table has them."""
     return {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
 
 

@@ -13,6 +13,7 @@ SPELLED = {
     "meters": "m", "metres": "m", "millimeter": "mm", "millimetre": "mm", "millimeters": "mm", "millimetres": "mm",
     "nm": "Nm", "n.m": "Nm", "n·m": "Nm", "µm": "um", "μm": "um", "micron": "um", "microns": "um", "inch": "in",
     "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm",
+    "°c": "degC", "celsius": "degC", "kelvin": "K",
 }  # fmt: skip
 """Units as they are spelled in headers; their own names besides."""
 

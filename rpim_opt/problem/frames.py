@@ -39,6 +39,7 @@ def starting_parameters(
     base: Place | None = (0.0,) * 6,
     tools: Mapping[str, Place] | None = None,
     own: Mapping[str, float] | None = None,
+    temperature: float | None = None,
 ) -> Parameters:
     """Return the model's parameters with closed-form values for what is not stated; none identified yet.
 
@@ -53,6 +54,8 @@ def starting_parameters(
     own
         Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
         parameters is stated is located from the nominal robot.
+    temperature
+        At which lengths are as on the drawing [K], where the data state temperatures; their mean by default.
 
     Raises
     ------
@@ -82,7 +85,9 @@ def starting_parameters(
         given = _own_values(robot, block, base, places[block.markers[0]], own)
         for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions)
+    if temperature is None and len(data.temperatures):
+        temperature = float(data.temperatures.mean())
+    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions, temperature)
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:

@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads, Stated
 from rpim_opt.robot.kinematics import FRAME, chain, frame
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, tool_prefix
 from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
 
@@ -179,13 +179,21 @@ def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated:
     found = []
     for point, marker in enumerate(of.markers):
         posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
-        flange = chain(of.joint_types, posture, p.value, of.terms)
+        flange = _grown(chain(of.joint_types, posture, p.value, of.terms), p, posture.columns.get("temperature"))
         if of.sessions:
             flange = p.chosen(of.sessions, session) @ flange
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
             flange = p.place("base_") @ flange
         found.append(flange @ p.place(tool_prefix(marker)))
     return found
+
+
+def _grown(flange: ca.SX, p: _Parameters, temperature: Symbol | None) -> ca.SX:
+    """Return where the flange (4, 4) is when all lengths have grown with temperature: as far again from the base."""
+    if temperature is None:
+        return flange
+    growth = 1 + p.value(EXPANSION) * (temperature - p.value(REFERENCE))
+    return ca.vertcat(ca.horzcat(flange[:3, :3], growth * flange[:3, 3]), flange[3, :])
 
 
 def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> dict[str, Symbol]:

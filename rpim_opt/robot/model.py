@@ -14,7 +14,7 @@ from rpim_opt.robot.joint_terms import BEND_SCALE, JOINT_TERMS
 from rpim_opt.robot.kinematics import FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.open_model import Model, entries_of
-from rpim_opt.robot.parameter_names import MDH_DIMENSION, group_of, session_prefix, tool_prefix
+from rpim_opt.robot.parameter_names import EXPANSION, MDH_DIMENSION, REFERENCE, group_of, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 
 Entry = tuple[str, str, float, float]
@@ -35,6 +35,10 @@ DEFAULT_SCALE = {
 """Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
 
 
+STEEL = 12e-6
+"""By how much steel grows [1/K]; aluminium by 23e-6."""
+
+
 def model_parameters(
     robot: Robot,
     base: Sequence[float] | Array = (0.0,) * 6,
@@ -42,6 +46,7 @@ def model_parameters(
     own: Mapping[str, tuple[str, float]] | None = None,
     own_frames: tuple[str, ...] = (),
     sessions: Iterable[str] = (),
+    temperature: float | None = None,
 ) -> Parameters:
     """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
@@ -59,6 +64,9 @@ def model_parameters(
         Prefixes of those that are frames, ``plane_``.
     sessions
         Names of sessions, by which the robot's base is shifted and turned besides.
+    temperature
+        At which the robot's lengths are as on the drawing [K], where temperatures are known: they grow by
+        ``expansion`` a kelvin.
 
     Examples
     --------
@@ -76,6 +84,9 @@ def model_parameters(
         entries += _of_frame(tool_prefix(marker), tool)
     for prefix in dict.fromkeys(map(session_prefix, sessions)):
         entries += _of_frame(prefix, (0.0,) * 6)
+    if temperature is not None:
+        entries.append((EXPANSION, "ratio per temperature", 0.0, STEEL))
+        entries.append((REFERENCE, "temperature", temperature, 1.0))
     if own is not None:
         entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
     names, dimensions, nominal, scale = zip(*entries, strict=True)

@@ -20,9 +20,13 @@ def own_name(name: str) -> str:
     return name.rpartition(".")[2]
 
 
+EXPANSION, REFERENCE = "expansion", "reference_temperature"
+"""By how much all lengths of a robot grow with temperature, and where they are as on the drawing."""
+
+
 def of_joint(name: str) -> bool:
     """Return whether a parameter is a robot's own, and not of a frame."""
-    return _TABLE.fullmatch(own_name(name)) is not None or of_term(name)
+    return _TABLE.fullmatch(own_name(name)) is not None or of_term(name) or own_name(name) == EXPANSION
 
 
 def of_term(name: str) -> bool:

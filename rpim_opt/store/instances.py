@@ -11,6 +11,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import sha256_of
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.shown import Tabled, shortened
+from rpim_opt.basics.units import UNITS
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import Box, Constraint
@@ -210,7 +211,10 @@ def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
     """Return the problem, whose robot and reflectors the validation data must have, too."""
     data = tables.identification
     fixtures = place_fixtures(stated.placed, data)
-    parameters = starting_parameters(stated.robot, data, stated.base, tables.tools, fixtures)
+    temperature = None
+    if stated.table.celsius is not None:
+        temperature = stated.table.celsius + UNITS["degC"].zero
+    parameters = starting_parameters(stated.robot, data, stated.base, tables.tools, fixtures, temperature)
     problem = CalibrationProblem(stated.robot, stated.chosen(parameters, data), data)
     if tables.validation is not None:
         problem.on(tables.validation)

@@ -81,6 +81,7 @@ class ProblemTable(Table):
     urdf_tip: str | None = None
     mounting: Mounting | None = None
     payload: PayloadTable | None = None
+    celsius: float | None = Field(default=None, alias="temperature_C")
     measurement: str = "position"
     layout: Layout = "named"
     identification: str | None = None

@@ -37,7 +37,7 @@ identification = "identification.csv"
 {validation}
 {target}
 # What may deviate from the drawing, by name or pattern: alpha, a, theta, d of every joint, Hayati's beta where axes
-# are near parallel, base_x ... base_rz, tool_x ... tool_rz. This is what "auto" means for these data.{sessions}
+# are near parallel, base_x ... base_rz, tool_x ... tool_rz. This is what "auto" means for these data.{conditions}
 identify = {identify}
 
 formulation = "tikhonov"        # "robust" where rows may be wrong; "bounded" keeps to [tolerance]
@@ -91,6 +91,9 @@ KNOWN_OF = """
 SESSIONS = """
 # session_* (how the registration differs from session to session) comes with model = "auto" where the data want it."""
 """What it says where rows name their session."""
+WARMTH = """
+# expansion (all lengths grow with temperature, counted from its mean or from a key temperature_C = 20.0) likewise."""
+"""What it says where rows state a temperature."""
 TARGET_TEXT = """
 # Where the points that the camera sees are on their board: x along its rows, y along its columns. No view tells whether
 # it is as large as stated; where it was printed, identify board_stretch_x and board_stretch_y, too.
@@ -147,7 +150,7 @@ def problem_text(
         known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
         tools="\n".join(_tool_tables(markers, arm.tool)),
         label=_key(rows.label[0]),
-        sessions=SESSIONS * bool(rows.sessions),
+        conditions=SESSIONS * bool(rows.sessions) + WARMTH * bool(len(rows.temperatures)),
         known_of=KNOWN_OF.replace("BETWEEN", _two_things(rows)) * kind.touching,
         camera=_camera_tables(rows) if seen else "",
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
