@@ -104,7 +104,7 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
     seed
         Of the division.
     parts
-        Instead of that, the numbers of the configurations that are left out together, each in one part:
+        Instead of that, the numbers (k,) of the configurations that are left out together, each in one part:
         `Dataset.by_session` has those of every session.
 
     Raises

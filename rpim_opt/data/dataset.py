@@ -186,12 +186,17 @@ class Dataset(Tabled):
 
     @property
     def temperatures(self) -> Array:
-        """The temperatures [K] of the rows that state one."""
+        """The temperatures (N',) [K] of the rows that state one.
+
+        >>> import rpim_opt as ro
+        >>> ro.load("position").problem.data.temperatures.shape
+        (0,)
+        """
         stated = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
         return np.concatenate([np.zeros(0), *stated])
 
     def by_session(self) -> list[np.ndarray]:
-        """Return the numbers of the configurations of every session, what cross-validation by sessions leaves out.
+        """Return the numbers (k,) of the configurations of every session, for cross-validation by sessions (`k_fold`).
 
         Rows that name no session are one more. Sessions that share a configuration stand together.
 

@@ -183,7 +183,13 @@ class Parameters(Tabled):
 
     @property
     def placed(self) -> np.ndarray:
-        """(P,) which of these may be anywhere: all but the shifts of sessions, which are as small as their sizes."""
+        """(P,) which of these may be anywhere: all but the shifts of sessions, which are as small as their sizes.
+
+        >>> import rpim_opt as ro
+        >>> parameters = ro.load("position").problem.parameters
+        >>> bool((parameters.placed == parameters.of_frames).all())  # nobody named a session
+        True
+        """
         return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)
 
     @property
