@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.blunders import clustered
 from rpim_opt.calibration.families import SESSIONS, WARMTH, members
 from rpim_opt.calibration.learning import sampled
-from rpim_opt.calibration.models import candidates, extended, restricted
+from rpim_opt.calibration.models import compared, extended, restricted, size_names
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.sizing import Learning, few
 from rpim_opt.convex.evidence import CENTRES, Evidence, Point
@@ -116,8 +116,17 @@ class Comparison:
     @cached_property
     def best(self) -> Judged:
         """The model that the data want, at a price of `SPEAK` a family."""
-        models = [self.plain, *(self._with(families) for families in self._candidates)]
-        return min(models, key=lambda model: model.point.value + SPEAK * len(model.families))
+        learned = self.result.learned
+        if learned is not None and learned.trials:  # the evidence has spoken
+            return self.plain
+        found = compared(self.problem, self.families, self._priced)
+        return min([self._priced(()), *found], key=itemgetter(0))[2]
+
+    def _priced(self, families: tuple[str, ...]) -> tuple[float, tuple[str, ...], Judged]:
+        model = self.plain
+        if families:
+            model = self._with(families)
+        return model.point.value + SPEAK * len(families), families, model
 
     @cached_property
     def gain(self) -> float:
@@ -142,13 +151,6 @@ class Comparison:
         keep = np.isin(self.names, [name for name, out in zip(self.own, members, strict=True) if not out])
         return self._fitted((), keep).point.value - self.plain.point.value
 
-    @property
-    def _candidates(self) -> Sequence[tuple[str, ...]]:
-        learned = self.result.learned
-        if learned is not None and learned.trials:  # the evidence has spoken
-            return ()
-        return [families for families in candidates(self.problem, self.families) if families]
-
     def _with(self, families: tuple[str, ...]) -> Judged:
         used = set(self.own).union(*(self.families[family] for family in families))
         return self._fitted(families, np.isin(self.names, list(used)))
@@ -161,8 +163,8 @@ class Comparison:
 
     def _from_plain(self, evidence: Evidence) -> Array:
         plain = self.plain
-        known = dict(zip(_sizes(plain.evidence), plain.point.logs, strict=True))
-        return np.array([known.get(name, c) for name, c in zip(_sizes(evidence), evidence.centre, strict=True)])
+        known = dict(zip(size_names(plain.evidence), plain.point.logs, strict=True))
+        return np.array([known.get(name, c) for name, c in zip(size_names(evidence), evidence.centre, strict=True)])
 
     def _start(self, evidence: Evidence) -> Array:
         """Return the sizes that a result learned, as far as it did."""
@@ -170,15 +172,10 @@ class Comparison:
         logs = evidence.centre.copy()
         if learned is None:
             return logs
-        for i, name in enumerate(_sizes(evidence)):
+        for i, name in enumerate(size_names(evidence)):
             if name in learned.noise and name in CENTRES:
                 logs[i] = np.log(learned.noise[name].value)
         return logs
-
-
-def _sizes(evidence: Evidence) -> tuple[str, ...]:
-    """Return the names of all sizes."""
-    return (*evidence.believed.names, *evidence.noise)
 
 
 def _trusted(result: Outcome) -> CalibrationProblem:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import combinations
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +25,8 @@ LARGE = 3.0
 """By how much larger, in their logarithms, families are expected in another start."""
 COMPARED = 1e-6
 """Of -2 ln L, to which models are compared: hundredths, of some thousands."""
+Priced = tuple[float, tuple[str, ...], Any]
+"""A model that was compared: what decides, its families, and what was found."""
 ROUNDS = 3
 """Linearizations at which the sizes of the chosen model are looked for."""
 
@@ -52,28 +58,45 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
     columns = learning.evidence(whole, x)
     names = whole.parameters.free.names
     own = set(fit.problem.parameters.free.names)
-    trials = []
-    for candidate in candidates(fit.problem, families):
+    before = dict(zip(size_names(fit.evidence), fit.point.logs, strict=True))
+    sizes: dict[frozenset[str], dict[str, float]] = {}
+
+    def tried(candidate: tuple[str, ...]) -> tuple[float, tuple[str, ...], Point]:
         used = own.union(*(families[family] for family in candidate))
         evidence = restricted(columns, np.array([name in used for name in names]))
-        point = evidence.mode(_starts(evidence, fit), COMPARED)[0]
-        trials.append((point.value + GAIN * _questions(candidate), candidate, point))
-    trials.sort(key=lambda trial: trial[0])
+        conditions = frozenset(candidate).intersection(CONDITIONS)
+        point = evidence.mode(_starts(evidence, sizes.get(conditions, before), fit.several), COMPARED)[0]
+        if conditions and conditions == set(candidate):  # what they explain stood among the noise
+            sizes[conditions] = dict(zip(size_names(evidence), point.logs, strict=True))
+        return point.value + GAIN * _questions(candidate), candidate, point
+
+    trials = sorted(compared(fit.problem, families, tried), key=itemgetter(0))
     _, best, point = trials[0]
     added = tuple(name for family in best for name in families[family])
     return added, tuple(Trial(candidate, each.value) for _, candidate, each in trials), point
 
 
-def candidates(problem: CalibrationProblem, families: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return the models that these data may tell apart, each once."""
-    tried = CANDIDATES
+def compared(
+    problem: CalibrationProblem,
+    families: dict[str, tuple[str, ...]],
+    tried: Callable[[tuple[str, ...]], Priced],
+) -> list[Priced]:
+    """Return the models that were compared, what ``tried`` says of each: its price first, its families second.
+
+    Families of the arm are chosen with all conditions in the model, which would stand for them else; then of the best
+    one each condition is asked for.
+    """
+    arm = CANDIDATES
     if len(np.unique(problem.data.configuration)) < MANY:
-        tried = CANDIDATES[:-1]
-    possible = [tuple(family for family in candidate if family in families) for candidate in tried]
-    for condition in CONDITIONS:
-        if condition in families:
-            possible += [(*candidate, condition) for candidate in possible]
-    return list(dict.fromkeys(possible))
+        arm = CANDIDATES[:-1]
+    conditions = tuple(condition for condition in CONDITIONS if condition in families)
+    possible = [tuple(family for family in candidate if family in families) for candidate in arm]
+    found = [tried((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+    best = min(found, key=itemgetter(0))[1]
+    kept = tuple(family for family in best if family not in conditions)
+    for count in range(len(conditions)):
+        found += [tried((*kept, *some)) for some in combinations(conditions, count)]
+    return found
 
 
 def _questions(families: tuple[str, ...]) -> int:
@@ -89,20 +112,32 @@ def extended(problem: CalibrationProblem, x: Array, names: tuple[str, ...]) -> t
     return whole, np.array([known.get(name, 0.0) for name in whole.parameters.free.names])
 
 
-def _starts(evidence: Evidence, fit: Fit) -> list[Array]:
-    """Return where the optimum of a model with families is looked for: at the sizes without them, and as always."""
-    before = fit.evidence.believed.names
-    names = evidence.believed.names
-    logs = evidence.centre.copy()
-    logs[[names.index(name) for name in before]] = fit.point.logs[: len(before)]
-    logs[len(names) :] = fit.point.logs[len(before) :]
+def size_names(evidence: Evidence) -> tuple[str, ...]:
+    """Return the names of all sizes: of deviations, then of noise."""
+    return (*evidence.believed.names, *evidence.noise)
+
+
+def _starts(evidence: Evidence, sizes: Mapping[str, float], several: bool) -> list[Array]:
+    """Return where the optimum of a model with families is looked for: at known sizes, and as always.
+
+    Parameters
+    ----------
+    evidence
+        Of the model.
+    sizes
+        Logarithms of sizes by name, of a model that was looked at before.
+    several
+        Whether there are other optima.
+    """
+    names = size_names(evidence)
+    logs = np.array([sizes.get(name, centre) for name, centre in zip(names, evidence.centre, strict=True)])
     starts = [logs]
-    new = [i for i, name in enumerate(names) if name not in before]
+    new = [i for i, name in enumerate(names) if name not in sizes]
     if new:  # at small sizes the likelihood is flat in a family whose effect the noise has taken up
         large = logs.copy()
         large[new] += LARGE
         starts.append(large)
-    if fit.several:
+    if several:
         starts += evidence.starts()
     return starts
 
