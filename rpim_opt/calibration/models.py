@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations
 from operator import itemgetter
 from typing import Any
 
@@ -54,7 +54,7 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
     All models are compared at one linearization: families are small.
     """
     families = members(fit.problem)
-    whole, x = extended(fit.problem, fit.x, tuple(name for names in families.values() for name in names))
+    whole, x = extended(fit.problem, fit.x, tuple(chain.from_iterable(families.values())))
     columns = learning.evidence(whole, x)
     names = whole.parameters.free.names
     own = set(fit.problem.parameters.free.names)
@@ -86,17 +86,22 @@ def compared(
     Families of the arm are chosen with all conditions in the model, which would stand for them else; then of the best
     one each condition is asked for.
     """
-    arm = CANDIDATES
-    if len(np.unique(problem.data.configuration)) < MANY:
-        arm = CANDIDATES[:-1]
     conditions = tuple(condition for condition in CONDITIONS if condition in families)
-    possible = [tuple(family for family in candidate if family in families) for candidate in arm]
-    found = [tried((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+    found = [tried((*candidate, *conditions)) for candidate in _of_arm(problem, families)]
     best = min(found, key=itemgetter(0))[1]
     kept = tuple(family for family in best if family not in conditions)
     for count in range(len(conditions)):
         found += [tried((*kept, *some)) for some in combinations(conditions, count)]
     return found
+
+
+def _of_arm(problem: CalibrationProblem, families: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return the models of the arm that these data may tell apart, each once."""
+    arm = CANDIDATES
+    if len(np.unique(problem.data.configuration)) < MANY:
+        arm = CANDIDATES[:-1]
+    possible = [tuple(family for family in candidate if family in families) for candidate in arm]
+    return list(dict.fromkeys(possible))
 
 
 def _questions(families: tuple[str, ...]) -> int:

@@ -85,9 +85,15 @@ def starting_parameters(
         given = _own_values(robot, block, base, places[block.markers[0]], own)
         for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    if temperature is None and len(data.temperatures):
-        temperature = float(data.temperatures.mean())
-    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions, temperature)
+    reference = _reference(data, temperature)
+    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions, reference)
+
+
+def _reference(data: Dataset, stated: float | None) -> float | None:
+    """Return the temperature at which lengths are as on the drawing [K]; None where nothing is known of it."""
+    if stated is None and len(data.temperatures):
+        return float(data.temperatures.mean())
+    return stated
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:

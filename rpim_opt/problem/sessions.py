@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix
+from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
 from rpim_opt.robot.parameters import Parameters
 
 
@@ -32,20 +34,12 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     True
     """
     p = problem.parameters
-    entries: list[int] = []
-    names: list[str] = []
-    for robot in problem.arms:
-        own = p.of_robot(robot)
-        model = _first(own)
-        known = {frame_of(name) for name in own.free.names}
-        for prefix in _prefixes(problem, robot):
-            if model and prefix not in known:
-                entries += [p.names.index(p.called(robot, name)) for name in model]
-                names += [_beside(p, robot, model[0], prefix + name.rpartition("_")[2]) for name in model]
-    if not entries:
+    like = dict(chain.from_iterable(_new(problem, robot) for robot in problem.arms))
+    if not like:
         return problem
-    kept = np.flatnonzero(~np.isin(p.names, names))
-    more = replace(p.take(np.array(entries)), names=tuple(names), nominal=np.zeros(len(names)))
+    kept = np.flatnonzero(~np.isin(p.names, list(like)))
+    entries = np.array([p.names.index(name) for name in like.values()])
+    more = replace(p.take(entries), names=tuple(like), nominal=np.zeros(len(like)))
     scatter = problem.scatter
     if scatter is not None and scatter.at is not None:
         scatter = replace(scatter, at=np.append(scatter.at[kept], more.nominal))
@@ -89,6 +83,18 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
     return found
 
 
+def _new(problem: CalibrationProblem, robot: str) -> Iterator[tuple[str, str]]:
+    """Yield the parameters of the sessions of a robot's rows that are not identified, each with a known one like it."""
+    p = problem.parameters
+    own = p.of_robot(robot)
+    known = {frame_of(name) for name in own.free.names}
+    for prefix in _prefixes(problem, robot):
+        for name in _first(own):
+            if prefix not in known:
+                called = p.called(robot, name)
+                yield called.removesuffix(name) + prefix + name.rpartition("_")[2], called
+
+
 def _first(own: Parameters) -> list[str]:
     """Return the identified parameters of the first session of one robot, as itself calls them."""
     names = [name for name in own.free.names if of_session(name)]
@@ -99,11 +105,6 @@ def _prefixes(problem: CalibrationProblem, robot: str) -> list[str]:
     """Return the prefixes of the sessions of a robot's rows, in their order."""
     names = [name for block in problem.data.blocks if block.robot == robot for name in block.session_names]
     return [session_prefix(name) for name in dict.fromkeys(names)]
-
-
-def _beside(parameters: Parameters, robot: str, known: str, own: str) -> str:
-    """Return what the table calls a parameter of a robot, as it calls a known one."""
-    return parameters.called(robot, known).removesuffix(own_name(known)) + own
 
 
 def _joined(first: Parameters, second: Parameters) -> Parameters:

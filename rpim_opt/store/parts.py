@@ -220,11 +220,6 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
     point = None
     if part.point is not None:
         point = _points(part.point, f"{where}.point", N, kind.points)
-    session = None
-    if part.session is not None:
-        if len(part.session) != N:
-            raise InputError(f"{where}.session", f"{len(part.session)} names", f"{N}, one a row")
-        session = named_sessions(part.session, N)
     return Block(
         kind,
         q=_array(part.q, f"{where}.q", N, kind.points, -1),
@@ -239,7 +234,7 @@ def _block_of(part: BlockPart, known: Mapping[str, Measurement], where: str) -> 
         columns={name: _array(values, f"{where}.columns.{name}", N) for name, values in part.columns.items()},
         robot=part.robot,
         point=point,
-        session=session,
+        session=named_sessions(part.session or (), N),
     )
 
 
