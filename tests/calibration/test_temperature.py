@@ -17,7 +17,7 @@ ALUMINIUM = 23e-6
 """[1/K]"""
 ZERO = 273.15
 SEED = 3
-COUNT = 40
+COUNT = 25
 
 
 def warmed(expansion: float, seed: int = SEED) -> ro.CalibrationProblem:
@@ -62,7 +62,7 @@ def test_all_lengths_grow_alike(problem: ro.CalibrationProblem) -> None:
     growth[names.index(EXPANSION)] = 1e-4
     kelvin = problem.data.temperatures - problem.parameters.nominal[problem.parameters.names.index(REFERENCE)]
     grown = own.modelled(growth)[0]
-    for row in (0, 20, 39):  # the same arm with longer links, one temperature at a time
+    for row in (0, 12, 24):  # the same arm with longer links, one temperature at a time
         longer = np.array([1e-4 * kelvin[row] * v for v in free.nominal])
         longer[names.index(EXPANSION)] = 0.0
         assert np.allclose(grown[row], own.modelled(longer)[0][row], atol=1e-12)
