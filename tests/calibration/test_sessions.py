@@ -240,6 +240,30 @@ def test_sessions_that_share_a_configuration_are_left_out_together(problem: ro.C
     assert sorted(len(part) for part in parts) == [10, 10, 19]
 
 
+def test_a_raw_table_keeps_its_sessions_through_a_folder(
+    problem: ro.CalibrationProblem, automatic: ro.Calibration, tmp_path: Path
+) -> None:
+    data = problem.data
+    raw = {f"J{i + 1} [deg]": np.degrees(data.q[:, i]) for i in range(6)}
+    raw |= {f"{axis} [mm]": 1e3 * data.blocks[0].y[:, k] for k, axis in enumerate("XYZ")}
+    rows = zip(*raw.values(), DAYS, np.linspace(20, 24, len(DAYS)), strict=True)
+    lines = [",".join([*raw, "Campaign", "Temperature [°C]"]), *(",".join(map(str, row)) for row in rows)]
+    table = tmp_path / "raw.csv"
+    table.write_text("\n".join(lines), encoding="utf-8")
+    ro.store.new_problem(tmp_path / "cell", "ur10e", table)
+    stated = tmp_path / "cell" / "problem.toml"
+    assert "# session_* " in stated.read_text(encoding="utf-8")
+    text = stated.read_text(encoding="utf-8").replace('"theta?",', '"theta?", "session_*", "expansion",')
+    stated.write_text("temperature_C = 21.0\n" + text, encoding="utf-8")
+    found = ro.load(tmp_path / "cell").problem
+    assert found.data.sessions == data.sessions
+    assert {"session_day_4_rz", "expansion"} <= set(found.parameters.free.names)
+    assert found.parameters.nominal[found.parameters.names.index("reference_temperature")] == 273.15 + 21.0
+    again, left_out = ro.read_measurements(automatic, table)
+    assert left_out == ()
+    assert automatic.errors(again) == pytest.approx(automatic.errors(data), abs=1e-9)
+
+
 @pytest.mark.parametrize(
     ("column", "said"),
     [(["a"] * 39 + [""], "row 40, column session: found ''"), (["a 1"] * 20 + ["a-1"] * 20, "'a 1' and 'a-1'")],
