@@ -46,6 +46,15 @@ def by_size(group: np.ndarray) -> list[Rows]:
     return found
 
 
+def taken(M: Array, places: np.ndarray) -> Array:
+    """Return some rows of a matrix (m, p), without a copy where their places (G,) are evenly spaced."""
+    if len(places) > 1:
+        steps = np.diff(places)
+        if steps[0] > 0 and (steps == steps[0]).all():
+            return M[places[0] : places[-1] + 1 : steps[0]]
+    return M[places]
+
+
 def solved(M: Array, v: Array) -> Array:
     """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...), without pivoting.
 
@@ -109,7 +118,8 @@ def of_squares(Q: Array, s2: Array, target: Array, group: np.ndarray) -> Score:
 def _products(Q: Array, places: np.ndarray) -> dict[tuple[int, int], Array]:
     """Return the products (G, p) of the rows i <= j of every configuration, whose sums are its influence."""
     k = places.shape[1]
-    return {(i, j): Q[places[:, i]] * Q[places[:, j]] for i in range(k) for j in range(i, k)}
+    rows = [taken(Q, each) for each in places.T]
+    return {(i, j): rows[i] * rows[j] for i in range(k) for j in range(i, k)}
 
 
 class Folds:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -82,10 +82,19 @@ class Newton(Whitened):
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
 
-        Where the neighbour was too far for kinks as sharp as there, they begin blunter.
+        Where the neighbour was too far for kinks as sharp as there, they begin blunter. Many norms are first taken as
+        they are: none of them may be zero at the minimum.
         """
         if self._dear:
             return self._by_secants(self._placed(z, kinked))
+        if self._away is not None:
+            curved = kinked.curved if kinked is not None else None
+            ended = self._away._by_secants(self._away._placed(z, Kinked([], 1.0, curved)), hasty=True)
+            if ended.good or ended.close:
+                return ended
+            z = ended.z
+        if kinked is None or len(kinked.multipliers) < len(self.loss.kinks):  # a neighbour without kinks
+            kinked = None
         if kinked is None or not self.loss.kinks:
             return self._descent(self._placed(z, kinked), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
@@ -119,7 +128,15 @@ class Newton(Whitened):
         """Whether a second derivative costs far more than a slope, and there is one that lasts."""
         return self.at.rows.size >= DEAR and not self.loss.kinks
 
-    def _by_secants(self, point: Point) -> Ended:
+    @cached_property
+    def _away(self) -> Newton | None:
+        """The same program away from kinks at norms of zero, where that is dear and there are some."""
+        away = self.loss.away
+        if away is None or self.at.rows.size < DEAR:
+            return None
+        return replace(self, loss=away)
+
+    def _by_secants(self, point: Point, hasty: bool = False) -> Ended:
         """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
 
         Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
@@ -130,7 +147,7 @@ class Newton(Whitened):
         ended = self._judged(point, slope, 0)
         best = Best(ended)
         for steps in range(1, MOST):
-            if best.will_do(ENOUGH):
+            if best.will_do(ENOUGH, hasty):
                 break
             fresh = bent is None
             if bent is None:

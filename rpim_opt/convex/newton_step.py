@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.left_out import Rows, by_size, solved
+from rpim_opt.convex.left_out import Rows, by_size, solved, taken
 from rpim_opt.convex.program import Estimate, Program
 
 SMALL = 1e-5
@@ -117,28 +118,36 @@ class NewtonStep:
         A, H = self._face(estimate)
         r = model.A @ estimate.z - model.b
         loss = self._loss(r, estimate)
-        bent = loss.rows[:, None] * A
-        if loss.extra.any():
-            for some in self.parts:
-                u = loss.u[some.places]
-                along = np.einsum("gk,gkp->gp", u, A[some.places]) * loss.extra[some.configurations, None]
-                bent[some.places] += u[:, :, None] * along[:, None, :]
-        values, vectors = np.linalg.eigh(A.T @ bent + H)
+        values, vectors = np.linalg.eigh(self._bent(A, loss) + H)
         root = np.zeros_like(values)
         kept = values > DROPPED * np.max(values, initial=0.0)
         root[kept] = 1 / np.sqrt(values[kept])
-        X = (A @ vectors) * root
+        X = A @ (vectors * root)
         norms = np.zeros(len(loss.extra))
         for some in self.parts:
             norms[some.configurations] = self._left(some, X, r, loss)
         return norms
 
+    def _bent(self, A: Array, loss: Curved) -> Array:
+        """Return the second derivative (p, p) of the loss along columns (m, p)."""
+        bent = A.T @ (loss.rows[:, None] * A)
+        if not loss.extra.any():
+            return bent
+        for some in self.parts:
+            along = np.zeros((len(some.places), A.shape[1]))
+            for places in some.places.T:
+                along += loss.u[places, None] * taken(A, places)
+            bent += along.T @ (loss.extra[some.configurations, None] * along)
+        return bent
+
     def _left(self, some: Rows, X: Array, r: Array, loss: Curved) -> Array:
         """Return the norms (G,) of left-out residuals of some configurations."""
         places = some.places
-        X_g = X[places]
-        S = np.moveaxis(X_g @ np.swapaxes(X_g, 1, 2), 0, -1)
         u, k = loss.u[places].T, places.shape[1]
+        S = np.empty((k, k, len(places)))
+        X_g = [taken(X, each) for each in places.T]
+        for i, j in combinations_with_replacement(range(k), 2):
+            S[i, j] = S[j, i] = np.einsum("gp,gp->g", X_g[i], X_g[j])
         W = np.eye(k)[:, :, None] * loss.rows[places].T + loss.extra[some.configurations] * u[:, None] * u
         # S (1 - W S)^-1 = (1 - S W)^-1 S
         M = np.eye(k)[:, :, None] - np.einsum("ijg,jlg->ilg", S, W)
@@ -165,6 +174,8 @@ class NewtonStep:
         free = np.ones(len(z), dtype=bool)
         if program.box is not None:
             free = (z > program.box[0]) & (z < program.box[1])
+        if free.all():
+            return A, 2 * weight * L.T @ L
         H = 2 * weight * L[:, free].T @ L[:, free]
         return A[:, free], H
 

@@ -166,7 +166,7 @@ def two_step(program: Program) -> Selection:
     if program.faces is not None:
         last = max(last, min(start, weight_grid(program, 2)[0]))
     coarse = np.geomspace(start, last, 30)
-    residual = np.sqrt([e.loss for e in program.path(coarse)])
+    residual = np.sqrt([e.loss for e in program.path(coarse, rough=True)])
     level = coarse[np.argmax(residual[1:] >= 0.99 * residual[:-1])]
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
     score = _left_out_error(program, fine)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.rows import LINE, Affine, Kink, Rows
+from rpim_opt.convex.rows import LINE, Affine, Kink, Piece, Rows
 
 NEAR_ZERO = 1e-150
 """Norms below have no direction."""
@@ -57,11 +57,22 @@ class Separated:
         (N,) the first equation of every group; None where the loss gets equations.
     count
         Equations m.
+    straight
+        Whether norms are taken as they are, without kinks: where they are zero, their slope is zero, too.
     """
 
     rows: Rows
     starts: np.ndarray | None
     count: int
+    straight: bool = False
+
+    @cached_property
+    def away(self) -> Separated | None:
+        """The same sum as it is away from kinks at norms of zero; None where it has none, or of equations."""
+        if self.starts is None or not self.kinks:
+            return None
+        line = Piece(LINE, self.at_zero - self._tilt, PLAIN)
+        return replace(self, rows=replace(self._curved, pieces=(*self._curved.pieces, line)), straight=True)
 
     @cached_property
     def _sizes(self) -> np.ndarray:
@@ -98,7 +109,7 @@ class Separated:
         """The kinks, as norms of groups or as absolute values of equations."""
         if self.starts is None:
             return list(self.rows.kinks)
-        if np.all(self.at_zero == 0):
+        if self.straight or np.all(self.at_zero == 0):
             return []
         return [Kink(self.at_zero, PLAIN)]
 
@@ -147,7 +158,7 @@ class Separated:
     @cached_property
     def _curved(self) -> Rows:
         """What is no kink and, of norms, no line: a line in a norm is a kink at zero."""
-        if self.starts is None:
+        if self.starts is None or self.straight:
             return self.rows
         bent = tuple(piece for piece in self.rows.pieces if piece.curve is not LINE)
         nothing = np.zeros(len(self.starts))
@@ -157,7 +168,7 @@ class Separated:
     @cached_property
     def _tilt(self) -> Any:
         """Slopes (N,) that curved pieces have at norms of zero, which belong to the kink there; or one number."""
-        if self.starts is None:
+        if self.starts is None or self.straight:
             return 0.0
         slope = self._curved.both(np.zeros(len(self.starts)))[1]
         if np.any(slope):
