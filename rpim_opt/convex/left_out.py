@@ -47,11 +47,10 @@ def by_size(group: np.ndarray) -> list[Rows]:
 
 
 def taken(M: Array, places: np.ndarray) -> Array:
-    """Return some rows of a matrix (m, p), without a copy where their places (G,) are evenly spaced."""
-    if len(places) > 1:
-        steps = np.diff(places)
-        if steps[0] > 0 and (steps == steps[0]).all():
-            return M[places[0] : places[-1] + 1 : steps[0]]
+    """Return rows (G, k, p) of a matrix (m, p) or numbers (G, k) of (m,), without a copy where they follow each other."""
+    first = int(places[0, 0]) if places.size else 0
+    if np.array_equal(places.ravel(), np.arange(first, first + places.size)):
+        return M[first : first + places.size].reshape(*places.shape, *M.shape[1:])
     return M[places]
 
 
@@ -118,8 +117,8 @@ def of_squares(Q: Array, s2: Array, target: Array, group: np.ndarray) -> Score:
 def _products(Q: Array, places: np.ndarray) -> dict[tuple[int, int], Array]:
     """Return the products (G, p) of the rows i <= j of every configuration, whose sums are its influence."""
     k = places.shape[1]
-    rows = [taken(Q, each) for each in places.T]
-    return {(i, j): rows[i] * rows[j] for i in range(k) for j in range(i, k)}
+    rows = taken(Q, places)
+    return {(i, j): rows[:, i] * rows[:, j] for i in range(k) for j in range(i, k)}
 
 
 class Folds:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -130,29 +129,29 @@ class NewtonStep:
 
     def _bent(self, A: Array, loss: Curved) -> Array:
         """Return the second derivative (p, p) of the loss along columns (m, p)."""
-        bent = A.T @ (loss.rows[:, None] * A)
+        X = np.sqrt(np.maximum(loss.rows, 0.0))[:, None] * A
+        bent = X.T @ X
         if not loss.extra.any():
             return bent
         for some in self.parts:
-            along = np.zeros((len(some.places), A.shape[1]))
-            for places in some.places.T:
-                along += loss.u[places, None] * taken(A, places)
+            along = np.einsum("gk,gkp->gp", taken(loss.u, some.places), taken(A, some.places))
             bent += along.T @ (loss.extra[some.configurations, None] * along)
         return bent
 
     def _left(self, some: Rows, X: Array, r: Array, loss: Curved) -> Array:
         """Return the norms (G,) of left-out residuals of some configurations."""
         places = some.places
-        u, k = loss.u[places].T, places.shape[1]
-        S = np.empty((k, k, len(places)))
-        X_g = [taken(X, each) for each in places.T]
-        for i, j in combinations_with_replacement(range(k), 2):
-            S[i, j] = S[j, i] = np.einsum("gp,gp->g", X_g[i], X_g[j])
-        W = np.eye(k)[:, :, None] * loss.rows[places].T + loss.extra[some.configurations] * u[:, None] * u
+        k = places.shape[1]
+        u, across = loss.u[places.T], loss.rows[places.T]
+        X_g = taken(X, places)
+        S = np.einsum("gip,gjp->ijg", X_g, X_g)
+        W = np.eye(k)[:, :, None] * across + loss.extra[some.configurations] * u[:, None] * u
         # S (1 - W S)^-1 = (1 - S W)^-1 S
-        M = np.eye(k)[:, :, None] - np.einsum("ijg,jlg->ilg", S, W)
-        change = solved(M, np.einsum("ijg,jg->ig", S, loss.slope[places].T))
-        return np.sqrt(np.sum((r[places].T + change) ** 2, axis=0))
+        M = np.repeat(np.eye(k)[:, :, None], len(places), axis=2)
+        for j in range(k):
+            M -= S[:, j, None] * W[j]
+        change = solved(M, np.einsum("ijg,jg->ig", S, loss.slope[places.T]))
+        return np.sqrt(np.sum((r[places.T] + change) ** 2, axis=0))
 
     # --- the penalty -----------------------------------------------------------------------------------------------
 
@@ -188,7 +187,11 @@ class NewtonStep:
         return np.sqrt(np.bincount(self.which, r**2))
 
     def _slopes(self, v: Array) -> Array | None:
-        slope = self.program.row_slopes(v)
+        loss = self.program.separated
+        if loss is not None and loss.starts is not None:  # the same as CVXPY's, in fewer passes
+            slope = loss.slope_of_norms(v)
+        else:
+            slope = self.program.row_slopes(v)
         if slope is None or len(slope) != len(v) or not np.isfinite(slope).all():
             return None
         return slope

@@ -113,6 +113,10 @@ class Separated:
             return []
         return [Kink(self.at_zero, PLAIN)]
 
+    def slope_of_norms(self, v: Array) -> Array:
+        """Return f_i' (N,) at norms of groups, on the right where there is a kink."""
+        return self._curved.both(v)[1] - self._tilt + self.at_zero
+
     @property
     def holds(self) -> bool:
         """Whether the sum is one that can be separated: its kinks over norms all at zero, and no slope falling."""
