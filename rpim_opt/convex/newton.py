@@ -186,7 +186,7 @@ class Newton(Whitened):
         """Return by how much the objective would fall, were it quadratic; infinite in a box."""
         if self.box is not None:
             return np.inf
-        factor, failed = _potrf(self._whole(bent))
+        factor, failed = self._factored(bent)[1:]
         if failed:
             return np.inf
         return 0.5 * float(slope @ _potrs(factor, slope)[0])
@@ -257,8 +257,7 @@ class Newton(Whitened):
 
     def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
         """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""
-        H = self._whole(bent)
-        factor, failed = _potrf(H)
+        H, factor, failed = self._factored(bent)
         if failed:
             factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
         if self.box is None:
@@ -270,6 +269,19 @@ class Newton(Whitened):
         z, _ = minimum_in_box(R @ self.back, target + R @ (self.back @ self.at.offset), *self.box, point.z)
         step = self.unit * (self.back @ (z - point.z))
         return self._searched(point, z, step)
+
+    def _factored(self, bent: Array) -> tuple[Array, Array, int]:
+        """Return the second derivative of the smoothed objective, its Cholesky factor, and whether there is none."""
+        known = self._last.get("bent")
+        if known is None or known[0] is not bent:  # what is promised is asked before the step
+            H = self._whole(bent)
+            self._last["bent"] = (bent, (H, *_potrf(H)))
+        return self._last["bent"][1]
+
+    @cached_property
+    def _last(self) -> dict[str, Any]:
+        """The last second derivative that was factored."""
+        return {}
 
     def _whole(self, bent: Array) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
@@ -286,7 +298,9 @@ class Newton(Whitened):
     def _hessian(self, point: Point) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
         curvatures = self.loss.curvature(point.r, *point.kinked[:2])
-        across = sum(c.across for c in curvatures[1:]) + curvatures[0].across
+        across = curvatures[0].across
+        for more in curvatures[1:]:
+            across = across + more.across
         H = self._across(across)
         for curvature in curvatures:
             if len(curvature.along):
@@ -296,21 +310,19 @@ class Newton(Whitened):
     def _across(self, across: Array) -> Array:
         """Return what curvatures of the equations add."""
         rows = self.at.rows
-        usual = 0.0
-        other = np.arange(len(rows))
         if rows.size >= DEAR:  # most of them may have the same
             usual = float(np.partition(across, len(across) // 2)[len(across) // 2])
             other = np.flatnonzero(across != usual)
-        if 2 * len(other) > len(rows):
-            X = np.sqrt(across)[:, None] * rows
-            return X.T @ X
-        X = rows[other]
-        return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+            if 2 * len(other) <= len(rows):
+                X = rows[other]
+                return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+        X = np.sqrt(across)[:, None] * rows
+        return X.T @ X
 
     def _along(self, curvature: Curvature) -> Array:
         """Return what the curvatures along the groups' directions add."""
         _, along, u = curvature
-        bent = np.flatnonzero(along)
+        bent = along.nonzero()[0]
         X = self.loss.projected(self.at.rows, u, bent)
         return X.T @ (along[bent][:, None] * X)
 

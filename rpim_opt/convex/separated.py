@@ -127,21 +127,30 @@ class Separated:
 
     def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
         """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
-        sizes = self._sizes
-        if np.ptp(sizes) == 0:
-            by_group = u.reshape(len(sizes), -1), rows.reshape(len(sizes), sizes[0], -1)
-            if 2 * len(groups) > len(sizes):  # most of them: picked out afterwards
+        count, each = len(self._sizes), self._alike
+        if each:
+            by_group = u.reshape(count, each), rows.reshape(count, each, -1)
+            if len(groups) == count:
+                return np.einsum("nk,nkp->np", *by_group)
+            if 2 * len(groups) > count:  # most of them: picked out afterwards
                 return np.einsum("nk,nkp->np", *by_group)[groups]
-            return np.einsum("nk,nkp->np", *(each[groups] for each in by_group))
+            return np.einsum("nk,nkp->np", *(some[groups] for some in by_group))
         return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
+
+    @cached_property
+    def _alike(self) -> int:
+        """Equations of every group that all have the same number; else 0."""
+        sizes = self._sizes
+        if np.ptp(sizes) > 0:
+            return 0
+        return int(sizes[0])
 
     @cached_property
     def _columns(self) -> int:
         """Equations of every group, of many that have the same number; else 0."""
-        sizes = self._sizes
-        if len(sizes) < MANY or np.ptp(sizes) > 0:
+        if len(self._sizes) < MANY:
             return 0
-        return int(sizes[0])
+        return self._alike
 
     def _norms(self, s: Array) -> Array:
         if self.starts is None:
@@ -155,7 +164,7 @@ class Separated:
 
     def _spread(self, v: Any) -> Any:
         """Return numbers of groups (N,) by equation (m,)."""
-        if self.starts is None or np.ndim(v) == 0:
+        if self.starts is None or not isinstance(v, np.ndarray):
             return v
         return v[self.which]
 
@@ -181,13 +190,14 @@ class Separated:
 
     def _smooth(self, r: Array) -> tuple[float, Array]:
         """Return value and slope (m,) of what is no kink."""
-        if not self._curved.pieces:
-            return self._curved.constant, np.zeros_like(r)
+        curved = self._curved
+        if not curved.pieces:
+            return curved.constant, np.zeros(r.shape)
         if self.starts is None:
-            return self._curved.both(r)
+            return curved.both(r)
         v = self._norms(r)
-        value, slope = self._curved.both(v)
-        if np.ndim(self._tilt):
+        value, slope = curved.both(v)
+        if isinstance(self._tilt, np.ndarray):
             slope = slope - self._tilt
             value -= float(self._tilt @ v)
         return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
@@ -219,7 +229,9 @@ class Separated:
 
     def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
         """Return the second derivative of the smoothed loss, as a sum."""
-        found = [self._smooth_curvature(r)]
+        found = []
+        if self._curved.pieces or not y:
+            found.append(self._smooth_curvature(r))
         for (factor, of), old in zip(self.kinks, y, strict=True):
             t = sharpness * _along(of, r) + old
             length = np.maximum(self._norms(t), NEAR_ZERO)
@@ -228,7 +240,7 @@ class Separated:
                 found.append(Curvature(of.a**2 * sharpness * inside))
                 continue
             across = sharpness * np.minimum(1.0, factor / length)
-            found.append(Curvature(self._spread(across), np.where(inside, 0.0, -across), t / self._spread(length)))
+            found.append(Curvature(self._spread(across), across * (inside - 1.0), t / self._spread(length)))
         return found
 
     def _smooth_curvature(self, r: Array) -> Curvature:
