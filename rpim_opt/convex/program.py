@@ -299,8 +299,9 @@ class Program(Objective):
 
     def _one(self, weight: float, rough: bool) -> Estimate:
         """Return one of many solutions."""
-        estimate = self._by_rows(weight, None, rough) if rough else None
-        return estimate or self.solve(weight)
+        if not rough:
+            return self.solve(weight)
+        return self._by_rows(weight, None, rough) or self._by_interior_point(weight, None)
 
     def _by_rows(self, weight: float, damping: Damping | None, rough: bool = False) -> Estimate | None:
         """Return the minimum of a loss that is a sum or the largest over rows, from the last one."""
