@@ -117,7 +117,7 @@ class Program(Objective):
 
     def on(self, model: LinearModel) -> Program:
         """Return the program for another model of the same shape, without asking the functions anew."""
-        return replace(self, model=model)
+        return Program(self.formulation, model, self._posed, self._met)
 
     def without(self, out: np.ndarray) -> Program:
         """Return the program without some equations, ``out`` (m,), which become rows of zeros.
@@ -202,6 +202,11 @@ class Program(Objective):
         else:
             estimate = self._by_rows(weight, damping) or self._by_interior_point(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
+
+    def beginning(self, z: Array) -> Program:
+        """Return the same program, whose next minimum in a box is looked for from z (n,) on."""
+        self._met.in_box = z
+        return self
 
     def proven(self, weight: float) -> Estimate:
         """Return the solution at a weight, on evidence that is independent of how it was found.
