@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ VANISHED = 1e-15
 """Fall that a Newton step promises, relative to the objective, from which the minimum of a face is reached."""
 CERTAIN = 1e-9
 """Gap, relative to the objective, up to which a minimum is taken to be one."""
+EXACT = 1e-13
+"""Gap, relative to the objective, up to which the end of one step needs no other."""
 GOOD = 1e-6
 """The same for a minimum that no other solver finds more exactly."""
 NOTHING = 1e-12
@@ -322,32 +325,47 @@ class Faces:
         ridge = RIDGE
         value = self.value(y, weight)
         step = np.zeros(len(y))
-        for _ in range(50 + len(y)):
+        arrived = False
+        for _ in range(50 + 2 * len(y)):
             slope = self.slope(y, weight)
             if len(self.groups):
                 slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
-            step, fall = self._newton(y, slope, C, weight, ridge)
-            if fall > VANISHED * abs(value):
-                ahead, there = self._ahead(y, step, fall, value, C, weight)
-                if there < value or (there == value and self.free(ahead).sum() < self.free(y).sum()):
-                    y, value = ahead, there
-                    ridge = RIDGE
-                    continue
-                if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
-                    ridge = STIFFER * ridge
-                    continue
+            if not arrived:
+                step, fall = self._newton(y, slope, C, weight, ridge)
+                if fall > VANISHED * abs(value):
+                    ahead, there = self._ahead(y, step, fall, value, C, weight)
+                    if there < value or (there == value and self.free(ahead).sum() < self.free(y).sum()):
+                        # squares on a face are a quadratic, whose minimum is one step away
+                        arrived = not len(self.groups) and np.array_equal(ahead, y + step)
+                        y, value = ahead, there
+                        ridge = RIDGE
+                        continue
+                    if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
+                        ridge = STIFFER * ridge
+                        continue
             ridge = RIDGE
-            wrong = self._wrong(y, slope, weight)
-            if not wrong.any():
+            ahead, there = self._freed(y, value, slope, C, weight)
+            if there < value:
+                y, value = ahead, there
+                arrived = False
+                continue
+            if not arrived:
                 break
-            moved = self._moved(y, slope, wrong, C, weight)
-            there = self.value(moved, weight)
-            if not there < value:
-                break
-            y, value = moved, there
+            gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
+            if gap <= EXACT * value:
+                return Face(y, self.free(y), gap, value)
+            arrived = False
         slope = self.slope(y, weight)
         return Face(y, self.free(y), self.gap(y, slope, weight, step), value)
+
+    def _freed(self, y: Array, value: float, slope: Array, C: Array, weight: float) -> tuple[Array, float]:
+        """Return the point after what is held in vain was moved to where it is best, and its value."""
+        wrong = self._wrong(y, slope, weight)
+        if not wrong.any():
+            return y, value
+        moved = self._moved(y, slope, wrong, C, weight)
+        return moved, self.value(moved, weight)
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
@@ -426,7 +444,7 @@ class Faces:
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
         step = np.zeros(len(y))
-        F = np.flatnonzero(self.free(y))
+        F = self.free(y).nonzero()[0]
         if not len(F):
             return step, 0.0
         K = C.take(F, 0).take(F, 1)
@@ -469,7 +487,8 @@ class Faces:
 
     def _stopped(self, y: Array, ahead: Array) -> Array:
         """Return a point with components that passed a kink or a bound put on it."""
-        ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
+        if self.bounded:
+            ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
         ahead[(ahead * y < 0) & self.kinked] = 0.0
         return ahead
 
@@ -542,10 +561,13 @@ class Faces:
         """Return the point after each component or group that is held in vain was moved to where it is best."""
         y = y.copy()
         slope = slope.copy()
-        for j in np.flatnonzero(wrong & ~self.grouped):
-            moved = self._best_component(int(j), float(y[j]), float(slope[j]), float(C[j, j]), weight)
+        alone = wrong & ~self.grouped
+        for j in alone.nonzero()[0].tolist():
+            moved = self._best_component(j, float(y[j]), float(slope[j]), float(C[j, j]), weight)
             slope += C[:, j] * (moved - y[j])
             y[j] = moved
+        if not len(self.groups):
+            return y
         for k in np.unique(self.member[wrong & self.grouped]):
             inside = self.members[k]
             block = C[inside[:, None], inside]
@@ -571,12 +593,10 @@ class Faces:
 
 def _towards(at: float, force: float, curvature: float, end: float) -> float:
     """Return at + force / curvature, or the end where that lies beyond."""
-    if curvature <= 0 and not np.isfinite(end):
-        return at
-    ahead = end
-    if curvature > 0:
-        ahead = at + force / curvature
-    if (ahead - end) * np.sign(force) > 0:
+    if curvature <= 0:
+        return end if isfinite(end) else at
+    ahead = at + force / curvature
+    if (ahead - end) * force > 0:
         return end
     return ahead
 
