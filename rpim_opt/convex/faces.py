@@ -129,6 +129,15 @@ class Faces:
         return 2 * self.M.T @ self.M
 
     @cached_property
+    def _twice(self) -> Array:
+        return 2 * self.M
+
+    @cached_property
+    def _lined(self) -> bool:
+        """Whether the penalty has a line."""
+        return bool(self.g.any())
+
+    @cached_property
     def size(self) -> Array:
         """Norms of the columns of M (n,)."""
         return np.sqrt(np.einsum("ij,ij->j", self.M, self.M))
@@ -184,7 +193,9 @@ class Faces:
 
     def penalty(self, y: Array) -> float:
         """Return what the weight multiplies."""
-        value = float(self.g @ y + self.price @ np.abs(y))
+        value = float(self.price @ np.abs(y))
+        if self._lined:
+            value += float(self.g @ y)
         if len(self.groups):
             value += float(self.groups @ self.lengths(y))
         if self.H is not None:
@@ -198,7 +209,9 @@ class Faces:
 
     def slope(self, y: Array, weight: float) -> Array:
         """Return the gradient (n,) of the smooth part."""
-        slope = 2 * (self.M.T @ (self.M @ y - self.d)) + weight * self.g
+        slope = (self.M @ y - self.d) @ self._twice
+        if self._lined:
+            slope += weight * self.g
         if self.H is not None:
             slope += weight * (self.H @ y)
         return slope
@@ -447,14 +460,30 @@ class Faces:
         F = self.free(y).nonzero()[0]
         if not len(F):
             return step, 0.0
-        K = C.take(F, 0).take(F, 1)
-        g = slope[F]
-        if len(self.groups):
-            kink, bend = self.bent(y, weight)
-            K += bend.take(F, 0).take(F, 1)
-            g += kink[F]
+        if not len(self.groups):
+            g = (slope + (weight * self.price) * np.sign(y))[F]
+            if C is self.gram and ridge == RIDGE:
+                _, found, info = _posv(self._raised.take(F, 0).take(F, 1), -g, lower=1, overwrite_a=1)
+                if info == 0:
+                    step[F] = found
+                    return step, float(-g @ found)
+            K = C.take(F, 0).take(F, 1)
         else:
-            g += weight * self.price[F] * np.sign(y[F])
+            kink, bend = self.bent(y, weight)
+            g = (slope + kink)[F]
+            K = (C + bend).take(F, 0).take(F, 1)
+        return self._solved(K, g, F, step, ridge)
+
+    @cached_property
+    def _raised(self) -> Array:
+        """`gram` with the least ridge."""
+        raised = self.gram.copy()
+        diagonal = raised.diagonal().copy()
+        raised.flat[:: len(raised) + 1] += RIDGE * np.maximum(diagonal, UNSEEN * diagonal.max(initial=0.0))
+        return raised
+
+    def _solved(self, K: Array, g: Array, F: np.ndarray, step: Array, ridge: float) -> tuple[Array, float]:
+        """Return the step (n,) that solves K step = -g for its components F, with a ridge, and twice the fall."""
         diagonal = K.diagonal().copy()
         own = np.maximum(diagonal, UNSEEN * diagonal.max())
         for _ in range(20):
