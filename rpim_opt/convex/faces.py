@@ -344,33 +344,38 @@ class Faces:
             if len(self.groups):
                 slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
+            fall = 0.0
             if not arrived:
                 step, fall = self._newton(y, slope, C, weight, ridge)
-                if fall > VANISHED * abs(value):
-                    ahead, there = self._ahead(y, step, fall, value, C, weight)
-                    if there < value or (there == value and self.free(ahead).sum() < self.free(y).sum()):
-                        # squares on a face are a quadratic, whose minimum is one step away
-                        arrived = not len(self.groups) and np.array_equal(ahead, y + step)
-                        y, value = ahead, there
-                        ridge = RIDGE
-                        continue
-                    if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
-                        ridge = STIFFER * ridge
-                        continue
+            if fall > VANISHED * abs(value):
+                ahead, there = self._ahead(y, step, fall, value, C, weight)
+                if self._nearer(y, value, ahead, there):
+                    # squares on a face are a quadratic, whose minimum is one step away
+                    arrived = not len(self.groups) and np.array_equal(ahead, y + step)
+                    y, value = ahead, there
+                    ridge = RIDGE
+                    continue
+                if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
+                    ridge = STIFFER * ridge
+                    continue
             ridge = RIDGE
             ahead, there = self._freed(y, value, slope, C, weight)
-            if there < value:
-                y, value = ahead, there
-                arrived = False
-                continue
-            if not arrived:
+            if not (there < value or arrived):
                 break
-            gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
-            if gap <= EXACT * value:
-                return Face(y, self.free(y), gap, value)
+            if not there < value:
+                gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
+                if gap <= EXACT * value:
+                    return Face(y, self.free(y), gap, value)
             arrived = False
+            y, value = ahead, there
         slope = self.slope(y, weight)
         return Face(y, self.free(y), self.gap(y, slope, weight, step), value)
+
+    def _nearer(self, y: Array, value: float, ahead: Array, there: float) -> bool:
+        """Whether a step is one: the objective falls, or it is the same on a smaller face."""
+        if there == value:
+            return bool(self.free(ahead).sum() < self.free(y).sum())
+        return there < value
 
     def _freed(self, y: Array, value: float, slope: Array, C: Array, weight: float) -> tuple[Array, float]:
         """Return the point after what is held in vain was moved to where it is best, and its value."""

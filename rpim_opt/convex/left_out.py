@@ -47,7 +47,7 @@ def by_size(group: np.ndarray) -> list[Rows]:
 
 
 def taken(M: Array, places: np.ndarray) -> Array:
-    """Return rows (G, k, p) of a matrix (m, p) or numbers (G, k) of (m,), without a copy where they follow each other."""
+    """Return rows (G, k, p) of (m, p), or numbers (G, k) of (m,): no copy where their places follow each other."""
     first = int(places[0, 0]) if places.size else 0
     if np.array_equal(places.ravel(), np.arange(first, first + places.size)):
         return M[first : first + places.size].reshape(*places.shape, *M.shape[1:])

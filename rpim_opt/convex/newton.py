@@ -87,16 +87,20 @@ class Newton(Whitened):
         """
         if self._dear:
             return self._by_secants(self._placed(z, kinked))
-        if self._away is not None:
-            curved = kinked.curved if kinked is not None else None
-            ended = self._away._by_secants(self._away._placed(z, Kinked([], 1.0, curved)), hasty=True)
-            if ended.good or ended.close:
-                return ended
-            z = ended.z
-        if kinked is None or len(kinked.multipliers) < len(self.loss.kinks):  # a neighbour without kinks
-            kinked = None
-        if kinked is None or not self.loss.kinks:
-            return self._descent(self._placed(z, kinked), MOST)
+        if self._away is None:
+            return self._with_kinks(z, kinked)
+        begun = Kinked([], 1.0)
+        if kinked is not None:
+            begun = begun._replace(curved=kinked.curved)
+        ended = self._away._by_secants(self._away._placed(z, begun), hasty=True)
+        if ended.good or ended.close:
+            return ended
+        return self._with_kinks(ended.z, kinked)
+
+    def _with_kinks(self, z: Array, kinked: Kinked | None) -> Ended:
+        """Return the minimum of a loss whose kinks, if it has any, are smoothed about a neighbour's multipliers."""
+        if kinked is None or not kinked.multipliers:  # a neighbour that met none knows nothing of them
+            return self._descent(self._placed(z, None), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
         if ended.good or ended.close:
             return ended

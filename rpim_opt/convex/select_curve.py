@@ -60,9 +60,17 @@ def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
     sharpest one and both its neighbours have theirs: they are then as sharp as on all of the grid. Kinks at norms of
     zero leave a path smooth while no configuration is met exactly.
     """
+    found = None
     loss = program.separated
-    if loss is None or (loss.kinks and loss.away is None):
+    if loss is not None and (not loss.kinks or loss.away is not None):
+        found = _about_corners(program, weights, bool(loss.kinks))
+    if found is None:
         return weights, menger(_points(program.path(weights)))
+    return found
+
+
+def _about_corners(program: Program, weights: Array, kinks: bool) -> tuple[Array, Array] | None:
+    """Return weights about the sharpest corners and the curvatures there; None where the path meets a kink."""
     last = len(weights) - 1
     places = {*range(0, last, STRIDE), last}
     met: dict[int, Array] = {}
@@ -70,8 +78,8 @@ def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
         some = sorted(places)
         new = [k for k in some if k not in met]
         path = program.path(weights[new], rough=True)
-        if loss.kinks and any(_meets(program, estimate) for estimate in path):
-            return weights, menger(_points(program.path(weights)))
+        if kinks and any(_meets(program, estimate) for estimate in path):
+            return None
         met |= dict(zip(new, _points(path), strict=True))
         score = menger(np.array([met[k] for k in some]))
         around = {near for k in _peaks(score) for near in _between(some, k, last)}
