@@ -115,7 +115,10 @@ class Separated:
 
     def slope_of_norms(self, v: Array) -> Array:
         """Return f_i' (N,) at norms of groups, on the right where there is a kink."""
-        return self._curved.both(v)[1] - self._tilt + self.at_zero
+        slope = self._curved.both(v)[1]
+        if self.straight:
+            return slope
+        return slope - self._tilt + self.at_zero
 
     @property
     def holds(self) -> bool:
