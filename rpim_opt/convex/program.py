@@ -204,7 +204,16 @@ class Program(Objective):
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum in a box is looked for from z (n,) on."""
+        """Return the same program, whose next minimum in a box is looked for from z (n,) on.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve(1.0).z
+        >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
+        True
+        """
         self._met.in_box = z
         return self
 
