@@ -20,6 +20,8 @@ SAME = 0.01
 """Two weights are the same when their logarithms differ by no more."""
 NEUTRAL = 1.0
 """The weight that takes declared noise and scales at their word."""
+TOLD = float(np.log(SAME_WEIGHT))
+"""By how much logarithms of weights differ that searches tell apart."""
 QUICK = (reml, gcv, robust_gcv, discrepancy, quasi_optimality, ncp)
 """Rules that solve a few programs at most."""
 RUNS = 0.1
@@ -115,6 +117,8 @@ class Choosing:
         last = turns[-4:]
         if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
             return self._settled_between(last[2], last[3])
+        if self.settled and len(last) >= 3 and _same(last[-1], last[-3], TOLD):  # it would lead where it led before
+            return self._settled_between(last[-2], last[-1])
         if len(turns) >= PATIENCE:
             return self._settled_between(last[-2], last[-1])
         return self
@@ -160,7 +164,7 @@ def _told_apart(selection: Selection | None) -> float:
     if not 0 < place < len(order) - 1 or order[place] != selection.weight or order[place - 1] <= 0:
         return SAME
     between = 0.5 * float(np.log(order[place + 1] / order[place - 1]))
-    return float(np.clip(between, SAME, np.log(SAME_WEIGHT)))
+    return float(np.clip(between, SAME, TOLD))
 
 
 def _lowest(selection: Selection) -> bool:

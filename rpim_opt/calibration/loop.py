@@ -425,6 +425,8 @@ def _begun(loop: Loop, formulation: Formulation, choice: Choosing, start: Array 
     if (nearest != z).any():
         z = nearest
         program = program.on(loop.linearized(z))
+    if start is not None:
+        program.beginning(z)
     size = np.linalg.norm(program.model.A, axis=0)
     merit = _merit(program, z, choice.weight)
     slope = float(np.linalg.norm(2 * model.A.T @ model.b))

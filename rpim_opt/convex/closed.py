@@ -6,7 +6,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
-from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
@@ -94,10 +93,7 @@ def shares(objective: Objective, bounds: Bounds, z: Array, multipliers: Array) -
     lower, upper = bounds
     left = multipliers.copy()
     found: list[Array] = []
-    for constraint in objective.formulation.constraints:
-        if not isinstance(constraint, Box):
-            continue
-        low, high = constraint.bounds(objective.model.parameters)
+    for low, high in objective._posed.limits:
         stated = (z <= lower) & (low == lower) | (z >= upper) & (high == upper)
         found.append(np.where(stated, left, 0.0))
         left = np.where(stated, 0.0, left)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ VANISHED = 1e-15
 """Fall that a Newton step promises, relative to the objective, from which the minimum of a face is reached."""
 CERTAIN = 1e-9
 """Gap, relative to the objective, up to which a minimum is taken to be one."""
+EXACT = 1e-13
+"""Gap, relative to the objective, up to which the end of one step needs no other."""
 GOOD = 1e-6
 """The same for a minimum that no other solver finds more exactly."""
 NOTHING = 1e-12
@@ -126,6 +129,15 @@ class Faces:
         return 2 * self.M.T @ self.M
 
     @cached_property
+    def _twice(self) -> Array:
+        return 2 * self.M
+
+    @cached_property
+    def _lined(self) -> bool:
+        """Whether the penalty has a line."""
+        return bool(self.g.any())
+
+    @cached_property
     def size(self) -> Array:
         """Norms of the columns of M (n,)."""
         return np.sqrt(np.einsum("ij,ij->j", self.M, self.M))
@@ -181,7 +193,9 @@ class Faces:
 
     def penalty(self, y: Array) -> float:
         """Return what the weight multiplies."""
-        value = float(self.g @ y + self.price @ np.abs(y))
+        value = float(self.price @ np.abs(y))
+        if self._lined:
+            value += float(self.g @ y)
         if len(self.groups):
             value += float(self.groups @ self.lengths(y))
         if self.H is not None:
@@ -195,7 +209,9 @@ class Faces:
 
     def slope(self, y: Array, weight: float) -> Array:
         """Return the gradient (n,) of the smooth part."""
-        slope = 2 * (self.M.T @ (self.M @ y - self.d)) + weight * self.g
+        slope = (self.M @ y - self.d) @ self._twice
+        if self._lined:
+            slope += weight * self.g
         if self.H is not None:
             slope += weight * (self.H @ y)
         return slope
@@ -322,15 +338,20 @@ class Faces:
         ridge = RIDGE
         value = self.value(y, weight)
         step = np.zeros(len(y))
-        for _ in range(50 + len(y)):
+        arrived = False
+        for _ in range(50 + 2 * len(y)):
             slope = self.slope(y, weight)
             if len(self.groups):
                 slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
-            step, fall = self._newton(y, slope, C, weight, ridge)
+            fall = 0.0
+            if not arrived:
+                step, fall = self._newton(y, slope, C, weight, ridge)
             if fall > VANISHED * abs(value):
                 ahead, there = self._ahead(y, step, fall, value, C, weight)
-                if there < value or (there == value and self.free(ahead).sum() < self.free(y).sum()):
+                if self._nearer(y, value, ahead, there):
+                    # squares on a face are a quadratic, whose minimum is one step away
+                    arrived = not len(self.groups) and np.array_equal(ahead, y + step)
                     y, value = ahead, there
                     ridge = RIDGE
                     continue
@@ -338,16 +359,31 @@ class Faces:
                     ridge = STIFFER * ridge
                     continue
             ridge = RIDGE
-            wrong = self._wrong(y, slope, weight)
-            if not wrong.any():
+            ahead, there = self._freed(y, value, slope, C, weight)
+            if not (there < value or arrived):
                 break
-            moved = self._moved(y, slope, wrong, C, weight)
-            there = self.value(moved, weight)
             if not there < value:
-                break
-            y, value = moved, there
+                gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
+                if gap <= EXACT * value:
+                    return Face(y, self.free(y), gap, value)
+            arrived = False
+            y, value = ahead, there
         slope = self.slope(y, weight)
         return Face(y, self.free(y), self.gap(y, slope, weight, step), value)
+
+    def _nearer(self, y: Array, value: float, ahead: Array, there: float) -> bool:
+        """Whether a step is one: the objective falls, or it is the same on a smaller face."""
+        if there == value:
+            return bool(self.free(ahead).sum() < self.free(y).sum())
+        return there < value
+
+    def _freed(self, y: Array, value: float, slope: Array, C: Array, weight: float) -> tuple[Array, float]:
+        """Return the point after what is held in vain was moved to where it is best, and its value."""
+        wrong = self._wrong(y, slope, weight)
+        if not wrong.any():
+            return y, value
+        moved = self._moved(y, slope, wrong, C, weight)
+        return moved, self.value(moved, weight)
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
@@ -426,17 +462,33 @@ class Faces:
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
         step = np.zeros(len(y))
-        F = np.flatnonzero(self.free(y))
+        F = self.free(y).nonzero()[0]
         if not len(F):
             return step, 0.0
-        K = C.take(F, 0).take(F, 1)
-        g = slope[F]
-        if len(self.groups):
-            kink, bend = self.bent(y, weight)
-            K += bend.take(F, 0).take(F, 1)
-            g += kink[F]
+        if not len(self.groups):
+            g = (slope + (weight * self.price) * np.sign(y))[F]
+            if C is self.gram and ridge == RIDGE:
+                _, found, info = _posv(self._raised.take(F, 0).take(F, 1), -g, lower=1, overwrite_a=1)
+                if info == 0:
+                    step[F] = found
+                    return step, float(-g @ found)
+            K = C.take(F, 0).take(F, 1)
         else:
-            g += weight * self.price[F] * np.sign(y[F])
+            kink, bend = self.bent(y, weight)
+            g = (slope + kink)[F]
+            K = (C + bend).take(F, 0).take(F, 1)
+        return self._solved(K, g, F, step, ridge)
+
+    @cached_property
+    def _raised(self) -> Array:
+        """`gram` with the least ridge."""
+        raised = self.gram.copy()
+        diagonal = raised.diagonal().copy()
+        raised.flat[:: len(raised) + 1] += RIDGE * np.maximum(diagonal, UNSEEN * diagonal.max(initial=0.0))
+        return raised
+
+    def _solved(self, K: Array, g: Array, F: np.ndarray, step: Array, ridge: float) -> tuple[Array, float]:
+        """Return the step (n,) that solves K step = -g for its components F, with a ridge, and twice the fall."""
         diagonal = K.diagonal().copy()
         own = np.maximum(diagonal, UNSEEN * diagonal.max())
         for _ in range(20):
@@ -469,7 +521,8 @@ class Faces:
 
     def _stopped(self, y: Array, ahead: Array) -> Array:
         """Return a point with components that passed a kink or a bound put on it."""
-        ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
+        if self.bounded:
+            ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
         ahead[(ahead * y < 0) & self.kinked] = 0.0
         return ahead
 
@@ -542,10 +595,13 @@ class Faces:
         """Return the point after each component or group that is held in vain was moved to where it is best."""
         y = y.copy()
         slope = slope.copy()
-        for j in np.flatnonzero(wrong & ~self.grouped):
-            moved = self._best_component(int(j), float(y[j]), float(slope[j]), float(C[j, j]), weight)
+        alone = wrong & ~self.grouped
+        for j in alone.nonzero()[0].tolist():
+            moved = self._best_component(j, float(y[j]), float(slope[j]), float(C[j, j]), weight)
             slope += C[:, j] * (moved - y[j])
             y[j] = moved
+        if not len(self.groups):
+            return y
         for k in np.unique(self.member[wrong & self.grouped]):
             inside = self.members[k]
             block = C[inside[:, None], inside]
@@ -571,12 +627,10 @@ class Faces:
 
 def _towards(at: float, force: float, curvature: float, end: float) -> float:
     """Return at + force / curvature, or the end where that lies beyond."""
-    if curvature <= 0 and not np.isfinite(end):
-        return at
-    ahead = end
-    if curvature > 0:
-        ahead = at + force / curvature
-    if (ahead - end) * np.sign(force) > 0:
+    if curvature <= 0:
+        return end if isfinite(end) else at
+    ahead = at + force / curvature
+    if (ahead - end) * force > 0:
         return end
     return ahead
 

@@ -46,6 +46,14 @@ def by_size(group: np.ndarray) -> list[Rows]:
     return found
 
 
+def taken(M: Array, places: np.ndarray) -> Array:
+    """Return rows (G, k, p) of (m, p), or numbers (G, k) of (m,): no copy where their places follow each other."""
+    first = int(places[0, 0]) if places.size else 0
+    if np.array_equal(places.ravel(), np.arange(first, first + places.size)):
+        return M[first : first + places.size].reshape(*places.shape, *M.shape[1:])
+    return M[places]
+
+
 def solved(M: Array, v: Array) -> Array:
     """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...), without pivoting.
 
@@ -109,7 +117,8 @@ def of_squares(Q: Array, s2: Array, target: Array, group: np.ndarray) -> Score:
 def _products(Q: Array, places: np.ndarray) -> dict[tuple[int, int], Array]:
     """Return the products (G, p) of the rows i <= j of every configuration, whose sums are its influence."""
     k = places.shape[1]
-    return {(i, j): Q[places[:, i]] * Q[places[:, j]] for i in range(k) for j in range(i, k)}
+    rows = taken(Q, places)
+    return {(i, j): rows[:, i] * rows[:, j] for i in range(k) for j in range(i, k)}
 
 
 class Folds:

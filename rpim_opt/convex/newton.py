@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -82,12 +82,25 @@ class Newton(Whitened):
     def minimum(self, z: Array, kinked: Kinked | None = None) -> Ended:
         """Return the minimum, or the best point that was met, begun at z (n,) with the multipliers of a neighbour.
 
-        Where the neighbour was too far for kinks as sharp as there, they begin blunter.
+        Where the neighbour was too far for kinks as sharp as there, they begin blunter. Many norms are first taken as
+        they are: none of them may be zero at the minimum.
         """
         if self._dear:
             return self._by_secants(self._placed(z, kinked))
-        if kinked is None or not self.loss.kinks:
-            return self._descent(self._placed(z, kinked), MOST)
+        if self._away is None:
+            return self._with_kinks(z, kinked)
+        begun = Kinked([], 1.0)
+        if kinked is not None:
+            begun = begun._replace(curved=kinked.curved)
+        ended = self._away._by_secants(self._away._placed(z, begun), hasty=True)
+        if ended.good or ended.close:
+            return ended
+        return self._with_kinks(ended.z, kinked)
+
+    def _with_kinks(self, z: Array, kinked: Kinked | None) -> Ended:
+        """Return the minimum of a loss whose kinks, if it has any, are smoothed about a neighbour's multipliers."""
+        if kinked is None or not kinked.multipliers:  # a neighbour that met none knows nothing of them
+            return self._descent(self._placed(z, None), MOST)
         ended = self._descent(self._placed(z, kinked), SOON, hasty=True)
         if ended.good or ended.close:
             return ended
@@ -119,7 +132,15 @@ class Newton(Whitened):
         """Whether a second derivative costs far more than a slope, and there is one that lasts."""
         return self.at.rows.size >= DEAR and not self.loss.kinks
 
-    def _by_secants(self, point: Point) -> Ended:
+    @cached_property
+    def _away(self) -> Newton | None:
+        """The same program away from kinks at norms of zero, where that is dear and there are some."""
+        away = self.loss.away
+        if away is None or self.at.rows.size < DEAR:
+            return None
+        return replace(self, loss=away)
+
+    def _by_secants(self, point: Point, hasty: bool = False) -> Ended:
         """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
 
         Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
@@ -130,7 +151,7 @@ class Newton(Whitened):
         ended = self._judged(point, slope, 0)
         best = Best(ended)
         for steps in range(1, MOST):
-            if best.will_do(ENOUGH):
+            if best.will_do(ENOUGH, hasty):
                 break
             fresh = bent is None
             if bent is None:
@@ -169,7 +190,7 @@ class Newton(Whitened):
         """Return by how much the objective would fall, were it quadratic; infinite in a box."""
         if self.box is not None:
             return np.inf
-        factor, failed = _potrf(self._whole(bent))
+        factor, failed = self._factored(bent)[1:]
         if failed:
             return np.inf
         return 0.5 * float(slope @ _potrs(factor, slope)[0])
@@ -240,8 +261,7 @@ class Newton(Whitened):
 
     def _stepped(self, point: Point, slope: Array, bent: Array) -> Point:
         """Return the point after a step of Newton's, with the loss's second derivative (p, p) by the coordinates."""
-        H = self._whole(bent)
-        factor, failed = _potrf(H)
+        H, factor, failed = self._factored(bent)
         if failed:
             factor, _ = _potrf(H + np.eye(len(H)) * 1e-6 * np.max(np.diag(H)))
         if self.box is None:
@@ -253,6 +273,19 @@ class Newton(Whitened):
         z, _ = minimum_in_box(R @ self.back, target + R @ (self.back @ self.at.offset), *self.box, point.z)
         step = self.unit * (self.back @ (z - point.z))
         return self._searched(point, z, step)
+
+    def _factored(self, bent: Array) -> tuple[Array, Array, int]:
+        """Return the second derivative of the smoothed objective, its Cholesky factor, and whether there is none."""
+        known = self._last.get("bent")
+        if known is None or known[0] is not bent:  # what is promised is asked before the step
+            H = self._whole(bent)
+            self._last["bent"] = (bent, (H, *_potrf(H)))
+        return self._last["bent"][1]
+
+    @cached_property
+    def _last(self) -> dict[str, Any]:
+        """The last second derivative that was factored."""
+        return {}
 
     def _whole(self, bent: Array) -> Array:
         """Return the second derivative (p, p) of the smoothed objective by the coordinates in their units."""
@@ -269,7 +302,9 @@ class Newton(Whitened):
     def _hessian(self, point: Point) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
         curvatures = self.loss.curvature(point.r, *point.kinked[:2])
-        across = sum(c.across for c in curvatures[1:]) + curvatures[0].across
+        across = curvatures[0].across
+        for more in curvatures[1:]:
+            across = across + more.across
         H = self._across(across)
         for curvature in curvatures:
             if len(curvature.along):
@@ -279,21 +314,19 @@ class Newton(Whitened):
     def _across(self, across: Array) -> Array:
         """Return what curvatures of the equations add."""
         rows = self.at.rows
-        usual = 0.0
-        other = np.arange(len(rows))
         if rows.size >= DEAR:  # most of them may have the same
             usual = float(np.partition(across, len(across) // 2)[len(across) // 2])
             other = np.flatnonzero(across != usual)
-        if 2 * len(other) > len(rows):
-            X = np.sqrt(across)[:, None] * rows
-            return X.T @ X
-        X = rows[other]
-        return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+            if 2 * len(other) <= len(rows):
+                X = rows[other]
+                return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
+        X = np.sqrt(across)[:, None] * rows
+        return X.T @ X
 
     def _along(self, curvature: Curvature) -> Array:
         """Return what the curvatures along the groups' directions add."""
         _, along, u = curvature
-        bent = np.flatnonzero(along)
+        bent = along.nonzero()[0]
         X = self.loss.projected(self.at.rows, u, bent)
         return X.T @ (along[bent][:, None] * X)
 

@@ -235,13 +235,18 @@ class Posed:
         return quadratic(term.expression, term.variable)
 
     @cached_property
+    def limits(self) -> list[tuple[Array, Array]]:
+        """Lower and upper bounds (n,) of every `Box`, in the order in which they are stated."""
+        boxes = [constraint for constraint in self.formulation.constraints if isinstance(constraint, Box)]
+        return [box.bounds(self.parameters) for box in boxes]
+
+    @cached_property
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none."""
         lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
-        for constraint in self.formulation.constraints:
-            if not isinstance(constraint, Box):
-                return None
-            low, high = constraint.bounds(self.parameters)
+        if any(not isinstance(constraint, Box) for constraint in self.formulation.constraints):
+            return None
+        for low, high in self.limits:
             lower, upper = np.maximum(lower, low), np.minimum(upper, high)
         if self.limited or (lower > upper).any():
             return None

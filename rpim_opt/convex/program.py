@@ -117,7 +117,7 @@ class Program(Objective):
 
     def on(self, model: LinearModel) -> Program:
         """Return the program for another model of the same shape, without asking the functions anew."""
-        return replace(self, model=model)
+        return Program(self.formulation, model, self._posed, self._met)
 
     def without(self, out: np.ndarray) -> Program:
         """Return the program without some equations, ``out`` (m,), which become rows of zeros.
@@ -202,6 +202,20 @@ class Program(Objective):
         else:
             estimate = self._by_rows(weight, damping) or self._by_interior_point(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
+
+    def beginning(self, z: Array) -> Program:
+        """Return the same program, whose next minimum in a box is looked for from z (n,) on.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve(1.0).z
+        >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
+        True
+        """
+        self._met.in_box = z
+        return self
 
     def proven(self, weight: float) -> Estimate:
         """Return the solution at a weight, on evidence that is independent of how it was found.
@@ -299,8 +313,9 @@ class Program(Objective):
 
     def _one(self, weight: float, rough: bool) -> Estimate:
         """Return one of many solutions."""
-        estimate = self._by_rows(weight, None, rough) if rough else None
-        return estimate or self.solve(weight)
+        if not rough:
+            return self.solve(weight)
+        return self._by_rows(weight, None, rough) or self._by_interior_point(weight, None)
 
     def _by_rows(self, weight: float, damping: Damping | None, rough: bool = False) -> Estimate | None:
         """Return the minimum of a loss that is a sum or the largest over rows, from the last one."""

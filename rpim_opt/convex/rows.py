@@ -79,7 +79,7 @@ class Rows:
     def both(self, v: Array) -> tuple[float, Array]:
         """Return the sum of the smooth pieces at v (m,), with the constant, and their slopes (m,)."""
         total = self.constant
-        slope = np.zeros_like(v)
+        slope = np.zeros(v.shape)
         for curve, factor, (a, c) in self.pieces:
             value, rise = curve.both(a * v + c)
             total += float((factor * value).sum())
@@ -88,7 +88,7 @@ class Rows:
 
     def bend(self, v: Array) -> Array:
         """Return the curvatures (m,) of the smooth pieces."""
-        bend = np.zeros_like(v)
+        bend = np.zeros(v.shape)
         for curve, factor, (a, c) in self.pieces:
             bend += factor * a**2 * curve.bend(a * v + c)
         return bend
@@ -104,7 +104,7 @@ def huber(bound: float) -> Curve:
     """Return x^2 up to a bound, and 2 bound |x| - bound^2 beyond."""
 
     def both(x: Array) -> Both:
-        slope = 2 * np.clip(x, -bound, bound)
+        slope = 2 * np.minimum(np.maximum(x, -bound), bound)
         return slope * (x - slope / 4), slope
 
     return Curve(both, lambda x: np.where(np.abs(x) <= bound, 2.0, 0.0))

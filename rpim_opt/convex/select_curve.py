@@ -16,6 +16,8 @@ SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
 GRID, STRIDE = 60, 4
 """Weights among which a corner is sought where each takes solving, and every which of them where the path is smooth."""
+MET = 1e-3
+"""Part of the median residual below which one counts as zero."""
 GOLDEN = (1 + 5**0.5) / 2
 
 
@@ -55,22 +57,41 @@ def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
     """Return weights and the curvatures there: all of a grid, or of a smooth loss those about the sharpest corners.
 
     A smooth path is looked at in large steps first, and then at every weight of the grid about its corners, until the
-    sharpest one and both its neighbours have theirs: they are then as sharp as on all of the grid.
+    sharpest one and both its neighbours have theirs: they are then as sharp as on all of the grid. Kinks at norms of
+    zero leave a path smooth while no configuration is met exactly.
     """
-    if program.separated is None or program.separated.kinks:
+    found = None
+    loss = program.separated
+    if loss is not None and (not loss.kinks or loss.away is not None):
+        found = _about_corners(program, weights, bool(loss.kinks))
+    if found is None:
         return weights, menger(_points(program.path(weights)))
+    return found
+
+
+def _about_corners(program: Program, weights: Array, kinks: bool) -> tuple[Array, Array] | None:
+    """Return weights about the sharpest corners and the curvatures there; None where the path meets a kink."""
     last = len(weights) - 1
     places = {*range(0, last, STRIDE), last}
     met: dict[int, Array] = {}
     while True:
         some = sorted(places)
         new = [k for k in some if k not in met]
-        met |= dict(zip(new, _points(program.path(weights[new], rough=True)), strict=True))
+        path = program.path(weights[new], rough=True)
+        if kinks and any(_meets(program, estimate) for estimate in path):
+            return None
+        met |= dict(zip(new, _points(path), strict=True))
         score = menger(np.array([met[k] for k in some]))
         around = {near for k in _peaks(score) for near in _between(some, k, last)}
         if around <= places:
             return weights[some], score
         places |= around
+
+
+def _meets(program: Program, estimate: Estimate) -> bool:
+    """Whether an estimate meets a configuration exactly."""
+    norms = program.norms(estimate.z)
+    return bool(np.min(norms) <= MET * np.median(norms))
 
 
 def _peaks(score: Array) -> np.ndarray:

@@ -139,6 +139,8 @@ def _division(groups: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarra
     return kept
 
 
+AHEAD = 5
+"""Weights at which the residual is asked for at once, where each takes solving."""
 COARSE = 12
 """Weights with which a search for the least error begins, where each takes solving."""
 
@@ -181,8 +183,7 @@ def two_step(program: Program) -> Selection:
     if program.faces is not None:
         last = max(last, min(start, weight_grid(program, 2)[0]))
     coarse = np.geomspace(start, last, 30)
-    residual = np.sqrt([e.loss for e in program.path(coarse)])
-    level = coarse[np.argmax(residual[1:] >= 0.99 * residual[:-1])]
+    level = _end_of_fall(program, coarse)
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
     score = _left_out_error(program, fine)
     best = int(np.argmin(score))
@@ -191,6 +192,26 @@ def two_step(program: Program) -> Selection:
     if not interior:
         note += "; the held-out error is smallest at an edge of the ten weights, so a wider search would go on"
     return Selection(float(fine[best]), "two_step", fine, score, interior, note)
+
+
+def _end_of_fall(program: Program, weights: Array) -> float:
+    """Return the first weight (K,), falling, from which the residual norm falls no more; the first if it always does.
+
+    What has no formula is solved no farther than that.
+    """
+    some = len(weights)
+    if not program.closed_form:
+        some = AHEAD
+    residual = np.empty(0)
+    near = None
+    while len(residual) < len(weights):
+        more = program.path(weights[len(residual) : len(residual) + some], near, rough=True)
+        near = more[-1].z
+        residual = np.append(residual, np.sqrt([estimate.loss for estimate in more]))
+        flat = residual[1:] >= 0.99 * residual[:-1]
+        if flat.any():
+            return float(weights[np.argmax(flat)])
+    return float(weights[0])
 
 
 def _left_out_error(program: Program, weights: Array) -> Array:

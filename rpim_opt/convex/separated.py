@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.rows import LINE, Affine, Kink, Rows
+from rpim_opt.convex.rows import LINE, Affine, Kink, Piece, Rows
 
 NEAR_ZERO = 1e-150
 """Norms below have no direction."""
@@ -57,11 +57,22 @@ class Separated:
         (N,) the first equation of every group; None where the loss gets equations.
     count
         Equations m.
+    straight
+        Whether norms are taken as they are, without kinks: where they are zero, their slope is zero, too.
     """
 
     rows: Rows
     starts: np.ndarray | None
     count: int
+    straight: bool = False
+
+    @cached_property
+    def away(self) -> Separated | None:
+        """The same sum as it is away from kinks at norms of zero; None where it has none, or of equations."""
+        if self.starts is None or not self.kinks:
+            return None
+        line = Piece(LINE, self.at_zero - self._tilt, PLAIN)
+        return replace(self, rows=replace(self._curved, pieces=(*self._curved.pieces, line)), straight=True)
 
     @cached_property
     def _sizes(self) -> np.ndarray:
@@ -98,9 +109,16 @@ class Separated:
         """The kinks, as norms of groups or as absolute values of equations."""
         if self.starts is None:
             return list(self.rows.kinks)
-        if np.all(self.at_zero == 0):
+        if self.straight or np.all(self.at_zero == 0):
             return []
         return [Kink(self.at_zero, PLAIN)]
+
+    def slope_of_norms(self, v: Array) -> Array:
+        """Return f_i' (N,) at norms of groups, on the right where there is a kink."""
+        slope = self._curved.both(v)[1]
+        if self.straight:
+            return slope
+        return slope - self._tilt + self.at_zero
 
     @property
     def holds(self) -> bool:
@@ -112,21 +130,30 @@ class Separated:
 
     def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
         """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
-        sizes = self._sizes
-        if np.ptp(sizes) == 0:
-            by_group = u.reshape(len(sizes), -1), rows.reshape(len(sizes), sizes[0], -1)
-            if 2 * len(groups) > len(sizes):  # most of them: picked out afterwards
+        count, each = len(self._sizes), self._alike
+        if each:
+            by_group = u.reshape(count, each), rows.reshape(count, each, -1)
+            if len(groups) == count:
+                return np.einsum("nk,nkp->np", *by_group)
+            if 2 * len(groups) > count:  # most of them: picked out afterwards
                 return np.einsum("nk,nkp->np", *by_group)[groups]
-            return np.einsum("nk,nkp->np", *(each[groups] for each in by_group))
+            return np.einsum("nk,nkp->np", *(some[groups] for some in by_group))
         return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
+
+    @cached_property
+    def _alike(self) -> int:
+        """Equations of every group that all have the same number; else 0."""
+        sizes = self._sizes
+        if np.ptp(sizes) > 0:
+            return 0
+        return int(sizes[0])
 
     @cached_property
     def _columns(self) -> int:
         """Equations of every group, of many that have the same number; else 0."""
-        sizes = self._sizes
-        if len(sizes) < MANY or np.ptp(sizes) > 0:
+        if len(self._sizes) < MANY:
             return 0
-        return int(sizes[0])
+        return self._alike
 
     def _norms(self, s: Array) -> Array:
         if self.starts is None:
@@ -140,14 +167,14 @@ class Separated:
 
     def _spread(self, v: Any) -> Any:
         """Return numbers of groups (N,) by equation (m,)."""
-        if self.starts is None or np.ndim(v) == 0:
+        if self.starts is None or not isinstance(v, np.ndarray):
             return v
         return v[self.which]
 
     @cached_property
     def _curved(self) -> Rows:
         """What is no kink and, of norms, no line: a line in a norm is a kink at zero."""
-        if self.starts is None:
+        if self.starts is None or self.straight:
             return self.rows
         bent = tuple(piece for piece in self.rows.pieces if piece.curve is not LINE)
         nothing = np.zeros(len(self.starts))
@@ -157,7 +184,7 @@ class Separated:
     @cached_property
     def _tilt(self) -> Any:
         """Slopes (N,) that curved pieces have at norms of zero, which belong to the kink there; or one number."""
-        if self.starts is None:
+        if self.starts is None or self.straight:
             return 0.0
         slope = self._curved.both(np.zeros(len(self.starts)))[1]
         if np.any(slope):
@@ -166,13 +193,14 @@ class Separated:
 
     def _smooth(self, r: Array) -> tuple[float, Array]:
         """Return value and slope (m,) of what is no kink."""
-        if not self._curved.pieces:
-            return self._curved.constant, np.zeros_like(r)
+        curved = self._curved
+        if not curved.pieces:
+            return curved.constant, np.zeros(r.shape)
         if self.starts is None:
-            return self._curved.both(r)
+            return curved.both(r)
         v = self._norms(r)
-        value, slope = self._curved.both(v)
-        if np.ndim(self._tilt):
+        value, slope = curved.both(v)
+        if isinstance(self._tilt, np.ndarray):
             slope = slope - self._tilt
             value -= float(self._tilt @ v)
         return value, self._spread(slope / np.maximum(v, NEAR_ZERO)) * r
@@ -204,7 +232,9 @@ class Separated:
 
     def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
         """Return the second derivative of the smoothed loss, as a sum."""
-        found = [self._smooth_curvature(r)]
+        found = []
+        if self._curved.pieces or not y:
+            found.append(self._smooth_curvature(r))
         for (factor, of), old in zip(self.kinks, y, strict=True):
             t = sharpness * _along(of, r) + old
             length = np.maximum(self._norms(t), NEAR_ZERO)
@@ -213,7 +243,7 @@ class Separated:
                 found.append(Curvature(of.a**2 * sharpness * inside))
                 continue
             across = sharpness * np.minimum(1.0, factor / length)
-            found.append(Curvature(self._spread(across), np.where(inside, 0.0, -across), t / self._spread(length)))
+            found.append(Curvature(self._spread(across), across * (inside - 1.0), t / self._spread(length)))
         return found
 
     def _smooth_curvature(self, r: Array) -> Curvature:

@@ -121,8 +121,8 @@ class Whitened:
     def unit(self) -> Array:
         """(p,) size of a coordinate of which data and penalty together make one; zero where they do not see it."""
         size = self.at.lengths + self.pull
-        seen = size > UNSEEN * np.max(self.at.lengths, initial=0.0)
-        return np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=seen)
+        seen = size > UNSEEN * self.at.lengths.max(initial=0.0)
+        return np.divide(1.0, np.sqrt(size), out=np.zeros(size.shape), where=seen)
 
     @property
     def whole(self) -> bool:

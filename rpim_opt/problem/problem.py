@@ -830,17 +830,26 @@ class CalibrationProblem(Tabled):
             return call_rows(function, [x, self.parameters.nominal], rows)
 
     def _functions(self, block: Block) -> Functions:
+        if id(block) not in self._structures:
+            self._structures[id(block)] = self._structure(block)
+        return (self.asked or asked)(self._structures[id(block)], block.measurement)
+
+    @cached_property
+    def _structures(self) -> dict[int, Structure]:
+        return {}
+
+    def _structure(self, block: Block) -> Structure:
+        """Return what the functions of a block's rows depend on, besides its measurement."""
         p = self.parameters
         absent = (p.nominal == 0) & ~p.identified
         robot = self.arms[block.robot]
         names = p.names
         if block.robot:  # those of other robots keep their long names, which nobody asks for
             names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-        structure = Structure(
+        return Structure(
             robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
             self._loads(block), tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
         )  # fmt: skip
-        return (self.asked or asked)(structure, block.measurement)
 
     @cached_property
     def _needs(self) -> dict[str, Needs]:

@@ -205,7 +205,7 @@ class Parameters(Tabled):
             for name, dimension in zip(self.names, self.dimensions, strict=True)
         )
 
-    @property
+    @cached_property
     def periodic(self) -> np.ndarray:
         """(P,) which parameters are rotations: after a full turn they describe the same robot at the same place.
 

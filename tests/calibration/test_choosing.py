@@ -155,6 +155,13 @@ def test_an_answer_that_comes_back_from_the_lower_end_is_an_alternation() -> Non
     assert not followed(-1e-3, 30.0, -1e-9, 40.0).final
 
 
+def test_an_answer_that_comes_back_has_led_to_the_other_before() -> None:
+    end = followed(-1e-9, 30.0, -0.95e-9)
+    assert (end.weight, end.settled, end.final) == (30.0, True, True)
+    assert "alternates between 30 and 9.5e-10" in end.note
+    assert not followed(-1e-9, 30.0, -0.9e-9).final
+
+
 @pytest.mark.parametrize(("answer", "same"), [(2.0, True), (2.0 * np.exp(0.0099), True), (2.0 * np.exp(0.0101), False)])
 def test_an_answer_is_confirmed_when_it_is_the_same_again(answer: float, same: bool) -> None:
     for again in (answer, 4.0 / answer):  # to either side

@@ -375,3 +375,21 @@ def test_some_of_the_data_begin_where_they_were() -> None:
     other.solve(1.0)
     assert any(np.array_equal(near.z, z) for near in one._met.near(1.1))
     assert not any(np.array_equal(near.z, z) for near in other._met.near(1.1))
+
+
+def test_norms_are_taken_without_kinks_where_none_is_zero_and_else_with_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of many equations: the same minima, of noise and of data of which some are met exactly."""
+    z = np.random.default_rng(8).normal(size=MODEL.A.shape[1])
+    met = replace(MODEL, b=np.where(MODEL.group % 4 > 0, MODEL.A @ z, MODEL.b))
+    weights = np.geomspace(1e3, 1e-3, 6)
+    for model, least, most in ((MODEL, 0, 5), (met, 1, 12)):
+        expected = ro.convex.pose(ro.sum_of_norms, model).path(weights)
+        with monkeypatch.context() as patched:
+            patched.setattr(newton, "DEAR", 0)
+            patched.setattr(by_rows, "DEAR", 0)
+            counted = Counted(newton.Newton._with_kinks)
+            patched.setattr(newton.Newton, "_with_kinks", counted.method())
+            found = ro.convex.pose(ro.sum_of_norms, model).path(weights)
+        assert least <= counted.count <= most
+        for one, other in zip(found, expected, strict=True):
+            assert one.objective == pytest.approx(other.objective, rel=1e-8)

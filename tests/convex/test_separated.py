@@ -142,3 +142,41 @@ def test_a_loss_that_falls_or_has_kinks_elsewhere_is_not_separated() -> None:
         assert rows is not None
         assert not Separated(rows, starts, 2 * COUNT).holds
         assert Separated(rows, None, COUNT).holds
+
+
+@pytest.mark.parametrize("name", OVER)
+def test_away_from_zero_norms_have_no_kinks(name: str) -> None:
+    """Value, slope and curvature of the same sum; of equations, and of what has no kinks, there is no other one."""
+    loss, _, _ = made(name)
+    if loss.starts is None or not loss.kinks:
+        assert loss.away is None
+        return
+    away = loss.away
+    assert away is not None
+    r = 1 + np.random.default_rng(4).random(loss.count)
+    assert (away.kinks, away.at(r)) == ([], pytest.approx(loss.at(r), rel=1e-12))
+    nothing = [0 * r for _ in loss.kinks]
+    sharp = loss.smoothed(r, nothing, 1e9)
+    assert away.smoothed(r, [], 1.0).slope == pytest.approx(sharp.slope, rel=1e-12)
+    v = norms(loss, r)
+    h = 1e-6
+    slopes = (values_of(away, v + h) - values_of(away, v - h)) / (2 * h)
+    assert loss.slope_of_norms(v) == pytest.approx(slopes, rel=1e-7)
+    assert away.slope_of_norms(v) == pytest.approx(slopes, rel=1e-7)
+    bend = np.array([(away.smoothed(r + d, [], 1.0).slope - away.smoothed(r - d, [], 1.0).slope) / (2 * h)
+                     for d in h * np.eye(loss.count)])  # fmt: skip
+    (curvature,) = away.curvature(r, [], 1.0)
+    same = np.equal.outer(loss.which, loss.which)
+    whole = np.diag(curvature.across) + same * np.outer(curvature.u, curvature.u) * curvature.along[loss.which]
+    assert whole == pytest.approx(bend, rel=1e-5, abs=1e-6)
+
+
+def values_of(loss: Separated, v: Array) -> Array:
+    """f_i(v_i), one by one, but for a constant: what the sum is when one norm is as given and the others are 1."""
+    found = []
+    for k, each in enumerate(v):
+        alone = np.ones(len(v))
+        alone[k] = each
+        found.append(loss.rows.both(alone)[0] + sum(float(np.sum(f * np.abs(of.a * alone + of.c)))
+                                                    for f, of in loss.rows.kinks))  # fmt: skip
+    return np.array(found)
