@@ -156,6 +156,9 @@ def read_problem(
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
+    if model is not None and not isinstance(model, KinematicModel):
+        accepted = "a ro.robot.Model with terms of your own; families are chosen by calibrate(model='auto')"
+        raise InputError("model", f"{model!r}"[:80], accepted)
     if model is not None:
         arm = replace(arm, robot=replace(arm.robot, model=model))
     return Stated(

@@ -382,14 +382,14 @@ def test_norms_are_taken_without_kinks_where_none_is_zero_and_else_with_them(mon
     z = np.random.default_rng(8).normal(size=MODEL.A.shape[1])
     met = replace(MODEL, b=np.where(MODEL.group % 4 > 0, MODEL.A @ z, MODEL.b))
     weights = np.geomspace(1e3, 1e-3, 6)
-    for model, least, most in ((MODEL, 0, 5), (met, 1, 12)):
-        expected = ro.convex.pose(ro.sum_of_norms, model).path(weights)
+    for linear, least, most in ((MODEL, 0, 5), (met, 1, 12)):
+        expected = ro.convex.pose(ro.sum_of_norms, linear).path(weights)
         with monkeypatch.context() as patched:
             patched.setattr(newton, "DEAR", 0)
             patched.setattr(by_rows, "DEAR", 0)
             counted = Counted(newton.Newton._with_kinks)
             patched.setattr(newton.Newton, "_with_kinks", counted.method())
-            found = ro.convex.pose(ro.sum_of_norms, model).path(weights)
+            found = ro.convex.pose(ro.sum_of_norms, linear).path(weights)
         assert least <= counted.count <= most
         for one, other in zip(found, expected, strict=True):
             assert one.objective == pytest.approx(other.objective, rel=1e-8)

@@ -229,3 +229,8 @@ def test_scatter_is_a_word_or_a_table(tmp_path: Path) -> None:
     assert instance.noise == "declared"
     assert instance.problem.scatter is not None
     assert (instance.problem.scatter.position, instance.problem.scatter.joint) == (4e-5, 2e-5)
+
+
+def test_the_word_auto_is_for_calibrate() -> None:
+    with pytest.raises(ro.InputError, match=r"model: found 'auto', accepted: a ro.robot.Model"):
+        ro.load("position", model="auto")
