@@ -20,6 +20,8 @@ from rpim_opt.basics.writing import write_text
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
 Mass = Annotated[float, "mass"]
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
+"""Escapes that JSON reads one by one, whether or not two of them make a character."""
 Name = Annotated[str, Field(max_length=200)]
 """A name or a pattern of names: long ones would take for ever to be matched."""
 
@@ -161,9 +163,26 @@ def read_json(path: Path) -> Any:
     """
     text = read_text(path, LARGEST_DATA, [".json"])
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:  # integers of thousands of digits; lists that deep
+        return parse_json(text)
+    except ValueError as error:
         raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
+
+
+def parse_json(text: str) -> Any:
+    """Return what JSON says, texts that can be written again.
+
+    Raises
+    ------
+    ValueError
+        For what is no JSON, is nested too deeply, or has half a surrogate pair, which no file of UTF-8 can hold.
+    """
+    try:
+        content = json.loads(text)
+        if _HALF_PAIR.search(text):
+            json.dumps(content, ensure_ascii=False).encode()
+    except RecursionError as error:
+        raise ValueError(str(error)) from None
+    return content
 
 
 def sha256_of(path: Path) -> str:

@@ -118,7 +118,8 @@ def _movement(text: str, limit: str, where: str | None) -> Sentence:
         raise reader.wrong(f"a movement in {reader.unit}", "a length: 'move at most 5 mm'")
     if not most > 0:
         raise reader.wrong(f"a movement of {most:g}", "one above zero; at_nominal keeps parameters")
-    places = tuple(place.strip() for place in (where or "workspace").split(","))
+    said = (where or "").strip() or "workspace"
+    places = tuple(place.strip() for place in said.split(","))
     return Sentence("move", limit=most, unit=reader.unit, places=places)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -74,7 +75,7 @@ def _split(stated: Any) -> Split:
         return Split(FOLDER)
     if number and 0 < stated < 1:
         return Split(f"{stated:g} held out", part=float(stated))
-    if number and stated >= 2 and stated == int(stated):
+    if number and 2 <= stated < math.inf and stated == int(stated):
         return Split(f"{int(stated)} folds", folds=int(stated))
     accepted = "'folder', a part of the configurations between 0 and 1, or a number of folds, 2 or more"
     raise InputError("splits", f"{stated!r}", accepted)

@@ -143,7 +143,7 @@ def make_desk(folder: Path) -> None:
 @cache
 def parameters() -> dict[str, list[Any]]:
     """Return the parameters of every command, as the command line knows them."""
-    group: Any = typer.main.get_command(cli.app)
+    group: Any = cli._command()
     return {name: list(command.params) for name, command in group.commands.items()}
 
 
