@@ -43,9 +43,10 @@ FILES = [
     "kinematics.yaml", "calibration.conf", "targets.csv", "poses.csv", "rows.csv", "table.csv", "mine.py",
     "nothing.csv",
     "empty.csv", "binary.xlsx", "binary.parquet", ".", "..", "", "\x00", "a" * 300, "/dev/null", "out", "/", "ur5e",
+    "\udcff",
 ]  # fmt: skip
 TARGETS = ["out/a.csv", "out/deep/b.html", "out", "\x00", "a" * 300 + "/x", "/dev/full", "/proc/x/y", "out/r.toml",
-           "out/r.json", "mine.py/x"]  # fmt: skip
+           "out/r.json", "mine.py/x", "out/\udcff"]  # fmt: skip
 TEXTS = [
     "", " ", "x", "1", "0", "-1", "nan", "inf", "1e400", "1e308", "deg,mm", "rad,m", "mm", "deg", "label", "row",
     "wxyz",
