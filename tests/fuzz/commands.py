@@ -16,7 +16,6 @@ from random import Random
 from typing import Any
 
 import numpy as np
-import typer
 
 import rpim_opt as ro
 from rpim_opt import cli
