@@ -78,6 +78,9 @@ DISPLAY = {
 """The unit in which a dimension is shown and written."""
 
 
+_LONGEST = max(map(len, UNITS))
+
+
 def accepted_units(dimension: str) -> list[str]:
     """Return the suffixes that a quantity of this dimension may carry."""
     return [name for name, unit in UNITS.items() if unit.dimension == dimension]
@@ -115,9 +118,12 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     """
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
-    for suffix in sorted(UNITS, key=len, reverse=True):
-        if name.endswith("_" + suffix):
-            return name.removesuffix("_" + suffix), UNITS[suffix]
+    place = name.find("_", max(len(name) - _LONGEST - 1, 0))
+    while place >= 0:  # the first that fits is the longest
+        unit = UNITS.get(name[place + 1 :])
+        if unit is not None:
+            return name[:place], unit
+        place = name.find("_", place + 1)
     return name, None
 
 
