@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
@@ -81,9 +82,10 @@ DISPLAY = {
 _LONGEST = max(map(len, UNITS))
 
 
-def accepted_units(dimension: str) -> list[str]:
+@cache
+def accepted_units(dimension: str) -> tuple[str, ...]:
     """Return the suffixes that a quantity of this dimension may carry."""
-    return [name for name, unit in UNITS.items() if unit.dimension == dimension]
+    return tuple(name for name, unit in UNITS.items() if unit.dimension == dimension)
 
 
 def display(dimension: str) -> tuple[str, float]:

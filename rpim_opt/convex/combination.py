@@ -88,8 +88,11 @@ def _terms(terms: str, text: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
         sign, factor, name = found.groups()
         if name in names:
             raise _wrong(text, f"'{name}' twice", "every parameter once")
+        number = _number(f"{sign}{factor or 1}", text)
+        if number == 0:
+            raise _wrong(text, f"'{factor} {name}'", "factors other than zero")
         names.append(name)
-        factors.append(_number(f"{sign}{factor or 1}", text))
+        factors.append(number)
         place = found.end()
     return tuple(names), tuple(factors)
 

@@ -32,23 +32,23 @@ class Hang(BaseException):
     """An input took too long."""
 
 
+def _late(number: int, frame: FrameType | None) -> None:
+    raise Hang("took too long")
+
+
 @contextmanager
 def limited(seconds: float):
     """Break off what takes longer; on systems without alarms nothing is."""
-
-    def late(number: int, frame: FrameType | None) -> None:
-        raise Hang(f"longer than {seconds:g} s")
-
     if not hasattr(signal, "setitimer"):
         yield
         return
-    before = signal.signal(signal.SIGALRM, late)
+    if signal.getsignal(signal.SIGALRM) is not _late:
+        signal.signal(signal.SIGALRM, _late)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def tried(name: str, data: bytes, folder: Path) -> Failure | bool:

@@ -75,7 +75,7 @@ def killed(study: Path, out: Path, wait: float, moments: list[float]) -> list[in
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
             lines.append(len(journal.read_bytes().splitlines()) if journal.exists() else 0)
-            print(f"killed after {seconds:.1f} s, {lines[-1]} lines in the journal", flush=True)
+            sys.stderr.write(f"killed after {seconds:.1f} s, {lines[-1]} lines in the journal\n")
     process = start(study, out, wait)
     if process.wait() != 0:
         raise RuntimeError(f"the study ended with exit code {process.returncode}")
@@ -115,7 +115,7 @@ def main(arguments: list[str]) -> int:
     replicates, wait, kills = (*arguments[1:], *("3000", "2.3", "10")[len(arguments) - 1 :])
     found = long_study(folder, int(replicates), float(wait), int(kills))
     (folder / "found.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-    print(json.dumps(found, indent=2))
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
     return int(bool(found["different"]))
 
 
