@@ -59,6 +59,7 @@ TEXTS = [
     "-", "é", "\x1b[2J", "\ud800", "9" * 400, "label,q1_deg,q2_deg,x_mm,y_mm,z_mm", "rms_mm", "max_mm,rms_mm",
     "nominal",
     "'tikhonov, reml'", "tcp://127.0.0.1:1",
+    "7x5,30mm", "99999x9,1.2.3mm",
 ]  # fmt: skip
 NUMBERS = [
     "0",

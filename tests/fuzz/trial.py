@@ -59,6 +59,7 @@ def tried(name: str, data: bytes, folder: Path) -> Failure | bool:
 def attempt(what: Callable[[], object]) -> Failure | bool:
     """Return whether something is done without an error, or refused; or how it fails."""
     began = process_time()
+    accepted = True
     try:
         with limited(PATIENCE):
             what()
@@ -66,12 +67,12 @@ def attempt(what: Callable[[], object]) -> Failure | bool:
         text = str(error)
         if "\n" in text or len(text) > LONGEST_SENTENCE:
             return Failure(f"sentence of {type(error).__name__}: {error.args}"[:200], text)
-        return False
+        accepted = False
     except (Exception, Hang) as error:
         return failure(error)
     if process_time() - began > LONGEST:
         return Failure("slow", f"{process_time() - began:.1f} s")
-    return True
+    return accepted
 
 
 def failure(error: BaseException) -> Failure:
