@@ -21,6 +21,8 @@ from rpim_opt.basics.writing import write_text
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
 Mass = Annotated[float, "mass"]
+_DEEP = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++\s*+\.\s*+){100}")
+"""Dotted keys, which are read in a time that grows with the square of their length."""
 _HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 """Escapes that JSON reads one by one, whether or not two of them make a character."""
 Name = Annotated[str, Field(max_length=200)]
@@ -103,6 +105,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         If there is no such file, or it is no TOML (with line and column).
     """
     text = read_text(path, endings=[".toml"])
+    if _DEEP.search(text):
+        raise InputError("the TOML text", "a key of more than a hundred parts", "keys that a person would write", path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep
