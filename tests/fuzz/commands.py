@@ -244,10 +244,12 @@ def desk(folder: Path) -> Iterator[None]:
 
 
 def tidy() -> None:
-    """Remove what a command may write."""
-    shutil.rmtree("out", ignore_errors=True)
-    for path in ("report.html", *Path().glob("--*")):  # the latter where an option stands for the value of another
-        Path(path).unlink(missing_ok=True)
+    """Remove what a command may write, also where an option stood for the value of another."""
+    for path in (Path("out"), Path("report.html"), *Path().glob("--*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def fuzz(rng: Random, count: int) -> Iterator[tuple[list[str], Failure | int]]:
