@@ -190,16 +190,23 @@ def understand_of(
     if measurement is not None:
         known = pick(MEASUREMENTS, measurement, "measurement")
     files = [(path, read_raw(path, asked.layout)) for path in paths]
-    known = known or _known_kind([table.columns for _, table in files])
-    kind = known or pose
-    tables = _understood(files, arm, kind, asked)
-    if known is None:
-        kind = _kind(tables, paths)
-        if kind is not pose:
-            tables = _understood(files, arm, kind, asked)
+    kind, tables = _told(files, arm, known or _known_kind([table.columns for _, table in files]), asked)
     if kind is pose and any(each.numbered for each in tables):
         return _ordered(files, arm, kind, asked)
     return _whole(paths, arm, kind, asked, tables)
+
+
+def _told(
+    files: Files, arm: Described, known: Measurement | None, asked: Asked
+) -> tuple[Measurement, tuple[Understood, ...]]:
+    """Return what was measured, by the names of columns where that is not known, and the tables understood so."""
+    tables = _understood(files, arm, known or pose, asked)
+    if known is not None:
+        return known, tables
+    kind = _kind(tables, [path for path, _ in files])
+    if kind is not pose:
+        tables = _understood(files, arm, kind, asked)
+    return kind, tables
 
 
 def _known_kind(tables: Sequence[Columns]) -> Measurement | None:

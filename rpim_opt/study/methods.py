@@ -215,13 +215,17 @@ def _selector(label: str | None, each: Any) -> tuple[str, Any]:
         return label or _rule_name(each), each
     if isinstance(each, Mapping) and label:
         return label, each
+    weight = _weight(each)
+    return label or f"{weight:g}", weight
+
+
+def _weight(each: Any) -> float:
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
         accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
         raise InputError("selectors", f"{each!r}", accepted)
-    weight = each
     if isinstance(each, int):
-        weight = number(each, "selectors")
-    return label or f"{weight:g}", require_weight(float(weight), "selectors")
+        each = number(each, "selectors")
+    return require_weight(float(each), "selectors")
 
 
 def _rule_name(rule: Callable[..., Any]) -> str:
