@@ -142,7 +142,7 @@ def _quantity(figure: str, text: str) -> tuple[float, str]:
     unit = found[2] or ""
     if unit and unit not in units():
         raise _wrong(text, f"unit '{unit}'", choices(unit, units()))
-    return _number(found[1].replace(" ", ""), text), unit
+    return _number("".join(found[1].split()), text), unit
 
 
 def _number(digits: str, text: str) -> float:
