@@ -1,11 +1,12 @@
-"""The command line ``rpim-opt``. Commands import what they need when they run."""
+"""The command line ``rpim-opt``. Commands import what they need when they run.
 
-from __future__ import annotations
+Annotations are values here: typer reads each of them twice, and as texts they would be compiled as often.
+"""
 
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -253,12 +254,12 @@ def _end_by(acceptance: dict[str, Any] | None) -> None:
 
 
 def _calibrated(
-    instance: Instance,
+    instance: "Instance",
     select: str | None,
     formulation: str | None,
     words: dict[str, str | None],
     say: Callable[[str], None],
-) -> Calibration:
+) -> "Calibration":
     """Calibrate as a problem's file says, or as the options say instead."""
     from rpim_opt.store.named import named_formulation, named_weight
 
@@ -276,7 +277,7 @@ def _calibrated(
         raise _with_causes(error, instance) from None
 
 
-def _with_causes(error: NoSolutionFound, instance: Instance) -> NoSolutionFound:
+def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFound:
     """Return the error of a program without solution; where data are likely read wrongly, it says how."""
     from rpim_opt.calibration.asking import calibrate
     from rpim_opt.calibration.causes import likely_causes, named
@@ -290,7 +291,7 @@ def _with_causes(error: NoSolutionFound, instance: Instance) -> NoSolutionFound:
     return NoSolutionFound(error.formulation, error.weight, error.status, advice=" ".join(causes).rstrip("."))
 
 
-def _saved(result: Calibration, out: Path | None) -> list[Path]:
+def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
     from rpim_opt.basics.inputs import inside
     from rpim_opt.basics.writing import refused
@@ -770,9 +771,15 @@ def main() -> None:
         _run()
 
 
+@cache
+def _command() -> Any:
+    """Return what typer makes of the commands above."""
+    return typer.main.get_command(app)
+
+
 def _run() -> None:
     try:
-        code = app(standalone_mode=False)
+        code = _command()(standalone_mode=False)
         if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
             fail("Interrupted.", INTERRUPTED)
         sys.exit(code)

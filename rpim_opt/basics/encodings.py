@@ -58,7 +58,7 @@ def decoded(data: bytes, encoding: str = "") -> Decoded:
         name, why = _recognised(data)
     try:
         text = data.decode(name)
-    except (UnicodeDecodeError, LookupError) as error:
+    except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
         raise InputError("the text", str(error), "an encoding that fits: --encoding utf-8, cp1252, utf-16") from None
     if "\x00" in text:
         raise InputError("the text", "bytes that are zero", "a text file, not a binary one")

@@ -204,9 +204,14 @@ def _by(bounds: Mapping[str, float]) -> str:
     return ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
 
 
+LONGEST_COMPARED = 200
+"""Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
+
+
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:
     """List what is known; of more than ``many`` what resembles ``found``, and how many others there are."""
     names = list(known)
+    found = found[:LONGEST_COMPARED]
     close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
     shown = names
     if len(names) > many:

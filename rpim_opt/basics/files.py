@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -20,6 +21,10 @@ from rpim_opt.basics.writing import write_text
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
 Mass = Annotated[float, "mass"]
+_DEEP = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++\s*+\.\s*+){100}")
+"""Dotted keys, which are read in a time that grows with the square of their length."""
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
+"""Escapes that JSON reads one by one, whether or not two of them make a character."""
 Name = Annotated[str, Field(max_length=200)]
 """A name or a pattern of names: long ones would take for ever to be matched."""
 
@@ -43,6 +48,7 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
     @classmethod
+    @cache
     def _dimensions(cls) -> dict[str, tuple[str, ...]]:
         known = {unit.dimension for unit in UNITS.values()}
         return {
@@ -99,6 +105,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         If there is no such file, or it is no TOML (with line and column).
     """
     text = read_text(path, endings=[".toml"])
+    if _DEEP.search(text):
+        raise InputError("the TOML text", "a key of more than a hundred parts", "keys that a person would write", path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep
@@ -161,9 +169,26 @@ def read_json(path: Path) -> Any:
     """
     text = read_text(path, LARGEST_DATA, [".json"])
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:  # integers of thousands of digits; lists that deep
+        return parse_json(text)
+    except ValueError as error:
         raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
+
+
+def parse_json(text: str) -> Any:
+    """Return what JSON says, texts that can be written again.
+
+    Raises
+    ------
+    ValueError
+        For what is no JSON, is nested too deeply, or has half a surrogate pair, which no file of UTF-8 can hold.
+    """
+    try:
+        content = json.loads(text)
+        if _HALF_PAIR.search(text):
+            json.dumps(content, ensure_ascii=False).encode()
+    except RecursionError as error:
+        raise ValueError(str(error)) from None
+    return content
 
 
 def sha256_of(path: Path) -> str:

@@ -77,6 +77,8 @@ def _csv(path: Path) -> Columns:
             lines = [[_as_written(cell) for cell in row] for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError("the file", str(error), "a readable UTF-8 CSV file") from None
+    if lines:
+        lines[0][0] = lines[0][0].lstrip("\ufeff")  # files put together have more than one mark
     if lines and len(lines[0]) == 1 and any(mark in lines[0][0] for mark in ";\t"):
         raise InputError("the header", "one column with semicolons or tabs", "columns separated by commas")
     return rectangle(lines)

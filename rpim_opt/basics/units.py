@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
@@ -78,9 +79,13 @@ DISPLAY = {
 """The unit in which a dimension is shown and written."""
 
 
-def accepted_units(dimension: str) -> list[str]:
+_LONGEST = max(map(len, UNITS))
+
+
+@cache
+def accepted_units(dimension: str) -> tuple[str, ...]:
     """Return the suffixes that a quantity of this dimension may carry."""
-    return [name for name, unit in UNITS.items() if unit.dimension == dimension]
+    return tuple(name for name, unit in UNITS.items() if unit.dimension == dimension)
 
 
 def display(dimension: str) -> tuple[str, float]:
@@ -115,9 +120,12 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     """
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
-    for suffix in sorted(UNITS, key=len, reverse=True):
-        if name.endswith("_" + suffix):
-            return name.removesuffix("_" + suffix), UNITS[suffix]
+    place = name.find("_", max(len(name) - _LONGEST - 1, 0))
+    while place >= 0:  # the first that fits is the longest
+        unit = UNITS.get(name[place + 1 :])
+        if unit is not None:
+            return name[:place], unit
+        place = name.find("_", place + 1)
     return name, None
 
 

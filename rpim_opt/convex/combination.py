@@ -9,10 +9,13 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import LARGEST, SMALLEST, UNITS
 
 ACCEPTED = "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'"
-NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_TERM = re.compile(rf"\s*([+-]?)\s*(?:({NUMBER})\s*\*?\s*)?([A-Za-z_][\w.]*)\s*")
-_QUANTITY = re.compile(rf"\s*([+-]?\s*{NUMBER})\s*([A-Za-z]\w*)?\s*")
-_NOMINAL = re.compile(r"\s*nominal\b(.*)")
+NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"
+"""Gives nothing back, as what follows could not begin with it: the time is that of reading it once."""
+_TERM = re.compile(rf"\s*+([+-]?+)\s*+(?:({NUMBER})\s*+\*?+\s*+)?+([A-Za-z_][\w.]*+)\s*+")
+_QUANTITY = re.compile(rf"\s*+([+-]?+\s*+{NUMBER})\s*+([A-Za-z]\w*+)?+\s*+")
+_NOMINAL = re.compile(r"\s*+nominal\b(.*)")
+LONGEST = 20_000
+"""Characters of a statement: some thousand parameters."""
 LINEAR = ("length", "angle", "ratio", "compliance")
 """Dimensions that parameters have."""
 
@@ -61,6 +64,7 @@ def combination(text: str) -> Combination:
     """
     if not isinstance(text, str):
         raise InputError("prior", repr(text)[:60], f"a statement like {ACCEPTED}")
+    require_length(text)
     left, known, spread = text.replace("±", "+-").partition("+-")
     terms, equals, right = left.partition("=")
     names, factors = _terms(terms, text)
@@ -70,6 +74,12 @@ def combination(text: str) -> Combination:
         return Combination(names, factors)
     value, deviation, sd, dimension = _figures(right, bool(equals), spread, text)
     return Combination(names, factors, value, deviation, sd, dimension)
+
+
+def require_length(text: str) -> None:
+    """Refuse a statement so long that its terms would be compared for ever."""
+    if len(text) > LONGEST:
+        raise InputError(f"statement '{text[:60]}...'", f"{len(text)} characters", f"at most {LONGEST}")
 
 
 def _wrong(text: str, found: str, accepted: str = f"a statement like {ACCEPTED}") -> InputError:
@@ -88,8 +98,11 @@ def _terms(terms: str, text: str) -> tuple[tuple[str, ...], tuple[float, ...]]:
         sign, factor, name = found.groups()
         if name in names:
             raise _wrong(text, f"'{name}' twice", "every parameter once")
+        number = _number(f"{sign}{factor or 1}", text)
+        if number == 0:
+            raise _wrong(text, f"'{factor} {name}'", "factors other than zero")
         names.append(name)
-        factors.append(_number(f"{sign}{factor or 1}", text))
+        factors.append(number)
         place = found.end()
     return tuple(names), tuple(factors)
 
@@ -129,7 +142,7 @@ def _quantity(figure: str, text: str) -> tuple[float, str]:
     unit = found[2] or ""
     if unit and unit not in units():
         raise _wrong(text, f"unit '{unit}'", choices(unit, units()))
-    return _number(found[1].replace(" ", ""), text), unit
+    return _number("".join(found[1].split()), text), unit
 
 
 def _number(digits: str, text: str) -> float:

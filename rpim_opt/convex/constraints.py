@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.patterns import fits
 from rpim_opt.basics.units import display
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.drawn import parse
@@ -286,7 +286,7 @@ def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.n
         raise InputError(what, "no pattern", "names or patterns of identified parameters")
     chosen = np.zeros(len(parameters), dtype=bool)
     for pattern in patterns:
-        hits = np.array([fnmatchcase(name, pattern) for name in parameters.names])
+        hits = np.array([fits(name, pattern) for name in parameters.names])
         if not hits.any():
             known = "identified parameters: " + choices(pattern, parameters.names)
             raise InputError(what, f"pattern '{pattern}'", known)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.patterns import fits
 from rpim_opt.convex.atoms import cp
 from rpim_opt.problem.identified import Identified, Machine
 from rpim_opt.problem.predicting import Predicted, markers, moved, predicted
@@ -19,7 +19,7 @@ from rpim_opt.robot.parameters import Parameters
 
 def places(names: Sequence[str], pattern: str, where: str) -> list[int]:
     """Return which names match a pattern (``*``, ``?``, ``[...]``), one at least."""
-    found = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
+    found = [i for i, name in enumerate(names) if fits(name, pattern)]
     if not found:
         raise InputError(where, f"'{pattern}'", "parameters: " + choices(pattern, names))
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from scipy.linalg import solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.patterns import fits
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.robot.parameter_names import own_name
 from rpim_opt.robot.parameters import Parameters
@@ -272,4 +272,4 @@ def _places(key: Any, free: Parameters) -> list[int]:
 
 
 def _meant(token: str, name: str, group: str) -> bool:
-    return fnmatchcase(name, token) or token in (_kind(name), _link(name), group)
+    return fits(name, token) or token in (_kind(name), _link(name), group)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.patterns import fits
 from rpim_opt.convex import statement
 from rpim_opt.convex.believed import penalized
 from rpim_opt.convex.fleet import Fleet
@@ -354,7 +354,7 @@ class Prior:
         """Return the number of every identified parameter's group, and the groups' names."""
         for group in self.groups:
             for pattern in group:
-                if not any(fnmatchcase(name, pattern) for name in parameters.names):
+                if not any(fits(name, pattern) for name in parameters.names):
                     raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
         free = parameters.free
         keys = [self._group_of(name, dimension) for name, dimension in zip(free.names, free.dimensions, strict=True)]
@@ -365,7 +365,7 @@ class Prior:
 
     def _group_of(self, name: str, dimension: str) -> str:
         for group in self.groups:
-            if any(fnmatchcase(name, pattern) for pattern in group):
+            if any(fits(name, pattern) for pattern in group):
                 return " ".join(group)
         if of_session(name):
             return SESSIONS[dimension]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,7 +11,7 @@ from typing import Literal
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import LARGEST, UNITS
-from rpim_opt.convex.combination import LINEAR, NUMBER, units
+from rpim_opt.convex.combination import LINEAR, NUMBER, require_length, units
 
 ACCEPTED = (
     "'d2 + d3 = 850.00 +- 0.05 mm', '|a2 - a3| <= 0.1 mm', 'alpha2 >= 89.9 deg', 'd5 = nominal +- 0.1 mm', "
@@ -104,6 +105,7 @@ def sentence(text: str) -> Sentence:
     """
     if not isinstance(text, str):
         raise InputError("key stated", repr(text)[:60], f"a statement like {ACCEPTED}")
+    require_length(text)
     moving = _MOVE.fullmatch(text)
     if moving is not None:
         return _movement(text, moving[1], moving[2])
@@ -118,7 +120,8 @@ def _movement(text: str, limit: str, where: str | None) -> Sentence:
         raise reader.wrong(f"a movement in {reader.unit}", "a length: 'move at most 5 mm'")
     if not most > 0:
         raise reader.wrong(f"a movement of {most:g}", "one above zero; at_nominal keeps parameters")
-    places = tuple(place.strip() for place in (where or "workspace").split(","))
+    said = (where or "").strip() or "workspace"
+    places = tuple(place.strip() for place in said.split(","))
     return Sentence("move", limit=most, unit=reader.unit, places=places)
 
 
@@ -137,8 +140,9 @@ class _Reader:
 
     def _split(self, part: str) -> Sequence[tuple[str, str]]:
         place = 0
+        end = len(part.rstrip())
         found: list[tuple[str, str]] = []
-        while part[place:].strip():
+        while place < end:
             token = _TOKEN.match(part, place)
             if token is None:
                 raise self.wrong(f"'{part[place:].strip()}'")
@@ -302,7 +306,7 @@ class _Reader:
         """Return a sum in which every parameter stands once, or say what is wrong."""
         if not found.names:
             raise self.wrong("no parameter", "parameters' names")
-        twice = [name for name in found.names if found.names.count(name) > 1]
+        twice = [name for name, times in Counter(found.names).items() if times > 1]
         if twice:
             raise self.wrong(f"'{twice[0]}' twice", "every parameter once")
         return found

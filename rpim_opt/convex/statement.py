@@ -123,7 +123,8 @@ class Statement:
         far = np.array(self.values) - rows @ offset
         room = FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))
         if (np.abs(far) > room).any():
-            size = float(np.max(np.abs(far) / np.linalg.norm(rows, axis=1)))
+            norms = np.linalg.norm(rows, axis=1)
+            size = float(np.max(np.abs(far) / np.where(norms > 0, norms, 1.0)))
             unit, si = display(parameters.dimensions[place[0]])
             found = f"a value {size / si:.4g} {unit} off nominal"
             raise InputError(self.where, found, "one near it; '= nominal +- ...' where the drawing's value is meant")

@@ -21,7 +21,8 @@ from rpim_opt.data.projection import TARGET
 Board = Mapping[str, Sequence[float] | Array]
 """Where points are on their board, (3,) each [m], by name."""
 LEAST = 2
-"""Points along either side of a pattern."""
+MOST = 300
+"""Points along either side of a pattern: beyond the larger number none has them, and they are listed one by one."""
 
 
 def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
@@ -37,7 +38,7 @@ def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
     Raises
     ------
     InputError
-        For fewer than two columns or rows, and a spacing that is not positive.
+        For fewer than two columns or rows or more than three hundred, and a spacing that is not positive.
 
     Examples
     --------
@@ -46,8 +47,8 @@ def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
     >>> len(board), board["10"]
     (54, array([0.025, 0.025, 0.   ]))
     """
-    if columns < LEAST or rows < LEAST:
-        raise InputError("board", f"{columns} x {rows} points", "two or more along either side")
+    if not (LEAST <= columns <= MOST and LEAST <= rows <= MOST):
+        raise InputError("board", f"{columns!r:.20} x {rows!r:.20} points", f"two to {MOST} along either side")
     if not 0 < spacing <= LARGEST:
         raise InputError("board", f"a spacing of {spacing:g} m", "a length greater than zero")
     y, x = np.divmod(np.arange(columns * rows), columns)

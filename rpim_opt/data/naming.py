@@ -186,7 +186,7 @@ def _by_name(read: dict[str, Reading], table: Columns, joints: Sequence[str], do
     """Return readings with ROS' joints in the robot's order, where columns name0, ... name them."""
     named = {}
     for name, found in read.items():
-        match = re.fullmatch(r"(?:field_)?name_?(\d+)", found.stem)
+        match = re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem)
         if match:
             named[int(match[1])] = name
     if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:

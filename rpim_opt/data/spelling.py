@@ -16,6 +16,8 @@ SPELLED = {
     "°c": "degC", "celsius": "degC", "kelvin": "K",
 }  # fmt: skip
 """Units as they are spelled in headers; their own names besides."""
+LONGEST_NAME = 200
+"""Characters that a column's name has: longer ones would take for ever to be matched."""
 
 
 class Foreign(NamedTuple):
@@ -78,6 +80,8 @@ def split(name: str) -> tuple[str, str]:
     stem, unit = split_unit(name)
     if unit:
         return stem, name[len(stem) + 1 :]
+    if len(name) > LONGEST_NAME:
+        return stem, ""
     for pattern in (
         r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]",
         r"(.+?)\s*/\s*(\S+)",

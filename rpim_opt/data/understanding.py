@@ -109,7 +109,12 @@ class Understood:
 
 
 def understand(
-    path: Path, robot: Robot, kind: Measurement, asked: Asked | None = None, joints: Sequence[str] = ()
+    path: Path,
+    robot: Robot,
+    kind: Measurement,
+    asked: Asked | None = None,
+    joints: Sequence[str] = (),
+    table: RawTable | None = None,
 ) -> Understood:
     r"""Return what a raw table says of a robot and a kind of measurement.
 
@@ -125,6 +130,8 @@ def understand(
         What the user states.
     joints
         What the robot's file calls its joints.
+    table
+        What the file holds, where it was read before.
 
     Raises
     ------
@@ -146,7 +153,7 @@ def understand(
     (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
     """
     asked = asked or Asked()
-    raw = read_raw(path, asked.layout)
+    raw = table or read_raw(path, asked.layout)
     try:
         raw, vectors = _turned(raw, asked)
         found = rename(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from itertools import chain
 from string import ascii_uppercase
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.patterns import fits
 from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.meeting import met
@@ -98,9 +98,9 @@ def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> t
     first, *others = (part.parameters.names for part in parts.values())
     everywhere = [name for name in first if all(name in names for names in others)]
     for pattern in shared:
-        if not any(fnmatchcase(name, pattern) for name in everywhere):
+        if not any(fits(name, pattern) for name in everywhere):
             raise InputError("together, shared", f"'{pattern}'", known_patterns(everywhere, pattern) + ", of all")
-    return tuple(name for name in everywhere if any(fnmatchcase(name, pattern) for pattern in shared))
+    return tuple(name for name in everywhere if any(fits(name, pattern) for pattern in shared))
 
 
 def _require_same(name: str, parts: Mapping[str, CalibrationProblem]) -> None:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.late import transform
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, link, numeric_frame
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH, Robot
 
 NEAR_PARALLEL = 0.1
@@ -210,7 +209,7 @@ def without_beta(robot: Robot) -> Robot:
 
 def link_of(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
     """Return the link's transform (4, 4) as numbers."""
-    return ca.DM(link(*(float(v) for v in (alpha, a, theta, d, beta)))).full()
+    return numeric_link(alpha, a, theta, d, beta)
 
 
 def _to_axis(axis: Array) -> Array:

@@ -64,6 +64,17 @@ def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> ca
     return along_x @ along_z @ rotation_y(beta)
 
 
+def numeric_link(*numbers: float) -> Array:
+    """Return the link's transform (4, 4) of alpha, a, theta, d and beta as numbers."""
+    return _link()(*numbers).full()
+
+
+@lru_cache(maxsize=1)
+def _link() -> ca.Function:
+    numbers = [ca.SX.sym(name) for name in MDH]
+    return ca.Function("link", numbers, [ca.densify(link(*numbers))])
+
+
 def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
     """Return Rz(rz) Ry(ry) Rx(rx): roll, pitch, yaw about fixed axes, as in URDF."""
     return rotation_z(rz) @ rotation_y(ry) @ rotation_x(rx)

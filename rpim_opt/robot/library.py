@@ -40,14 +40,15 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     """Return the file of a robot: one in ``folder``, or a ready robot by name."""
     if folder is not None and name.endswith(ROBOT_FILES):
         return inside(folder, name, "key robot", folder / "problem.toml")
-    if name in robots():
+    ready = robots()
+    if name in ready:
         return READY / f"{name}.toml"
     accepted = "a file .toml, .urdf, .csv or .json"
     file = None if folder is None else folder / "problem.toml"
     other = OF_OTHERS.get(Path(name).suffix.lower())
     if other:
         raise InputError("key robot", f"'{name}', {other}", accepted, file)
-    raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, robots())}", file)
+    raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, ready)}", file)
 
 
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from fnmatch import fnmatchcase
+from functools import lru_cache
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.patterns import fits
 from rpim_opt.basics.units import SMALLEST, quantities, split_unit
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.robot.parameter_names import KNOWN, own_name
 
 PATTERN = re.compile(r"[*?\[]")
 JOINT_OFFSET = "joint_offset"
 _OFFSET = re.compile(r"theta\d+")
 
 
+@lru_cache(KNOWN)
 def is_joint_offset(name: str) -> bool:
     """Return whether a parameter is the offset of a revolute joint: set at assembly, and not machined."""
     return _OFFSET.fullmatch(own_name(name)) is not None
@@ -69,7 +71,7 @@ class Overlay:
                 stems.setdefault(JOINT_OFFSET, set()).add(dimension)
         for key in filter(PATTERN.search, table):
             stem, _ = split_unit(key)
-            met = [d for name, d in zip(self.names, self.dimensions, strict=True) if fnmatchcase(name, stem)]
+            met = [d for name, d in zip(self.names, self.dimensions, strict=True) if fits(name, stem)]
             stems.setdefault(stem, set()).update(met)
         return {stem: tuple(sorted(dimensions)) for stem, dimensions in stems.items()}
 
@@ -89,4 +91,4 @@ class Overlay:
     def _meant(self, stem: str, i: int, name: str) -> bool:
         if stem == JOINT_OFFSET:
             return is_joint_offset(name)
-        return stem == self.groups[i] or fnmatchcase(name, stem)
+        return stem == self.groups[i] or fits(name, stem)

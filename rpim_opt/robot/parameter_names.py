@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.robot.joint_terms import JOINT_TERMS, terms_of
@@ -13,6 +14,9 @@ from rpim_opt.robot.terms import Term
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})(\d+)|(bend)(\d+)_\d+[xyz]")
+
+KNOWN = 2**14
+"""Names of which what they say is kept: those of a hundred robots, asked for again with every table."""
 
 
 def own_name(name: str) -> str:
@@ -24,6 +28,7 @@ EXPANSION, REFERENCE = "expansion", "reference_temperature"
 """By how much all lengths of a robot grow with temperature, and where they are as on the drawing."""
 
 
+@lru_cache(KNOWN)
 def of_joint(name: str) -> bool:
     """Return whether a parameter is a robot's own, and not of a frame."""
     return _TABLE.fullmatch(own_name(name)) is not None or of_term(name) or own_name(name) == EXPANSION
@@ -49,6 +54,7 @@ def term_of(name: str, dof: int) -> tuple[Term, int]:
     raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
 
 
+@lru_cache(KNOWN)
 def group_of(name: str, dimension: str) -> str:
     """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.patterns import fits
 from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
@@ -263,7 +263,7 @@ class Parameters(Tabled):
         """
         chosen = np.zeros(len(self), dtype=bool)
         for pattern in patterns:
-            hits = [fnmatchcase(name, pattern) for name in self.names]
+            hits = [fits(name, pattern) for name in self.names]
             if not any(hits):
                 raise InputError("key identify", f"pattern '{pattern}'", known_patterns(self.names, pattern))
             chosen |= hits

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import write_json
-from rpim_opt.basics.inputs import read_bytes
+from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import UNITS, display
 from rpim_opt.basics.writing import write_text
@@ -134,10 +133,7 @@ def _by_ending(known: dict[str, Any], path: Path) -> Any:
 
 
 def _read_json(path: Path) -> Robot:
-    try:
-        content = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError("the JSON text", str(error), "JSON", path) from None
+    content = read_json(path)
     if not isinstance(content, dict):
         raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
     return robot_of(content, path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from pydantic import ConfigDict, Field
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import Table, read_json
+from rpim_opt.basics.patterns import fits
 from rpim_opt.basics.units import split_unit
 from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.stated import FRAMES
@@ -114,7 +114,7 @@ def _offsets(scale: Mapping[str, float], parameters: Parameters) -> dict[str, fl
 def _at_its_word(stem: str, parameters: Parameters) -> bool:
     if stem == JOINT_OFFSET or stem in parameters.names:
         return True
-    met = [name for name in parameters.names if fnmatchcase(name, stem)]
+    met = [name for name in parameters.names if fits(name, stem)]
     return bool(met) and all(map(is_joint_offset, met))
 
 

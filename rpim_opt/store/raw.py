@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.layouts import read_raw
+from rpim_opt.basics.layouts import RawTable, read_raw
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.models import MEASUREMENTS, Measurement, eye_in_hand, pose, position, revisit
 from rpim_opt.data.naming import TOUCHED
@@ -28,6 +28,7 @@ from rpim_opt.store.named import pick
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
+Files = Sequence[tuple[Path, RawTable]]
 CLEARLY = 3.0
 """The right order of a quaternion leaves so many times less than the other one."""
 
@@ -185,31 +186,40 @@ def understand_of(
     """Return what raw tables of an arm say, as `understand_tables` does."""
     asked = asked or Asked()
     paths = [Path(each) for each in data]
-    known = _known_kind(paths, asked, measurement)
-    kind = known or pose
-    tables = _understood(paths, arm, kind, asked)
-    if known is None:
-        kind = _kind(tables, paths)
-        if kind is not pose:
-            tables = _understood(paths, arm, kind, asked)
+    known = None
+    if measurement is not None:
+        known = pick(MEASUREMENTS, measurement, "measurement")
+    files = [(path, read_raw(path, asked.layout)) for path in paths]
+    kind, tables = _told(files, arm, known or _known_kind([table.columns for _, table in files]), asked)
     if kind is pose and any(each.numbered for each in tables):
-        return _ordered(paths, arm, kind, asked, tables)
+        return _ordered(files, arm, kind, asked)
     return _whole(paths, arm, kind, asked, tables)
 
 
-def _known_kind(paths: Sequence[Path], asked: Asked, measurement: str | None) -> Measurement | None:
-    """Return the kind that is stated, or that columns of pixels or touches tell; None where tables have to be read."""
-    if measurement is not None:
-        return pick(MEASUREMENTS, measurement, "measurement")
-    if _seeing(paths, asked):
+def _told(
+    files: Files, arm: Described, known: Measurement | None, asked: Asked
+) -> tuple[Measurement, tuple[Understood, ...]]:
+    """Return what was measured, by the names of columns where that is not known, and the tables understood so."""
+    tables = _understood(files, arm, known or pose, asked)
+    if known is not None:
+        return known, tables
+    kind = _kind(tables, [path for path, _ in files])
+    if kind is not pose:
+        tables = _understood(files, arm, kind, asked)
+    return kind, tables
+
+
+def _known_kind(tables: Sequence[Columns]) -> Measurement | None:
+    """Return the kind that columns of pixels or touches tell; None where names have to be read."""
+    if any(map(_seeing, tables)):
         return eye_in_hand
-    if _touching(paths, asked):
+    if _touching(tables):
         return revisit
     return None
 
 
-def _understood(paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:
-    return tuple(understand(path, arm.robot, kind, asked, arm.names) for path in paths)
+def _understood(files: Files, arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:
+    return tuple(understand(path, arm.robot, kind, asked, arm.names, table) for path, table in files)
 
 
 def _whole(
@@ -233,30 +243,15 @@ def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
     return pose if any(form <= stems for form in forms) else position
 
 
-def _seeing(paths: Sequence[Path], asked: Asked) -> bool:
+def _seeing(raw: Columns) -> bool:
     """Return whether a table has columns u and v: pixels."""
-    for path in paths:
-        try:
-            stems = {split(name)[0].strip().lower() for name in read_raw(path, asked.layout).columns}
-        except InputError:  # whatever it is, the one who understands it says so
-            return False
-        if {"u", "v"} <= stems:
-            return True
-    return False
+    return {"u", "v"} <= {split(name)[0].strip().lower() for name in raw}
 
 
-def _touching(paths: Sequence[Path], asked: Asked) -> bool:
+def _touching(tables: Sequence[Columns]) -> bool:
     """Return whether a table says what was touched, and none has a measured coordinate."""
-    touched = False
-    for path in paths:
-        try:
-            raw = read_raw(path, asked.layout).columns
-        except InputError:  # whatever it is, the one who understands it says so
-            return False
-        if any(COORDINATE.search(name.lower()) for name in raw):
-            return False
-        touched = touched or _touched(raw)
-    return touched
+    measured = any(COORDINATE.search(name.lower()) for raw in tables for name in raw)
+    return not measured and any(map(_touched, tables))
 
 
 def _touched(raw: Columns) -> bool:
@@ -265,12 +260,13 @@ def _touched(raw: Columns) -> bool:
     return any(len({str(cell) for cell in column}) < len(column) for column in cells)
 
 
-def _ordered(
-    paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked, tables: Sequence[Understood]
-) -> Understanding:
+def _ordered(files: Files, arm: Described, kind: Measurement, asked: Asked) -> Understanding:
     """Return the tables with a quaternion in the order that fits the nominal robot, and say both figures."""
-    found = {order: _whole(paths, arm, kind, replace(asked, quaternion=order), _understood(
-        paths, arm, kind, replace(asked, quaternion=order))) for order in ORDERS}  # fmt: skip
+    paths = [path for path, _ in files]
+    found: dict[str, Understanding] = {}
+    for order in ORDERS:
+        stated = replace(asked, quaternion=order)
+        found[order] = _whole(paths, arm, kind, stated, _understood(files, arm, kind, stated))
     misfit = {order: _misfit(each, arm) for order, each in found.items()}
     best, other = sorted(ORDERS, key=lambda order: misfit[order])
     if not misfit[other] > CLEARLY * misfit[best]:

@@ -21,7 +21,7 @@ from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 
 TARGET_FILE = "target.csv"
 """What a board's table is called in a folder."""
-GRID = re.compile(r"(\d+)\s*x\s*(\d+)\s*,\s*([\d.]+)\s*(mm|m)")
+GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 CLEARLY = 3.0
 """The camera is where the poses fit so many times better."""
 

@@ -135,6 +135,12 @@ def compare(
     return Comparison(tuple(kept.rows), tuple(plan.metrics), drawn, plan.said(), made)
 
 
+MOST_DRAWS = 100_000
+"""Each is a calibration of its own, and is listed before the first begins."""
+LARGEST_FACTOR = float(np.finfo(float).max)
+"""Whole numbers may be larger than any double."""
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """What is compared: the axes of the grid, checked.
@@ -219,6 +225,8 @@ def _counts(stated: Any) -> tuple[int | None, ...]:
 
 def _seeds(stated: int | Iterable[int]) -> tuple[int, ...]:
     if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
+        if stated > MOST_DRAWS:
+            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
         return _whole("seeds", range(max(int(stated), 0)), 0)
     return _whole("seeds", stated, 0)
 
@@ -235,6 +243,6 @@ def _whole(where: str, stated: Any, least: int) -> tuple[int, ...]:
 def _factors(stated: Any) -> tuple[float, ...]:
     values = list(stated) if isinstance(stated, Iterable) else [stated]
     numbers = [isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values]
-    if not values or not all(numbers) or not all(np.isfinite(v) and v >= 1 for v in values):
+    if not values or not all(numbers) or not all(1 <= v <= LARGEST_FACTOR for v in values):
         raise InputError("noise", f"{stated!r}", "factors of 1 or more on the noise that was measured")
     return tuple(dict.fromkeys(float(v) for v in values))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import parse_json
 from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, require_file
 from rpim_opt.basics.writing import refused
 
@@ -69,8 +70,8 @@ class Journal:
 
     def _entry(self, line: bytes, number: int) -> dict[str, Any]:
         try:
-            entry = json.loads(line)
-        except (ValueError, RecursionError) as error:
+            entry = parse_json(line.decode())
+        except ValueError as error:
             raise self._odd(number, str(error)) from None
         if not isinstance(entry, dict):
             raise self._odd(number, "no table")

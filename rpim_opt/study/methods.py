@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_of
@@ -214,10 +215,17 @@ def _selector(label: str | None, each: Any) -> tuple[str, Any]:
         return label or _rule_name(each), each
     if isinstance(each, Mapping) and label:
         return label, each
+    weight = _weight(each)
+    return label or f"{weight:g}", weight
+
+
+def _weight(each: Any) -> float:
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
         accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
         raise InputError("selectors", f"{each!r}", accepted)
-    return label or f"{each:g}", require_weight(float(each), "selectors")
+    if isinstance(each, int):
+        each = number(each, "selectors")
+    return require_weight(float(each), "selectors")
 
 
 def _rule_name(rule: Callable[..., Any]) -> str:

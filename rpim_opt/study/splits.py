@@ -13,6 +13,8 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.store.instances import Instance
 
 FOLDER = "folder"
+MOST_FOLDS = 10_000
+"""Each is a calibration of its own, and is listed before the first begins."""
 NOISE = 11
 """Stream of the noise that is added, apart from those that draw configurations."""
 
@@ -74,9 +76,9 @@ def _split(stated: Any) -> Split:
         return Split(FOLDER)
     if number and 0 < stated < 1:
         return Split(f"{stated:g} held out", part=float(stated))
-    if number and stated >= 2 and stated == int(stated):
+    if number and 2 <= stated <= MOST_FOLDS and stated == int(stated):
         return Split(f"{int(stated)} folds", folds=int(stated))
-    accepted = "'folder', a part of the configurations between 0 and 1, or a number of folds, 2 or more"
+    accepted = f"'folder', a part of the configurations between 0 and 1, or a number of folds, 2 to {MOST_FOLDS}"
     raise InputError("splits", f"{stated!r}", accepted)
 
 

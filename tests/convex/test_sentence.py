@@ -36,6 +36,8 @@ from rpim_opt.convex.sentence import Sentence, Sum, sentence
         ("norm(base_[xyz]) <= 2 mm", Sentence("norm", (Sum(("base_[xyz]",), (1.0,)),), 0.002, "mm")),
         ("|a1, a2| <= 2 mm", Sentence("norm", (Sum(("a1",), (1.0,)), Sum(("a2",), (1.0,))), 0.002, "mm")),
         ("move at most 2 mm", Sentence("move", (), 0.002, "mm", ("workspace",))),
+        ("move at most 2 mm:", Sentence("move", (), 0.002, "mm", ("workspace",))),
+        (" move at most 2 mm : ", Sentence("move", (), 0.002, "mm", ("workspace",))),
         ("move at most 2 mm: here, there", Sentence("move", (), 0.002, "mm", ("here", "there"))),
     ],
 )

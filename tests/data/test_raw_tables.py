@@ -54,6 +54,8 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
         HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the mark that the numbers have"
     ),
     "nothing": ("\n\n", {}, "an empty file"),
+    "an encoding that no text has": (HEAD + ROWS, {"encoding": "\ud800"}, "an encoding that fits"),
+    "an encoding of no name": (HEAD + ROWS, {"encoding": "\x00"}, "an encoding that fits"),
     "a sheet of a text": (HEAD + ROWS, {"sheet": "1"}, "an Excel workbook"),
     "angles that no file has": (HEAD + ROWS, {"rotation": "euler"}, "--rotation: found 'euler'"),
     "no row with values": (HEAD + "P1,1,2,-,-,-\nP2,-,-,3,4,5\n", {}, "no row with values"),

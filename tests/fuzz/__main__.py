@@ -1,5 +1,7 @@
 """Fuzz for as long as it is let: ``python -m tests.fuzz SECONDS FOLDER [PARSER...]``; failures go to the folder.
 
+``python -m tests.fuzz sum FOLDER...`` counts what was tried in all of them, commands included, as a table.
+
 Where atheris is installed, an input that reaches a branch that none has reached is kept, and changed further
 (libFuzzer; half of the changes are those of `mutation`). Without it the changes are of the seeds alone. One process
 per parser, one after the other: libFuzzer ends its own.
@@ -15,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import Counter
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +30,9 @@ EACH = 60.0
 
 def main(arguments: list[str]) -> int:
     """Fuzz parsers in turn, a minute each, until the time is over."""
+    if arguments[0] == "sum":
+        sys.stdout.write(summed([Path(folder) for folder in arguments[1:]]) + "\n")
+        return 0
     if arguments[0] == "one":
         return one(arguments[1], float(arguments[2]), Path(arguments[3]), int(arguments[4]))
     from tests.fuzz.parsers import PARSERS
@@ -105,6 +111,27 @@ def one(name: str, seconds: float, folder: Path, turn: int) -> int:
         atheris.Setup([*options, f"-seed={turn + 1}"], step, custom_mutator=change)
         atheris.Fuzz()
     return 0
+
+
+def summed(folders: list[Path]) -> str:
+    """Return what was tried of every parser, and how commands ended, as Markdown."""
+    from rpim_opt.basics.text import markdown
+
+    parsers: dict[str, Counter[str]] = {}
+    codes: Counter[str] = Counter()
+    for file in sorted(file for folder in folders for file in folder.glob("*-*.json")):
+        counts = json.loads(file.read_text())
+        name = counts.pop("parser", None)
+        if name is None:
+            codes.update(counts)
+            continue
+        numbers = {key: counts[key] for key in ("tried", "accepted", "failed")}
+        parsers.setdefault(name, Counter()).update(numbers)
+    parsers["all"] = sum(parsers.values(), Counter())
+    rows = [[name, *(f"{each[key]:,}" for key in ("tried", "accepted", "failed"))] for name, each in parsers.items()]
+    ended = [[code, f"{count:,}"] for code, count in sorted(codes.items())]
+    ended.append(["all", f"{codes.total():,}"])
+    return markdown(["parser", "tried", "accepted", "failed"], rows) + "\n\n" + markdown(["code", "commands"], ended)
 
 
 def _memory() -> str | None:

@@ -15,14 +15,11 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import numpy as np
-import typer
-
 import rpim_opt as ro
 from rpim_opt import cli
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.named import problems_folder
-from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF
+from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF, make_cell
 from tests.fuzz.trial import Failure, failure, limited
 
 LONGEST = 120.0
@@ -43,9 +40,10 @@ FILES = [
     "kinematics.yaml", "calibration.conf", "targets.csv", "poses.csv", "rows.csv", "table.csv", "mine.py",
     "nothing.csv",
     "empty.csv", "binary.xlsx", "binary.parquet", ".", "..", "", "\x00", "a" * 300, "/dev/null", "out", "/", "ur5e",
+    "\udcff",
 ]  # fmt: skip
 TARGETS = ["out/a.csv", "out/deep/b.html", "out", "\x00", "a" * 300 + "/x", "/dev/full", "/proc/x/y", "out/r.toml",
-           "out/r.json", "mine.py/x"]  # fmt: skip
+           "out/r.json", "mine.py/x", "out/\udcff"]  # fmt: skip
 TEXTS = [
     "", " ", "x", "1", "0", "-1", "nan", "inf", "1e400", "1e308", "deg,mm", "rad,m", "mm", "deg", "label", "row",
     "wxyz",
@@ -61,6 +59,7 @@ TEXTS = [
     "-", "é", "\x1b[2J", "\ud800", "9" * 400, "label,q1_deg,q2_deg,x_mm,y_mm,z_mm", "rms_mm", "max_mm,rms_mm",
     "nominal",
     "'tikhonov, reml'", "tcp://127.0.0.1:1",
+    "7x5,30mm", "99999x9,1.2.3mm",
 ]  # fmt: skip
 NUMBERS = [
     "0",
@@ -106,24 +105,9 @@ FITTING: dict[str, list[list[str]]] = {
 def make_desk(folder: Path) -> None:
     """Make a folder with a file of every kind."""
     cell = folder / "cell"
-    cell.mkdir(parents=True)
-    arm = ro.robot.Robot(
-        "two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]), limits=np.array([[-2.0, 2.0]] * 2)
-    )
-    for place in (cell / "robot.toml", folder / "robot.toml"):
-        ro.robot.write_robot(arm, place)
-    rng = np.random.default_rng(0)
-    q = np.degrees(rng.uniform(-2, 2, (12, 2)))
-    T = ro.robot.forward_kinematics(arm, np.radians(q))
-    points = 1e3 * T[:, :3, 3] + rng.normal(0, 0.2, (12, 3))
-    head = "label,q1_deg,q2_deg,x_mm,y_mm,z_mm\n"
-    rows = [f"P{i}," + ",".join(f"{v:.6f}" for v in (*q[i], *points[i])) + "\n" for i in range(12)]
-    for place in (cell / "identification.csv", folder / "table.csv"):
-        place.write_text(head + "".join(rows))
-    (cell / "problem.toml").write_text(
-        'title = "T"\nrobot = "robot.toml"\nidentification = "identification.csv"\nidentify = ["d?", "a2", "theta?"]\n'
-        "[noise]\nposition_mm = 0.2\n[scale]\nlength_mm = 1\nangle_mrad = 1\n"
-    )
+    make_cell(cell)
+    shutil.copy(cell / "robot.toml", folder / "robot.toml")
+    shutil.copy(cell / "identification.csv", folder / "table.csv")
     instance = ro.load(cell)
     ro.store.save_result(ro.calibrate(instance.problem, ro.tikhonov, 1.0), folder / "result.json", instance.record)
     shutil.copytree(problems_folder() / "scara", folder / "sim")
@@ -143,7 +127,7 @@ def make_desk(folder: Path) -> None:
 @cache
 def parameters() -> dict[str, list[Any]]:
     """Return the parameters of every command, as the command line knows them."""
-    group: Any = typer.main.get_command(cli.app)
+    group: Any = cli._command()
     return {name: list(command.params) for name, command in group.commands.items()}
 
 
@@ -224,7 +208,7 @@ def _oddity(line: list[str], code: int, out: str, err: str, before: dict[str, tu
     if "output cannot be written" in err:
         return Failure(f"an input taken for an output by {line[0]}", said)
     changed = {name for name, state in listing().items() if before.get(name) != state}
-    places = ("out", "report.html", *DEFAULTS.get(line[0], ()))
+    places = ("out", "report.html", "--", *DEFAULTS.get(line[0], ()))
     allowed = {name for name in changed if name.startswith(places)}
     left = {name for name in changed if ".part" in name}
     if changed - allowed or left:
@@ -260,9 +244,12 @@ def desk(folder: Path) -> Iterator[None]:
 
 
 def tidy() -> None:
-    """Remove what a command may write."""
-    shutil.rmtree("out", ignore_errors=True)
-    Path("report.html").unlink(missing_ok=True)
+    """Remove what a command may write, also where an option stood for the value of another."""
+    for path in (Path("out"), Path("report.html"), *Path().glob("--*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def fuzz(rng: Random, count: int) -> Iterator[tuple[list[str], Failure | int]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from random import Random
 
@@ -37,14 +38,16 @@ UNITS = [
     b"_arcsec",
 ]
 LONGEST = 20_000
+BETWEEN = re.compile(rb"[ =,\"'\[\]{}()<>:;\n\t|_]")
 
 
 def mutated(rng: Random, seed: bytes, others: Sequence[bytes], words: Sequence[bytes]) -> bytes:
     """Return an input a few changes away from a seed."""
     data = seed
+    longest = max(LONGEST, 2 * len(seed))
     for _ in range(1 + min(int(rng.expovariate(0.6)), 12)):
-        data = _changed(rng, data, others, words)
-    return data[:LONGEST]
+        data = _changed(rng, data, others, words)[:longest]
+    return data
 
 
 def _changed(rng: Random, data: bytes, others: Sequence[bytes], words: Sequence[bytes]) -> bytes:
@@ -68,6 +71,8 @@ def _place(rng: Random, data: bytes) -> tuple[int, int]:
 
 def _token(rng: Random, data: bytes, words: Sequence[bytes]) -> bytes:
     token = rng.choice(rng.choice((NUMBERS, SIGNS, UNITS, words)))
+    if rng.random() < 0.01:  # what is matched by going back and forth takes for ever
+        token *= LONGEST // len(token)
     start, end = _place(rng, data)
     if rng.random() < 0.5:
         end = start
@@ -103,7 +108,7 @@ def _lines(rng: Random, data: bytes, others: Sequence[bytes]) -> bytes:
 
 def _spans(rng: Random, data: bytes, words: Sequence[bytes]) -> bytes:
     """Change what lies between signs: a number, a name, a text."""
-    ends = [0, *(i for i, byte in enumerate(data) if byte in b" =,\"'[]{}()<>:;\n\t|_"), len(data)]
+    ends = [0, *(found.start() for found in BETWEEN.finditer(data)), len(data)]
     i = rng.randrange(len(ends) - 1)
     start = min(ends[i] + (i > 0), ends[i + 1])
     middle = data[start : ends[i + 1]]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import tempfile
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 import rpim_opt as ro
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.content import content
 from rpim_opt.store.named import problems_folder
 
 CORPUS = Path(__file__).with_name("corpus")
@@ -90,12 +90,36 @@ def _tables_of_robots(ending: str) -> list[str]:
         return [path.read_text(encoding="utf-8")]
 
 
+def make_cell(folder: Path) -> None:
+    """Make a problem folder that is quick to read: twelve positions of an arm with two joints."""
+    folder.mkdir(parents=True)
+    arm = ro.robot.Robot(
+        "two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]), limits=np.array([[-2.0, 2.0]] * 2)
+    )
+    ro.robot.write_robot(arm, folder / "robot.toml")
+    rng = np.random.default_rng(0)
+    q = np.degrees(rng.uniform(-2, 2, (12, 2)))
+    T = ro.robot.forward_kinematics(arm, np.radians(q))
+    points = 1e3 * T[:, :3, 3] + rng.normal(0, 0.2, (12, 3))
+    rows = [f"P{i}," + ",".join(f"{v:.6f}" for v in (*q[i], *points[i])) + "\n" for i in range(12)]
+    (folder / "identification.csv").write_text("label,q1_deg,q2_deg,x_mm,y_mm,z_mm\n" + "".join(rows))
+    (folder / "problem.toml").write_text(
+        'title = "T"\nrobot = "robot.toml"\nidentification = "identification.csv"\nidentify = ["d?", "a2", "theta?"]\n'
+        "[noise]\nposition_mm = 0.2\n[scale]\nlength_mm = 1\nangle_mrad = 1\n"
+        "[tolerance]\nlength_mm = 5\nangle_deg = 1\n"
+    )
+
+
 def _results() -> list[str]:
-    instance = ro.load("paper_arm")
     texts = []
-    for formulation, weight in ((ro.bounded, 0.1), (ro.tikhonov, ro.l_curve)):
-        result = ro.calibrate(instance.problem, formulation, weight)
-        texts.append(json.dumps(content(replace(result, record=instance.record))))
+    with tempfile.TemporaryDirectory() as folder:
+        make_cell(Path(folder) / "cell")
+        instance = ro.load(Path(folder) / "cell")
+        for formulation, weight in ((ro.bounded, 0.1), (ro.tikhonov, ro.l_curve)):
+            result = ro.calibrate(instance.problem, formulation, weight)
+            path = Path(folder) / "result.json"
+            ro.store.save_result(result, path, instance.record)
+            texts.append(path.read_text(encoding="utf-8"))
     return texts
 
 

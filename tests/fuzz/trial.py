@@ -32,23 +32,23 @@ class Hang(BaseException):
     """An input took too long."""
 
 
+def _late(number: int, frame: FrameType | None) -> None:
+    raise Hang("took too long")
+
+
 @contextmanager
 def limited(seconds: float):
     """Break off what takes longer; on systems without alarms nothing is."""
-
-    def late(number: int, frame: FrameType | None) -> None:
-        raise Hang(f"longer than {seconds:g} s")
-
     if not hasattr(signal, "setitimer"):
         yield
         return
-    before = signal.signal(signal.SIGALRM, late)
+    if signal.getsignal(signal.SIGALRM) is not _late:
+        signal.signal(signal.SIGALRM, _late)
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def tried(name: str, data: bytes, folder: Path) -> Failure | bool:
@@ -59,6 +59,7 @@ def tried(name: str, data: bytes, folder: Path) -> Failure | bool:
 def attempt(what: Callable[[], object]) -> Failure | bool:
     """Return whether something is done without an error, or refused; or how it fails."""
     began = process_time()
+    accepted = True
     try:
         with limited(PATIENCE):
             what()
@@ -66,12 +67,12 @@ def attempt(what: Callable[[], object]) -> Failure | bool:
         text = str(error)
         if "\n" in text or len(text) > LONGEST_SENTENCE:
             return Failure(f"sentence of {type(error).__name__}: {error.args}"[:200], text)
-        return False
+        accepted = False
     except (Exception, Hang) as error:
         return failure(error)
     if process_time() - began > LONGEST:
         return Failure("slow", f"{process_time() - began:.1f} s")
-    return True
+    return accepted
 
 
 def failure(error: BaseException) -> Failure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from pathlib import Path
 
@@ -165,10 +166,15 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"selectors": "relm"}, "weight: found 'relm', accepted: a number, a selector, learned, reml"),
         ({"selectors": [True]}, "selectors: found True"),
         ({"selectors": -1.0}, "selectors: found '-1.0'"),
+        ({"selectors": 10**400}, "selectors: found 10000.*, accepted: a finite number"),
+        ({"noise": 10**400}, "noise: found 10000.*, accepted: factors of 1 or more"),
+        ({"seeds": 10**400}, "seeds: found 10000.*, accepted: at most 100000 draws"),
         ({"methods": "newton"}, "methods: found 'newton', accepted: a function of the problem, nominal"),
         ({"metrics": "rms"}, r"metrics: found 'rms', accepted: a function of a fit, rms_mm"),
         ({"splits": 1}, "splits: found 1, accepted: 'folder', a part"),
         ({"splits": "half"}, "splits: found 'half'"),
+        ({"splits": math.inf}, "splits: found inf"),
+        ({"splits": [5, 1e308]}, r"splits: found 1e\+308, .* 2 to 10000"),
         ({"noise": 0.5}, "noise: found 0.5, accepted: factors of 1 or more"),
         ({"counts": 0}, "counts: found 0, accepted: whole numbers, 1 or more"),
         ({"seeds": []}, r"seeds: found \[\], accepted: whole numbers"),
