@@ -15,7 +15,7 @@ from rpim_opt.basics.writing import write_bytes
 from rpim_opt.robot.chain import Chain, Described, corrected, describe, require_same_arm
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.original import origin_numbers, spliced
+from rpim_opt.robot.original import origin_numbers, reach, spliced
 from rpim_opt.robot.ur_numbers import JOINTS, REVOLUTE, finite
 
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -99,9 +99,10 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     origins, _ = corrected(G, robot.mdh, base, tool)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0", path)
+    size = reach(robot.mdh, base, tool)
     edits = {}
     for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
-        texts = origin_numbers(T, old)
+        texts = origin_numbers(T, old, size)
         numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
         edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
     write_bytes(Path(target), spliced(data, edits))

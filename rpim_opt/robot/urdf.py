@@ -17,7 +17,7 @@ from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.original import spliced
+from rpim_opt.robot.original import ROUNDING, reach, spliced
 from rpim_opt.robot.urdf_masses import carried_masses, on_frames
 from rpim_opt.robot.urdf_tree import Joint, Urdf, read_tree
 
@@ -120,23 +120,24 @@ def write_urdf(
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
     origins, tail = corrected(G, robot.mdh, T_base, T_tool)
+    size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
     before = np.eye(4)
     place = 0
     for joint in every:
         if joint.kind:  # the fixed joints before it stay, this one takes the whole correction
-            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ origins[place])
+            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ origins[place], size)
             before = np.eye(4)
             place = place + 1
         else:
             before = before @ joint.origin
-    if np.abs(tail - chain.tail).max() > 1e-13:
+    if np.abs(tail - chain.tail).max() > 10 * ROUNDING * size:
         if every[-1].kind:
             what = f"a tool or beta{len(joints)} that moves the tip '{every[-1].child}'"
             accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it, or no tool"
             raise InputError("robot", what, accepted, urdf.path)
         rest = np.linalg.inv(before @ np.linalg.inv(every[-1].origin))
-        edits |= every[-1].origin_edits(urdf.data, rest @ tail)
+        edits |= every[-1].origin_edits(urdf.data, rest @ tail, size)
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 

@@ -123,9 +123,12 @@ class Joint:
         unlimited = far or lower == upper or self.element.attributes.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
-    def origin_edits(self, data: bytes, T: Array) -> dict[tuple[int, int], str]:
-        """Return what to replace in the file so that the origin becomes T, by first and last byte."""
-        texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin), strict=True)
+    def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
+        """Return what to replace in the file so that the origin becomes T, by first and last byte.
+
+        ``size`` is the arm's `reach` [m].
+        """
+        texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin, size), strict=True)
         new = {name: text for name, text in texts if text is not None}
         if not new:
             return {}
