@@ -236,6 +236,9 @@ def read_table(result: Calibration, source: Any, measurement: str | None, units:
     given = parse_units(units)
     try:
         columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
+        if left_out and not columns:
+            accepted = f"joints' values and {', '.join(kinds[name].columns)}"
+            raise InputError("the header", f"nothing that is known among {', '.join(left_out)}"[:200], accepted)
         board = board_of(result.problem.sample().data)
         if kinds[name].by_camera and board and not any(column.startswith("target_") for column in columns):
             columns = on_board(columns, board)

@@ -256,3 +256,11 @@ def test_one_of_several_robots_is_compensated_as_it_alone() -> None:
         alone = ro.calibrate(other, formulation, 1.0)
         found = ro.use.compensate(whole, q=q, robot="right")
         assert found.q == pytest.approx(ro.use.compensate(alone, q=q).q, abs=1e-4)
+
+
+def test_a_table_without_any_known_column_is_named_so(tmp_path: Path) -> None:
+    """Not as an empty one: it has a row."""
+    path = tmp_path / "other.csv"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(ro.InputError, match="header: found nothing that is known among a, b"):
+        read_measurements(calibrated(), path)
