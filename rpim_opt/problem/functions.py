@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads, Stated
-from rpim_opt.robot.kinematics import FRAME, chain, frame
+from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, tool_prefix
 from rpim_opt.robot.posture import SYMBOLS, Symbol
 from rpim_opt.robot.terms import Term
@@ -144,16 +144,16 @@ class _Parameters(NamedTuple):
             return ca.SX(0)
         return self.start[name] + self.deviation[name]
 
-    def place(self, prefix: str) -> ca.SX:
-        """Return the frame whose six parameters begin with a prefix."""
+    def place(self, prefix: str) -> list[ca.SX]:
+        """Return the factors of the frame whose six parameters begin with a prefix."""
         names = [prefix + component for component in FRAME]
-        return frame([self.start[name] for name in names], [self.deviation[name] for name in names])
+        return placed([self.start[name] for name in names], [self.deviation[name] for name in names])
 
-    def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> ca.SX:
-        """Return one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
+    def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> list[ca.SX]:
+        """Return the factors of one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
         start = [ca.dot(chosen, ca.vertcat(*(self.start.get(p + c, 0) for p in prefixes))) for c in FRAME]
         moved = [ca.dot(chosen, ca.vertcat(*(self.deviation.get(p + c, 0) for p in prefixes))) for c in FRAME]
-        return frame(start, moved)
+        return placed(start, moved)
 
 
 def _expressions(of: Structure, measurement: Measurement) -> Row:
@@ -179,26 +179,27 @@ def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated:
     found = []
     for point, marker in enumerate(of.markers):
         posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
-        flange = _grown(chain(of.joint_types, posture, p.value, of.terms), p, posture.columns.get("temperature"))
-        if of.sessions:
-            flange = p.chosen(of.sessions, session) @ flange
+        factors = []
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
-            flange = p.place("base_") @ flange
-        found.append(flange @ p.place(tool_prefix(marker)))
+            factors += p.place("base_")
+        if of.sessions:
+            factors += p.chosen(of.sessions, session)
+        factors += _grown(chain(of.joint_types, posture, p.value, of.terms), p, posture.columns.get("temperature"))
+        found.append(product([*factors, *p.place(tool_prefix(marker))]))
     return found
 
 
-def _grown(flange: ca.SX, p: _Parameters, temperature: Symbol | None) -> ca.SX:
-    """Return where the flange (4, 4) is when all lengths have grown with temperature: as far again from the base."""
+def _grown(flange: list[ca.SX], p: _Parameters, temperature: Symbol | None) -> list[ca.SX]:
+    """Return the flange's factors when all lengths have grown with temperature: it is as far again from the base."""
     if temperature is None:
         return flange
-    growth = 1 + p.value(EXPANSION) * (temperature - p.value(REFERENCE))
-    return ca.vertcat(ca.horzcat(flange[:3, :3], growth * flange[:3, 3]), flange[3, :])
+    growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
+    return [translation(*ca.vertsplit(growth * product(flange)[:3, 3])), *flange]
 
 
 def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> dict[str, Symbol]:
     """Return the frames, parameters and columns that a measurement's model takes by name."""
-    own = {name: p.place(of_fixture(name + "_", of.fixture)) for name in measurement.frames}
+    own = {name: product(p.place(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
     in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
     for name in measurement.parameters:
         if not name.startswith(in_frames):

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.models import Measurement
 from rpim_opt.problem.loads import Loads
 from rpim_opt.robot.joint_terms import motion
-from rpim_opt.robot.kinematics import FRAME, call_rows, chain, frame, transforms
+from rpim_opt.robot.kinematics import FRAME, call_rows, chain, placed, product, transforms
 from rpim_opt.robot.mdh import Robot
 
 
@@ -50,8 +50,8 @@ class Arm:
         posture = loads.posture(robot.joint_types, stated.__getitem__, command)
         terms = robot.model.terms
         after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
-        flange = ca.DM(before) @ chain(robot.joint_types, posture, value, terms)
-        T = flange @ frame([value(prefix + c) for c in FRAME])
+        flange = chain(robot.joint_types, posture, value, terms)
+        T = product([ca.DM(before), *flange, *placed([value(prefix + c) for c in FRAME])])
         joints = list(enumerate(robot.joint_types, start=1))
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
         moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))
