@@ -51,7 +51,7 @@ class Arm:
         terms = robot.model.terms
         after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
         flange = chain(robot.joint_types, posture, value, terms)
-        T = product([ca.DM(before), *flange, *placed([value(prefix + c) for c in FRAME])])
+        T = product([ca.SX(ca.DM(before)), *flange, *placed([value(prefix + c) for c in FRAME])])
         joints = list(enumerate(robot.joint_types, start=1))
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
         moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))

@@ -82,6 +82,15 @@ def test_jacobian_equals_central_differences(seed: int) -> None:
         assert np.abs(column - difference).max() < 2e-9
 
 
+def test_a_jacobian_takes_few_operations() -> None:
+    """Twelve an entry, where products from the left need thirty: what every evaluation of a table costs."""
+    problem = simulated(ALL)[0]
+    block = problem.data.blocks[0]
+    jacobian = problem._functions(block)["jacobian"]
+    entries = 3 * len(problem.parameters.free)
+    assert jacobian.n_instructions() <= 16 * entries
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=3, max_size=3))
 def test_roll_pitch_yaw_gives_back_the_rotation(angles: list[float]) -> None:
