@@ -94,9 +94,10 @@ def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
         size = np.sqrt(np.bincount(rows, relative**2) / np.bincount(rows))
         before = weight
         weight = np.minimum(1.0, TRUSTED / np.maximum(size, 1e-12))
-        root = np.sqrt(weight)[rows] / unit
-        A = np.vstack([X * root[:, None], np.eye(len(z))])
-        z = np.linalg.lstsq(A, np.concatenate([y * root, np.zeros(len(z))]), rcond=None)[0]
+        weighed = X * (weight[rows] / unit**2)[:, None]
+        H = weighed.T @ X + np.eye(len(z))
+        d = 1 / np.sqrt(H.diagonal())
+        z = d * np.linalg.solve(H * np.outer(d, d), d * (weighed.T @ y))
         if np.abs(weight - before).max() <= SAME:
             break
     return scale * z

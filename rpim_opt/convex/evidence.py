@@ -35,6 +35,9 @@ BASIN = 0.3
 """Logarithms of sizes within which of an optimum that is known no other is looked for."""
 FARTHEST_STEP = 1.0
 """Of the logarithms, that such a step may go."""
+WIDEST = 1e8
+"""Local variances stay below, and below so many squares of a size that is above 1: nobody's deviation is ten thousand
+scales, and beyond what rounding leaves of directions that nothing decides is all there is."""
 RIDGE = 1e-13
 """Added to the scaled information: rounding in directions that nothing decides."""
 
@@ -283,9 +286,11 @@ class Evidence:
         """
         tails = self.believed.tails
         before = np.inf
+        widest = WIDEST * np.maximum(size2, 1.0)
         for _ in range(MOST_ROUNDS):
+            v = np.minimum(v, widest)
             z, C, _ = _posterior(S, g, 1 / v)
-            weighed = tails * size2 + z**2 + C.diagonal()
+            weighed = np.minimum(tails * size2 + z**2 + C.diagonal(), (tails + 1) * widest)
             change = np.log(weighed / ((tails + 1) * v))
             largest = np.abs(change).max()
             if largest <= settled:
@@ -295,7 +300,7 @@ class Evidence:
                 step = _step(change, C * (C + 2 * np.outer(z, z)), weighed, v)
             v = v * np.exp(step)
             before = min(before, largest)
-        return v
+        return np.minimum(v, widest)
 
     def _tails(self, e2: Array, size2: Array, v: Array) -> float:
         """Return what heavy tails add to -2 ln L."""

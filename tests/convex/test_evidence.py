@@ -18,6 +18,7 @@ from rpim_opt.convex.evidence import (
     FAMILY_SD,
     GEOMETRY_SD,
     NOISE_SD,
+
     Believed,
     Evidence,
     Linearized,
@@ -156,6 +157,19 @@ def test_local_variances_settle_where_steps_each_for_itself_run_in_circles(
     e2 = point.z**2 + np.diag(point.C)
     size2 = np.exp(2 * point.logs[0])
     np.testing.assert_allclose(point.v[heavy], (3 * size2 + e2[heavy]) / 4, rtol=1e-7)
+
+
+def test_a_blunder_does_not_widen_local_variances_beyond_what_rounding_leaves() -> None:
+    """Of two directions that nothing tells apart, 1 / v is all that is known: it must not vanish beside rounding."""
+    data = linearized(1, 10, 4)
+    X = data.X.copy()
+    X[:, 1] = X[:, 0]
+    y = X @ np.array([1e7, 0.0, 1.0, -1.0])  # tails take such a deviation for 5e6 of its scales
+    evidence = Evidence(replace(data, X=X, y=y), believed([0] * 4, [True] * 4, ("size",)), ())
+    point = evidence.at(evidence.centre)
+    assert point.v.max() <= 1e8
+    assert np.isfinite(point.gradient).all()
+    assert (X @ point.z)[:5] == pytest.approx(y[:5], rel=1e-3)
 
 
 def test_statements_are_measurements_without_scatter() -> None:
