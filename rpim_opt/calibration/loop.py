@@ -338,9 +338,11 @@ def run(
     return Ended(state, evidence, loop.source.parameters.free.scale * state.z, converged, message)
 
 
-def nearby(problem: Source, formulation: Formulation, weight: float, start: Array, tolerance: float) -> Array:
-    """Return deviations (n,) [SI] near to a minimum, on the way to another: nothing certifies them."""
-    loop, state = _rested(problem, formulation, weight, start, tolerance=tolerance)
+def nearby(
+    problem: Source, formulation: Formulation, weight: float, start: Array, tolerance: float, steps: int
+) -> Array:
+    """Return deviations (n,) [SI] near to a minimum, or on the way to it after some steps: nothing certifies them."""
+    loop, state = _rested(problem, formulation, weight, start, steps, tolerance)
     return loop.source.parameters.free.scale * state.z
 
 

@@ -25,8 +25,8 @@ SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Sizes are found when their logarithms change by no more, and deviations by no more of their scales (RMS)."""
 CLOSE = 0.1
 """Scales (RMS) up to which the mean at one linearization stands for a fit."""
-NEAR = 1e-3
-"""Tolerance of the fits in between: the last one is exact."""
+NEAR, STEPS = 1e-3, 6
+"""Tolerance and steps of the fits in between: sizes are others where they lead, and the last fit is exact."""
 DISTINCT = 0.3
 """Logarithms of sizes by which two optima differ."""
 
@@ -169,7 +169,7 @@ class Learning:
         mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
         if _moved(mean, x, laid) > CLOSE:  # too far for one linearization
             penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-            mean = nearby(laid, penalized, 1.0, x, NEAR)
+            mean = nearby(laid, penalized, 1.0, x, NEAR, STEPS)
         return Fit(problem, evidence, point, others, laid, mean)
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:

@@ -383,7 +383,8 @@ class Evidence:
         noisy = np.arange(len(self.centre)) >= sizes
         geometry = np.zeros(len(self.centre))
         geometry[self.believed.geometry] = 2.0
-        return [self.centre, self.centre + 3.0 * noisy, self.centre + geometry]
+        away = [3.0 * noisy, geometry]
+        return [self.centre, *(self.centre + step for step in away if step.any())]
 
 
 _potrf: Any = get_lapack_funcs("potrf", dtype=float)

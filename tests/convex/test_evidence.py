@@ -18,7 +18,6 @@ from rpim_opt.convex.evidence import (
     FAMILY_SD,
     GEOMETRY_SD,
     NOISE_SD,
-
     Believed,
     Evidence,
     Linearized,
