@@ -32,11 +32,13 @@ class NoiseTest(NamedTuple):
 class Scattered:
     """What adds to the covariance of a row's model, block by block (N, k, k) [SI]: the robot's part, and a reading's.
 
-    ``reading`` is the robot's and the instrument's together.
+    ``reading`` is the robot's and the instrument's together, and ``session`` what of it a session adds that the problem
+    does not know.
     """
 
     robot: list[Array]
     reading: list[Array]
+    session: list[Array]
 
 
 def checked(of: str) -> Interval:
@@ -72,7 +74,8 @@ def scattered(problem: CalibrationProblem, level: float) -> Scattered:
     if problem.scatter is not None:
         robot = problem.covariances(reading=False)
         reading = problem.covariances()
-    return Scattered(robot, [V + more for V, more in zip(reading, unknown_sessions(problem), strict=True)])
+    session = unknown_sessions(problem)
+    return Scattered(robot, [V + more for V, more in zip(reading, session, strict=True)], session)
 
 
 def position_noise(source: Source) -> Array:
@@ -87,6 +90,32 @@ def position_noise(source: Source) -> Array:
 def coverage_factor(freedom: float, confidence: float) -> float:
     """Return the quantile k of Student's t at (1 + confidence) / 2, with at least one degree of freedom."""
     return float(stdtrit(max(freedom, 1.0), (1 + confidence) / 2))
+
+
+def coverage_factors(freedom: Array, confidence: float) -> Array:
+    """Return the same for degrees of freedom (N,)."""
+    return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + confidence) / 2), dtype=float)
+
+
+def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> Array:
+    """Return the degrees of freedom (N,) of rows' variances, at least one; less where a few sessions told a part.
+
+    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite).
+
+    Parameters
+    ----------
+    freedom
+        Of what no session adds.
+    spread
+        Standard deviation of the logarithm of the sessions' size.
+    whole, session
+        (N, k, k) covariances of a row, and what of them an unknown session adds, (N, k, k) or (1, 1, 1) zeros.
+    """
+    freedom = max(freedom, 1.0)
+    V = np.einsum("nkk->n", whole)
+    part = np.broadcast_to(np.einsum("nkk->n", session), V.shape)
+    variance = 2 * (V - part) ** 2 / freedom + (2 * spread * part) ** 2
+    return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), freedom), 1.0)
 
 
 def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTest:

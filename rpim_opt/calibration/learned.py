@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.shown import Brief
+from rpim_opt.convex.prior import SESSIONS
 
 
 class Size(NamedTuple):
@@ -106,3 +107,10 @@ class Learned(Brief):
         ratio = np.abs(z) * self.local
         order = np.argsort(-ratio)
         return [(names[i], float(ratio[i])) for i in order if ratio[i] > least]
+
+
+def sessions_spread(learned: Learned | None) -> float:
+    """Return the standard deviation of the logarithm of how far sessions lie apart; zero where no size was learned."""
+    if learned is None:
+        return 0.0
+    return max((learned.sizes[name].spread for name in SESSIONS.values() if name in learned.sizes), default=0.0)

@@ -6,7 +6,7 @@ import numpy as np
 
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.learned import Learned, Size
-from rpim_opt.convex.prior import SESSIONS
+from rpim_opt.convex.prior import BASE, SESSIONS
 from rpim_opt.robot.family import EXPECTED
 from rpim_opt.robot.overlay import is_joint_offset
 from rpim_opt.robot.parameter_names import EXPANSION, of_session, own_name
@@ -64,7 +64,7 @@ def _sizes(learned: Learned) -> str:
     said = []
     much = "{} deviate {} times as much as expected ({})"
     for name, size in learned.sizes.items():
-        if name in (*SESSIONS.values(), EXPANSION):
+        if name in (*SESSIONS.values(), BASE, EXPANSION):
             continue
         if name in FAMILIES:
             figure = f"{1e3 * EXPECTED * size.value:.2g} mrad ({_range(size, 1e3 * EXPECTED)})"

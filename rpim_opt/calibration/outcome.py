@@ -17,8 +17,17 @@ from rpim_opt.calibration.accused import contradicted
 from rpim_opt.calibration.blunders import coherent
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
-from rpim_opt.calibration.intervals import UNLIKELY, Interval, NoiseTest, checked, noise_test, position_noise, scattered
-from rpim_opt.calibration.learned import Learned
+from rpim_opt.calibration.intervals import (
+    UNLIKELY,
+    Interval,
+    NoiseTest,
+    checked,
+    noise_test,
+    position_noise,
+    row_freedom,
+    scattered,
+)
+from rpim_opt.calibration.learned import Learned, sessions_spread
 from rpim_opt.calibration.prices import Price, prices
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
 from rpim_opt.calibration.spread import Spread
@@ -76,7 +85,9 @@ class Iteration:
 class Prediction(NamedTuple):
     """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals.
 
-    ``outside`` says which rows are beyond the joint ranges that were measured; there an interval may be too narrow.
+    The factor is (N, 1) where rows have degrees of ``freedom`` (N,) of their own: readings of a session that is not
+    known, where a few sessions told how far they lie apart. ``outside`` says which rows are beyond the joint ranges
+    that were measured; there an interval may be too narrow.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -88,12 +99,14 @@ class Prediction(NamedTuple):
 
     position: Array
     covariance: Array
-    coverage_factor: float = 1.0
+    coverage_factor: float | Array = 1.0
     outside: Outside = Outside()
+    freedom: float | Array = np.inf
 
     def __repr__(self) -> str:
         """Return one line."""
-        return f"<Prediction of {len(self.position)} positions, coverage factor {self.coverage_factor:.3g}>"
+        largest = float(np.max(self.coverage_factor, initial=0.0))
+        return f"<Prediction of {len(self.position)} positions, coverage factor {largest:.3g}>"
 
     @property
     def standard(self) -> Array:
@@ -279,9 +292,12 @@ class Outcome:
         added = scattered(problem, self.noise_level)
         if of == "reached":
             covariance = covariance + added.robot[0]
+        freedom: float | Array = self.freedom
         if of == "reading":
             covariance = covariance + added.reading[0]
-        return Prediction(problem.modelled(self.x)[0], covariance, outside=self.outside(problem.data))
+            if added.session[0].any():
+                freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, added.session[0])
+        return Prediction(problem.modelled(self.x)[0], covariance, 1.0, self.outside(problem.data), freedom)
 
     def outside(self, data: Dataset) -> Outside:
         """Return which rows are beyond the measured joint ranges, where no measurement checked the model.

@@ -13,7 +13,7 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.calibration.loop import nearby, require_finite
 from rpim_opt.convex.evidence import Believed, Evidence, Linearized, Point, alike
 from rpim_opt.convex.formulation import tikhonov
-from rpim_opt.convex.prior import Prior
+from rpim_opt.convex.prior import BASE, Prior
 from rpim_opt.convex.stated import Stated
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter
@@ -110,11 +110,12 @@ class Learning:
         stacks = problem.stacks(joints="joint" in self.noise, at=_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
         heavy = np.isin(np.arange(len(stated.names)), stated.group[stated.heavy])
+        base = np.array([name == BASE for name in stated.names], dtype=bool)
         believed = Believed(
             group=stated.group,
             heavy=stated.heavy,
             names=stated.names,
-            covariance=alike(heavy),
+            covariance=alike(heavy, base),
             tails=self.prior.tails,
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,

@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Tabled
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor
+from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor, coverage_factors
 from rpim_opt.calibration.result import Calibration, Prediction
 
 
@@ -165,6 +165,8 @@ class Uncertainty(Tabled):
     ) -> Prediction:
         """Return what `Calibration.predict` does, with the confidence's coverage factor.
 
+        It is larger for readings of a session that is not known, where few sessions told how far they lie apart.
+
         Parameters
         ----------
         q
@@ -184,7 +186,10 @@ class Uncertainty(Tabled):
         array([[2.63, 2.63, 2.63]])
         """
         found = self.result.predict(q, marker, torque, payload, of, columns, robot)
-        return found._replace(coverage_factor=self.coverage_factor)
+        factor: float | Array = self.coverage_factor
+        if isinstance(found.freedom, np.ndarray):
+            factor = coverage_factors(found.freedom, self.confidence)[:, None]
+        return found._replace(coverage_factor=factor)
 
     def budget(self) -> str:
         """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty).

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.intervals import scattered
+from rpim_opt.calibration.intervals import coverage_factors, row_freedom, scattered
+from rpim_opt.calibration.learned import sessions_spread
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
-from rpim_opt.convex.prior import SESSIONS
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.sessions import unknown_sessions
 
 RARE = 0.01
 """Probability that data like those of the calibration have any row that is named."""
@@ -52,43 +51,27 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
     start = 0
-    readings = scattered(problem, result.noise_level).reading
-    for block, reading, session in zip(data.blocks, readings, unknown_sessions(problem), strict=True):
+    added = scattered(problem, result.noise_level)
+    for block, reading, session in zip(data.blocks, added.reading, added.session, strict=True):
         k = len(block.measurement.components)
         end = start + k * len(block.row)
         r = residual[start:end].reshape(-1, k)
         A = J[start:end].reshape(-1, k, len(C))
         start = end
         S = A @ C @ A.transpose(0, 2, 1) + reading
-        freedom = _freedom(result, S, session)
+        freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
         sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
         allowed[block.row] = np.where(seen, _limit(k, freedom, N), np.nan)
         lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
-        factor = np.asarray(stdtrit(freedom, (1 + CONFIDENCE) / 2))[:, None]
+        factor = coverage_factors(freedom, CONFIDENCE)[:, None]
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
         inside.append(within[seen][:, lengths].ravel())
     covered = np.concatenate(inside)
     if not len(covered):
         return Judged(sigmas, allowed, None)
     return Judged(sigmas, allowed, float(covered.mean()))
-
-
-def _freedom(result: Calibration, whole: Array, session: Array) -> Array:
-    """Return the degrees of freedom (N,) of rows' variances, at least one; less where a few sessions told a part.
-
-    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), where a size's logarithm has a spread.
-    """
-    freedom = max(result.freedom, 1.0)
-    V = np.einsum("nkk->n", whole)
-    part = np.broadcast_to(np.einsum("nkk->n", session), V.shape)
-    spread = 0.0
-    if result.learned is not None:
-        sizes = result.learned.sizes
-        spread = max((sizes[name].spread for name in SESSIONS.values() if name in sizes), default=0.0)
-    variance = 2 * (V - part) ** 2 / freedom + (2 * spread * part) ** 2
-    return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), freedom), 1.0)
 
 
 def _limit(k: int, freedom: Array, rows: int) -> Array:

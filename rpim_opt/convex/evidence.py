@@ -19,6 +19,8 @@ CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1
 """Median of what a robot's scatter is believed to be before the data [m, rad, rad], and of the instrument's factor."""
 NOISE_SD, GEOMETRY_SD, FAMILY_SD = 2.0, 3.0, 2.0
 """Standard deviations of the natural logarithms of sizes, before the data."""
+BASE_SD = 1.0
+"""The same of the base: wider, eight configurations take it for nearer than it is."""
 APART = 1.0
 """That of the ratio of two sizes of the geometry: lengths, angles and joint offsets are made by different means, but
 few data do not tell each size alone."""
@@ -49,7 +51,7 @@ class Believed:
     Parameters
     ----------
     group
-        (p,) which size multiplies a deviation's scale; -1 for frames, which have none.
+        (p,) which size multiplies a deviation's scale; -1 for those that have none.
     heavy
         (p,) which deviations have Student's tails; the others are normal.
     names
@@ -79,10 +81,16 @@ class Believed:
         return np.unique(self.group[self.heavy])
 
 
-def alike(geometry: np.ndarray) -> Array:
-    """Return the covariance (s, s) of logarithms of sizes before the data; geometry (s,) says which are alike."""
+def alike(geometry: np.ndarray, base: np.ndarray) -> Array:
+    """Return the covariance (s, s) of logarithms of sizes before the data.
+
+    Parameters
+    ----------
+    geometry, base
+        (s,) which sizes are of the geometry, whose are alike, and which of the base.
+    """
     among = np.ix_(geometry, geometry)
-    covariance = np.diag(np.where(geometry, GEOMETRY_SD, FAMILY_SD) ** 2)
+    covariance = np.diag(np.select([geometry, base], [GEOMETRY_SD, BASE_SD], FAMILY_SD) ** 2)
     own = APART**2 / 2
     covariance[among] = GEOMETRY_SD**2 - own + own * np.eye(int(geometry.sum()))
     return covariance
@@ -151,7 +159,7 @@ class Evidence:
 
         y = X z + e
         z_j ~ t_nu(0, size_g)     heavy ones: normal with own variance v_j = (nu size^2 + z_j^2 + C_jj) / (nu + 1)
-        z_j ~ N(0, size_g^2)      other groups;    N(0, 1) frames
+        z_j ~ N(0, size_g^2)      other groups;    N(0, 1) what has none
         e_c ~ N(0, R_c)           `Scatter`
         C = (X'R^-1 X + diag(1/v))^-1,    z = C X'R^-1 y
         -2 ln L = |y - X z|^2_R + z'z/v + ln|R| - ln|C| + sum ln v

@@ -27,6 +27,11 @@ OFFSETS = "joint offsets"
 """The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
 SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}
 """Groups of what the readings of a session have in common."""
+BASE = "base"
+"""The group of the base, which is expected where the drawing's robot puts it: as far from there as its deviations lead.
+
+Tools and other places are stated by hand, or nobody measured them: they have no size.
+"""
 _FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
@@ -38,7 +43,7 @@ class Prior:
     By default deviations are about as large as the scales of the parameters say, some of them much larger (Student's
     t), joint offsets three times as large, because they are set at assembly, and frames may be anywhere within ten of
     their scales. How large a group of them is altogether, the data may tell: lengths, angles and joint offsets have a
-    size each, which are believed alike. `stated` says it of a problem in numbers.
+    size each, which are believed alike, and the base has one. `stated` says it of a problem in numbers.
 
     Parameters
     ----------
@@ -47,7 +52,7 @@ class Prior:
         ``{"theta5_mrad": 4.0}``. Zero where nothing is said.
     scale
         How far they lie from it, keys as for ``centre``: ``{"theta?_mrad": 10.0, "tool_mm": 2.0}``. What stands here
-        is taken at its word: neither ``joint_offset`` nor ``frames`` multiplies it.
+        is taken at its word: neither ``joint_offset`` nor ``frames`` multiplies it, nor the size of the base.
     tails
         Degrees of freedom of the Student's t of the robot's own geometry; infinity: a normal distribution.
     groups
@@ -57,7 +62,8 @@ class Prior:
     joint_offset
         By how much the scale of a joint's theta is multiplied.
     frames
-        By how much the scales of frames (base, reflectors, anchors) are multiplied.
+        By how much the scales of frames (base, reflectors, anchors) are multiplied. Of the base
+        that is what is expected before the data.
     statements
         What is known of linear combinations: `known`, `gaussian`, `from_result`.
     doubted
@@ -75,7 +81,7 @@ class Prior:
     >>> prior = Prior(scale={"theta?_mrad": 10.0}) & Prior.known("a2 + a3 +- 0.05 mm")
     >>> stated = prior.stated(ro.load("position").problem.parameters)
     >>> float(stated.scale.max()), len(stated.values), stated.names  # frames, statements, groups
-    (10.0, 1, ('angles', 'lengths', 'joint offsets'))
+    (10.0, 1, ('angles', 'lengths', 'joint offsets', 'base'))
     """
 
     centre: Mapping[str, float] = field(default_factory=dict)
@@ -358,12 +364,22 @@ class Prior:
                     raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
         free = parameters.free
         keys = [self._group_of(name, dimension) for name, dimension in zip(free.names, free.dimensions, strict=True)]
-        names = tuple(dict.fromkeys(k for k, frame in zip(keys, free.placed, strict=True) if not frame))
+        fixed = self._fixed(parameters)
+        names = tuple(dict.fromkeys(k for k, alone in zip(keys, fixed, strict=True) if not alone))
         number = {name: i for i, name in enumerate(names)}
-        found = [FIXED if frame else number[key] for key, frame in zip(keys, free.placed, strict=True)]
+        found = [FIXED if alone else number[key] for key, alone in zip(keys, fixed, strict=True)]
         return np.array(found, dtype=int), names
 
+    def _fixed(self, parameters: Parameters) -> np.ndarray:
+        """Return which identified parameters have a width that is no part of any size: tools, and what is stated."""
+        table = Overlay(parameters.names, parameters.dimensions, parameters.groups)
+        stated = np.isfinite(table.on(np.full(len(parameters), np.nan), self.scale, "prior, table scale"))
+        of_base = np.array([_of_base(name) for name in parameters.names])
+        return (parameters.placed & (stated | ~of_base))[parameters.identified]
+
     def _group_of(self, name: str, dimension: str) -> str:
+        if _of_base(name):
+            return BASE
         for group in self.groups:
             if any(fits(name, pattern) for pattern in group):
                 return " ".join(group)
@@ -388,6 +404,10 @@ def family_of(name: str) -> str:
     if found is None:
         return own_name(name)
     return found[1]
+
+
+def _of_base(name: str) -> bool:
+    return own_name(name).startswith(f"{BASE}_")
 
 
 def _patterns(group: str | Iterable[str]) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from rpim_opt.robot.overlay import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
 FIXED = -1
-"""The group of a parameter whose width is no part of any size: of a frame."""
+"""The group of a parameter whose width is no part of any size: of what is placed, but for the base."""
 
 JOINT_OFFSET, FRAMES = 3.0, 10.0
 """By how much the scales of joint offsets, which are set at assembly, and of frames are multiplied."""
@@ -33,7 +33,7 @@ class Stated:
 
         z_j ~ centre_j + tau_g scale_j t_nu     (heavy)        z_j ~ N(centre_j, (tau_g scale_j)^2)     (others)
 
-    (tau is 1 for frames), and together rows z - values ~ N(0, I).
+    (tau is 1 where there is no group), and together rows z - values ~ N(0, I).
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Stated:
     replaced
         (n,) for which parameters a statement stands in the place of their own width.
     group
-        (n,) the number of the group whose size a parameter has; -1 where there is none, for frames.
+        (n,) the number of the group whose size a parameter has; -1 where there is none.
     heavy
         (n,) whose tails are Student's.
     names
@@ -62,12 +62,12 @@ class Stated:
     >>> parameters = ro.load("position").problem.parameters
     >>> stated = ro.convex.Prior.known("a2 + a3 +- 0.05 mm").stated(parameters)  # scales of 0.5 mm
     >>> stated.names, stated.rows.shape, stated.rows[stated.rows != 0]
-    (('angles', 'lengths', 'joint offsets'), (1, 34), array([10., 10.]))
+    (('angles', 'lengths', 'joint offsets', 'base'), (1, 34), array([10., 10.]))
     >>> for name, width, group in list(zip(stated.parameters.names, stated.scale, stated.group))[-11:-8]:
     ...     print(name, width, group)
     theta6 3.0 2
     d6 1.0 1
-    base_x 10.0 -1
+    base_x 10.0 3
     """
 
     parameters: Parameters

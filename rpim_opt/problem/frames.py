@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +40,7 @@ def starting_parameters(
     tools: Mapping[str, Place] | None = None,
     own: Mapping[str, float] | None = None,
     temperature: float | None = None,
+    sessions: Sequence[str] = (),
 ) -> Parameters:
     """Return the model's parameters with closed-form values for what is not stated; none identified yet.
 
@@ -56,6 +57,8 @@ def starting_parameters(
         parameters is stated is located from the nominal robot.
     temperature
         At which lengths are as on the drawing [K], where the data state temperatures; their mean by default.
+    sessions
+        Names of sessions that are not among the data, where these are the first of several parts.
 
     Raises
     ------
@@ -86,7 +89,8 @@ def starting_parameters(
         for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
     reference = _reference(data, temperature)
-    return model_parameters(robot, base, tools, entries, own_frames(data), data.sessions, reference)
+    named = sorted({*data.sessions, *sessions})
+    return model_parameters(robot, base, tools, entries, own_frames(data), named, reference)
 
 
 def _reference(data: Dataset, stated: float | None) -> float | None:

@@ -23,6 +23,7 @@ from rpim_opt.problem.source import Source
 from rpim_opt.problem.triangles import joined, reduced
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.open_model import Model
+from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
 from rpim_opt.robot.parameters import Parameters
 
 KEPT = 200_000
@@ -55,7 +56,8 @@ class PartitionedProblem:
     Raises
     ------
     InputError
-        For no parts, as `CalibrationProblem`, and for `data` of all the parts, which do not stand anywhere.
+        For no parts, as `CalibrationProblem`, and for `data` of all the parts, which do not stand anywhere; when a part
+        is read whose sessions the parameters do not have, where they have others (`starting_parameters`).
 
     Examples
     --------
@@ -193,6 +195,7 @@ class PartitionedProblem:
         configurations = 0
         for number, part in enumerate(self.parts, start=1):
             data = _read(self._dropped, (number, part))
+            _require_sessions(self.parameters, number, data)
             if len(data):
                 label = tuple(f"{number}:{name}" for name in data.label)
                 yield self.on(replace(data, label=label, configuration=data.configuration + configurations))
@@ -297,7 +300,17 @@ def _on_part(
     part: tuple[int, Part],
 ) -> Any:
     data = _read(dropped, part)
+    _require_sessions(known.parameters, part[0], data)
     return what(known.on(data)) if len(data) else None
+
+
+def _require_sessions(parameters: Parameters, number: int, data: Dataset) -> None:
+    """Raise for a session that the parameters lack while they have others: its rows would be taken for unshifted."""
+    known = {frame_of(name) for name in parameters.names if of_session(name)}
+    strange = [name for name in data.sessions if session_prefix(name) not in known]
+    if known and strange:
+        accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
+        raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
 
 
 def _read(dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:

@@ -113,14 +113,18 @@ def test_data_that_are_no_numbers_are_refused() -> None:
 
 def test_sizes_come_out_as_they_were_put_in() -> None:
     logs = []
+    base = []
     for seed in range(6):
         result = ro.calibrate(measured(POSITION, drawn(seed), seed, scatter=8e-5))
         learned = result.learned
         assert learned is not None
-        sizes = [size.value / 0.5 for size in learned.sizes.values()]
+        sizes = [learned.sizes[name].value / 0.5 for name in ("angles", "lengths", "joint offsets")]
         logs.append([*sizes, learned.noise["position"].value / 8e-5])
+        base.append(learned.sizes["base"].value)
     # t_3 tails around normal draws: its size comes out somewhat smaller; frames take up some of the lengths
     assert np.exp(np.mean(np.log(logs), axis=0)) == pytest.approx([0.8, 0.6, 0.8, 1.0], rel=0.2)
+    # drawn at a twentieth; six deviations pull it so far from one, which is expected
+    assert np.exp(np.mean(np.log(base))) == pytest.approx(1.3 / 20, rel=0.2)
 
 
 def test_scatter_of_joints_is_told_from_that_of_positions() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
+from rpim_opt.calibration.unseen import judged
+from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.sessions import unknown_sessions
 from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameter_names import of_session
@@ -223,8 +226,6 @@ def test_an_update_in_a_new_session_keeps_the_robot(arm: ro.study.SimulatedArm, 
 
 
 def test_folds_leave_whole_sessions_out(problem: ro.CalibrationProblem) -> None:
-    from functools import partial
-
     by_session = partial(ro.k_fold, parts=problem.data.by_session())
     result = ro.calibrate(with_sessions(problem), weight=by_session)
     assert result.weight > 0
@@ -281,3 +282,47 @@ def test_session_parameters_have_scales_of_their_own(problem: ro.CalibrationProb
     sizes = {round(float(s), 9) for n, s in zip(table.names, table.scale, strict=True) if of_session(n)}
     assert sizes == {5e-4, 2e-4}
     assert not (table.placed & np.array([of_session(name) for name in table.names])).any()
+
+
+# --- in parts ------------------------------------------------------------------------------------------------------
+
+
+def test_parts_know_the_sessions_of_all_parts_and_say_where_they_do_not(problem: ro.CalibrationProblem) -> None:
+    data = problem.data
+    parts = [partial(data.take, range(start, start + 20)) for start in (0, 20)]  # two days each
+    names = sorted({name for part in parts for name in part().sessions})
+    assert names == list(data.sessions)
+    start = partial(ro.problem.starting_parameters, problem.robot, parts[0](), BASE, {"": TOOL})
+    identified = problem.parameters.free.names
+    whole = start(sessions=names).scaled(SCALES).identify([*identified, "session_*"])
+    found = ro.calibrate(PartitionedProblem(problem.robot, whole, parts[0](), parts))
+    together = ro.calibrate(ro.CalibrationProblem(problem.robot, whole, data))
+    assert sum(of_session(name) for name in found.problem.parameters.free.names) == 6 * len(names)
+    assert found.x == pytest.approx(together.x, abs=1e-5)
+
+    first = start().scaled(SCALES).identify([*identified, "session_*"])
+    with pytest.raises(ro.InputError, match=r"session: found 'day 3' in part 2, accepted: sessions of the parameters"):
+        ro.calibrate(PartitionedProblem(problem.robot, first, parts[0](), parts))
+    with pytest.raises(ro.InputError, match=r"'day 3' in part 2"):  # weights of one's own do not learn from all rows
+        ro.calibrate(PartitionedProblem(problem.robot, first, parts[0](), parts), ro.tikhonov, 1.0)
+
+
+# --- readings of a session that is not known ------------------------------------------------------------------------
+
+
+def test_intervals_of_readings_are_wide_where_few_sessions_told_how_they_differ(automatic: ro.Calibration) -> None:
+    """The factor is the one that `validate` counts with; the robot's own positions have that of all equations."""
+    fresh = in_sessions(SEED, ["another day"] * 40)
+    data = fresh.data
+    uncertainty = ro.calibration.Uncertainty(automatic)
+    reading = uncertainty.predict(data.q, of="reading")
+    assert reading.coverage_factor.shape == (len(data), 1)
+    assert (reading.coverage_factor > uncertainty.coverage_factor + 0.05).all()
+    assert uncertainty.predict(data.q).coverage_factor == uncertainty.coverage_factor
+    assert uncertainty.predict(data.q, of="mean").coverage_factor == uncertainty.coverage_factor
+    y = data.blocks[0].y
+    for scale in (0.5, 1.0, 2.0):  # at all of which some are inside and some are not
+        moved = reading.position + scale * (y - reading.position)
+        away = fresh.on(replace(data, blocks=(replace(data.blocks[0], y=moved),))).data
+        inside = np.abs(moved - reading.position) <= reading.expanded
+        assert judged(automatic, away).coverage == pytest.approx(inside.mean(), abs=1e-12)

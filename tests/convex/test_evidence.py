@@ -14,6 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.sizing import Learning
 from rpim_opt.convex.evidence import (
     APART,
+    BASE_SD,
     CENTRES,
     FAMILY_SD,
     GEOMETRY_SD,
@@ -260,11 +261,12 @@ def test_a_way_into_an_optimum_that_is_known_is_not_climbed_to_its_end() -> None
 
 
 def test_sizes_of_the_geometry_are_alike_before_the_data() -> None:
-    covariance = alike(np.array([True, False, True]))
-    assert np.allclose(np.sqrt(np.diag(covariance)), [GEOMETRY_SD, FAMILY_SD, GEOMETRY_SD])
-    ratio = np.array([1.0, 0.0, -1.0])
+    covariance = alike(np.array([True, False, True, False]), np.array([False, False, False, True]))
+    assert np.allclose(np.sqrt(np.diag(covariance)), [GEOMETRY_SD, FAMILY_SD, GEOMETRY_SD, BASE_SD])
+    ratio = np.array([1.0, 0.0, -1.0, 0.0])
     assert np.sqrt(ratio @ covariance @ ratio) == pytest.approx(APART)
-    assert covariance[0, 1] == covariance[1, 2] == 0
+    assert not covariance[[0, 2]][:, [1, 3]].any()
+    assert covariance[1, 3] == 0
 
 
 def test_sizes_of_simulated_data_are_found() -> None:
@@ -320,7 +322,7 @@ def test_a_gibbs_sampler_agrees() -> None:
         L = np.linalg.cholesky(A.T @ A + np.diag(1 / v))
         mean = np.linalg.solve(L.T, np.linalg.solve(L, A.T @ b))
         z = mean + np.linalg.solve(L.T, rng.normal(size=len(v)))
-        v = np.where(stated.heavy, (3 * size**2 + z**2) / rng.chisquare(4, size=len(v)), 1.0)
+        v = np.where(stated.heavy, (3 * size**2 + z**2) / rng.chisquare(4, size=len(v)), size**2)
         if k >= 1000:
             draws.append(z)
     z = np.array(draws)

@@ -11,6 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex import Prior
 from rpim_opt.convex.combination import combination
+from rpim_opt.convex.stated import FIXED
 from rpim_opt.convex.structure import quadratic
 
 PROBLEM = ro.load("position").problem
@@ -133,7 +134,7 @@ def test_what_is_believed_where_nothing_is_said() -> None:
     by_name = dict(zip(parameters.free.names, zip(stated.scale, stated.group, stated.heavy, strict=True), strict=True))
     assert by_name["a2"] == (1.0, stated.names.index("lengths"), True)
     assert by_name["theta2"] == (3.0, stated.names.index("joint offsets"), True)
-    assert by_name["base_rx"] == (10.0, -1, False)
+    assert by_name["base_rx"] == (10.0, stated.names.index("base"), False)
     groups = {stated.names[by_name[name][1]] for name in ("ecc_cos3", "ecc_sin3")}
     assert groups == {"ecc"}
     assert not by_name["ecc_cos3"][2]
@@ -153,6 +154,16 @@ def test_a_stated_width_is_taken_at_its_word() -> None:
     stated = Prior(scale={"joint_offset_mrad": 8.0, "base_mm": 2.0, "theta2_mrad": 1.0}).stated(PROBLEM.parameters)
     wanted = np.array([8e-3, 1e-3, 2e-3])
     assert (stated.scale * FREE.scale)[at("theta1", "theta2", "base_x")] == pytest.approx(wanted, rel=1e-12)
+    assert stated.group[at("base_x", "base_rx", "tool_x")].tolist() == [FIXED, stated.names.index("base"), FIXED]
+
+
+def test_places_that_nobody_measured_have_no_size() -> None:
+    parameters = ro.load("cable").problem.parameters
+    stated = Prior().stated(parameters)
+    anchor = np.array([name.startswith("anchor") for name in parameters.free.names])
+    assert anchor.any()
+    assert (stated.group[anchor] == FIXED).all()
+    assert (stated.scale[anchor] == 10.0).all()
 
 
 # --- statements -----------------------------------------------------------------------------------------------------

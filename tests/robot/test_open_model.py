@@ -264,7 +264,7 @@ def test_penalties_groups_scales_and_the_learned_prior_know_its_parameters() -> 
     assert not own.parameters.free.of_frames[-3:].any()
     learned = ro.calibrate(own)
     assert learned.converged
-    assert set(learned.learned.sizes) == {"lengths", "angles", "own"}
+    assert set(learned.learned.sizes) == {"lengths", "angles", "own", "base"}
     grouped = ro.calibrate(own, ro.tikhonov, weight={"own": 10.0, "alpha a d": 1.0, "tool base": 0.1})
     assert grouped.converged
     assert " own2 " in learned.parameter_table()

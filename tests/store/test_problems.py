@@ -177,6 +177,25 @@ def test_real_data_reach_the_least_squares_figures(name: str) -> None:
     assert np.sqrt(np.mean(before**2)) == pytest.approx(NOMINAL[name], rel=0.002)
 
 
+MODELLED = {  # RMS on the validation rows [mm] with families that the evidence wants
+    "ur5_jacobi": 0.102, "wam_jacobi": 2.08, "franka_fr3_nadeau": 1.32, "irb120_wu": 0.176, "rokae_lmpytorch": 0.086,
+}  # fmt: skip
+
+
+@real
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [("motoman_right", 0.068), *(pytest.param(*item, marks=pytest.mark.slow) for item in MODELLED.items())],
+)
+def test_real_data_choose_their_model(name: str, most: float) -> None:
+    """The first one's tool hangs in one attitude: where the base may be anywhere it leaves 0.0693 mm."""
+    instance = ro.load(REAL / name)
+    result = ro.calibrate(instance.problem, model="auto")
+    assert result.converged
+    rms = 1e3 * np.sqrt(np.mean(result.errors(instance.validation) ** 2))
+    assert rms <= most + 5e-4  # figures are stated with three digits after the point
+
+
 @real
 @pytest.mark.parametrize("name", TEN)
 def test_ten_configurations_of_real_data_beat_least_squares(name: str) -> None:
