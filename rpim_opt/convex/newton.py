@@ -15,7 +15,7 @@ from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
 from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
 
-MOST, SOON = 100, 15
+MOST, SOON = 100, 30
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
 """How sharp they then are, relative to those that a loss without multipliers begins with."""
@@ -301,7 +301,7 @@ class Newton(Whitened):
 
     def _hessian(self, point: Point) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
-        curvatures = self.loss.curvature(point.r, *point.kinked[:2])
+        curvatures = self.loss.curvature(point.r, point.smooth, point.kinked.sharpness)
         across = curvatures[0].across
         for more in curvatures[1:]:
             across = across + more.across

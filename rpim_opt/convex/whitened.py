@@ -18,6 +18,8 @@ SOUGHT = 1e-12
 """Duality gap, relative to the objective, that methods go on to while it falls."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good point is taken."""
+HALF = 0.5
+"""Part of the gap before a step that one of a hasty method may leave, if it is larger than one met before."""
 FLAT = 1e-10
 """Curvature that unknowns without penalty have at least, where the data have about one."""
 FAR = 100.0
@@ -64,23 +66,33 @@ class Ended(NamedTuple):
 
 @dataclass
 class Best:
-    """The point with the smallest gap that a method has met, and how many after it had none smaller."""
+    """The point with the smallest gap that a method has met, and how many after it had none smaller.
+
+    Of those, how many at last came no nearer: where kinks are sharp, the first step may lead far from a small gap.
+    """
 
     ended: Ended
     vain: int = 0
+    stuck: int = 0
+    last: float = np.inf
 
     def meets(self, ended: Ended) -> None:
         """Take note of another point."""
         self.vain += 1
+        self.stuck += 1
+        if ended.gap <= HALF * self.last:
+            self.stuck = 0
+        self.last = ended.gap
         if ended.gap < self.ended.gap:
             self.ended = ended
             self.vain = 0
+            self.stuck = 0
 
     def will_do(self, sought: float = SOUGHT, hasty: bool = False) -> bool:
         """Whether nothing is left to go on for: the gap is as sought, or falls no more and is good or one is hasty."""
         if self.ended.gap <= sought * abs(self.ended.objective):
             return True
-        return self.vain >= VAIN and (self.ended.good or hasty)
+        return (self.vain >= VAIN and self.ended.good) or (hasty and self.stuck >= VAIN)
 
 
 @dataclass(frozen=True, eq=False)
