@@ -170,6 +170,15 @@ class Faces:
         return s[seen], Vt[seen]
 
     @cached_property
+    def _of(self) -> np.ndarray:
+        """Group (n,) of every component, the first one for those of none."""
+        return np.maximum(self.member, 0)
+
+    def spread(self, some: np.ndarray) -> np.ndarray:
+        """Return which components (n,) belong to some of the groups (K,)."""
+        return some[self._of] & self.grouped
+
+    @cached_property
     def members(self) -> list[np.ndarray]:
         """The components of every group."""
         return [np.flatnonzero(self.member == k) for k in range(len(self.groups))]
@@ -178,6 +187,16 @@ class Faces:
     def kinked(self) -> np.ndarray:
         """Which components (n,) have a kink of their own at zero."""
         return self.price > 0
+
+    @cached_property
+    def _smooth(self) -> np.ndarray:
+        """Which components have none."""
+        return ~self.kinked
+
+    @cached_property
+    def _alone(self) -> np.ndarray:
+        """Which components belong to no group."""
+        return ~self.grouped
 
     def lengths(self, v: Array) -> Array:
         """Return the norms of the groups (K,) of a vector (n,)."""
@@ -219,7 +238,12 @@ class Faces:
     def rounding(self, y: Array, weight: float) -> Array:
         """Return what rounding may make of the slopes (n,)."""
         terms = float(self.size @ np.abs(y)) + self.target
-        return SLOPE * (2 * terms * self.size + weight * (self.prices + np.abs(self.g)))
+        return (2 * SLOPE * terms) * self.size + (SLOPE * weight) * self._steepest
+
+    @cached_property
+    def _steepest(self) -> Array:
+        """What the penalty's slopes (n,) are at most, but for its square."""
+        return self.prices + np.abs(self.g)
 
     @cached_property
     def target(self) -> float:
@@ -249,14 +273,16 @@ class Faces:
             ridge = STIFFER * ridge
         return gap
 
-    def _gap(self, y: Array, slope: Array, weight: float, C: Array, step: Array) -> float:
+    def _gap(self, y: Array, slope: Array, weight: float, C: Array, step: Array | None) -> float:
         """Return by how much the objective at y may lie above its minimum: Fenchel's and Young's inequality.
 
         The tangent of the smooth part at any point is a lower bound of it, and with the kinks, whose minimum is known,
         one of the objective. It is taken where Newton's step leads, whose curvature counts: on the face the slope there
         is what the kinks need, whatever rounding made of it at y.
         """
-        left = slope + C @ step
+        left = slope
+        if step is not None:
+            left = slope + C @ step
         price = weight * self.price
         excess = np.minimum(left + price, 0.0)
         rest = np.maximum(left - price, 0.0)
@@ -268,10 +294,17 @@ class Faces:
             excess = np.where(self.grouped, self._over(left, weight), excess)
         left = left - excess
         young = self._young(y, left, price, weight * self.groups)
-        curved = float(np.sum((self.M @ step) ** 2))
+        return max(young, 0.0) + self._curved(step, weight) + self._cost(excess, y, step, weight)
+
+    def _curved(self, step: Array | None, weight: float) -> float:
+        """Return by how much the smooth part rises above its tangent where a step leads."""
+        if step is None:
+            return 0.0
+        seen = self.M @ step
+        curved = float(seen @ seen)
         if self.H is not None:
             curved += 0.5 * weight * max(float(step @ self.H @ step), 0.0)
-        return max(young, 0.0) + curved + self._cost(excess, y, step, weight)
+        return curved
 
     def _over(self, slope: Array, weight: float) -> Array:
         """Return what a slope (n,) has beyond the prices of the groups."""
@@ -295,7 +328,7 @@ class Faces:
         single = float(np.sum((here - least)[~self.grouped]))
         return single + float(np.sum(self.picks @ here + groups * self.lengths(y)))
 
-    def _cost(self, excess: Array, y: Array, step: Array, weight: float) -> float:
+    def _cost(self, excess: Array, y: Array, step: Array | None, weight: float) -> float:
         """Return what it costs a lower bound to take an excess (n,) off the slope after a step.
 
         Of what the equations see, the squares hold y' near y + step: |e|^2 / 4 - e'M step in their coordinates.
@@ -304,9 +337,13 @@ class Faces:
             return 0.0
         s, Vt = self.spectrum
         seen = Vt @ excess
+        cost = float(np.sum((seen / (2 * s)) ** 2))
+        if step is not None:
+            cost -= float(seen @ (Vt @ step))
+        if len(s) == len(y):
+            return cost
         unseen = excess - seen @ Vt
         unseen[np.abs(unseen) <= self.rounding(y, weight)] = 0.0
-        cost = float(np.sum((seen / (2 * s)) ** 2) - seen @ (Vt @ step))
         if not unseen.any():
             return cost
         priced = weight * self.prices
@@ -333,7 +370,9 @@ class Faces:
         return self._minimum(weight, self.near(weight))
 
     def _minimum(self, weight: float, start: Array) -> Face:
-        y = np.minimum(np.maximum(self.snapped(start, NEAR), self.lower), self.upper)
+        y = self.snapped(start, NEAR)
+        if self.bounded:
+            y = np.minimum(np.maximum(y, self.lower), self.upper)
         C = self.curvature(weight)
         ridge = RIDGE
         value = self.value(y, weight)
@@ -348,10 +387,9 @@ class Faces:
             if not arrived:
                 step, fall = self._newton(y, slope, C, weight, ridge)
             if fall > VANISHED * abs(value):
-                ahead, there = self._ahead(y, step, fall, value, C, weight)
+                ahead, there, whole = self._ahead(y, step, fall, value, C, weight)
                 if self._nearer(y, value, ahead, there):
-                    # squares on a face are a quadratic, whose minimum is one step away
-                    arrived = not len(self.groups) and np.array_equal(ahead, y + step)
+                    arrived = whole  # squares on a face are a quadratic, whose minimum is one step away
                     y, value = ahead, there
                     ridge = RIDGE
                     continue
@@ -363,7 +401,7 @@ class Faces:
             if not (there < value or arrived):
                 break
             if not there < value:
-                gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
+                gap = self._gap(y, slope, weight, C, None)
                 if gap <= EXACT * value:
                     return Face(y, self.free(y), gap, value)
             arrived = False
@@ -387,11 +425,11 @@ class Faces:
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
-        free = (y != 0) | ~self.kinked
+        free = (y != 0) | self._smooth
         if self.bounded:
             free &= (y > self.lower) & (y < self.upper)
         if len(self.groups):
-            free &= ~self.grouped | ((self.lengths(y) > 0) @ self.picks > 0)
+            free &= ~self.spread(self.lengths(y) == 0)
         return free
 
     def largest(self) -> float | None:
@@ -442,22 +480,29 @@ class Faces:
 
     def snapped(self, y: Array, close: float) -> Array:
         """Return a point (n,) with what is close to a kink or bound, relative to the largest component, put on it."""
-        room = close * float(np.max(np.abs(y), initial=0.0))
+        room = close * float(np.abs(y).max(initial=0.0))
         y = y.copy()
         for place in self.places:
             y = np.where(np.abs(y - place) <= room, place, y)
         if len(self.groups):
-            y = np.where(self.grouped & ((self.lengths(y) <= room) @ self.picks > 0), 0.0, y)
+            y[self.spread(self.lengths(y) <= room)] = 0.0
         return y
 
-    def _ahead(self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float) -> tuple[Array, float]:
-        """Return the point after a step, and where that comes short, after groups were moved one by one; its value."""
-        ahead, there = self._stepped(y, step, value, weight)
-        if len(self.groups) and there > value - SHORT * fall:
+    def _ahead(
+        self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float
+    ) -> tuple[Array, float, bool]:
+        """Return the point after a step, and where that comes short, after groups were moved one by one.
+
+        With its value, and whether it is the minimum of a quadratic.
+        """
+        ahead, there, whole = self._stepped(y, step, value, weight)
+        if not len(self.groups):
+            return ahead, there, whole
+        if there > value - SHORT * fall:
             # where a group is nearly zero, the norm bends more than Newton's step sees
             ahead = self._moved(ahead, self.slope(ahead, weight), self.grouped, C, weight)
-            return ahead, self.value(ahead, weight)
-        return ahead, there
+            there = self.value(ahead, weight)
+        return ahead, there, False
 
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
@@ -502,29 +547,38 @@ class Faces:
         step[F] = found
         return step, float(-g @ found)
 
-    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> tuple[Array, float]:
-        """Return the point after a step and its value: over all kinks where that is lower, else to the first."""
-        full = self._stopped(y, y + step)
+    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> tuple[Array, float, bool]:
+        """Return the point after a step and its value: over all kinks where that is lower, else to the first.
+
+        And whether nothing stopped it.
+        """
+        full, whole = self._stopped(y, y + step)
         there = self.value(full, weight)
         if there < value:
-            return full, there
+            return full, there, whole
         share = self._first(y, step)
+        if share == 1 and there == value:
+            return full, there, whole
         for _ in range(40):
-            ahead = self._stopped(y, y + share * step)
+            ahead, _ = self._stopped(y, y + share * step)
             if share < 1:
                 ahead = self._snapped(y, step, ahead, share)
             there = self.value(ahead, weight)
             if there <= value:
-                return ahead, there
+                return ahead, there, False
             share = share / 2
-        return y, value
+        return y, value, False
 
-    def _stopped(self, y: Array, ahead: Array) -> Array:
-        """Return a point with components that passed a kink or a bound put on it."""
+    def _stopped(self, y: Array, ahead: Array) -> tuple[Array, bool]:
+        """Return a point with components that passed a kink or a bound put on it, and whether none did."""
+        inside = ahead
         if self.bounded:
-            ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
-        ahead[(ahead * y < 0) & self.kinked] = 0.0
-        return ahead
+            inside = np.minimum(np.maximum(ahead, self.lower), self.upper)
+        passed = (inside * y < 0) & self.kinked
+        if passed.any():
+            inside[passed] = 0.0
+            return inside, False
+        return inside, inside is ahead or bool((inside == ahead).all())
 
     def _first(self, y: Array, step: Array) -> float:
         """Return how far along a step (at most 1) the first kink or bound is."""
@@ -532,7 +586,8 @@ class Faces:
         passed = (gap * step > 0) & (np.abs(gap) < np.abs(step))
         if not passed.any():
             return 1.0
-        return float(np.min(np.divide(gap, step, out=np.ones_like(gap), where=passed)))
+        places, components = passed.nonzero()
+        return float((gap[places, components] / step[components]).min())
 
     @cached_property
     def _stops(self) -> Array:
@@ -587,18 +642,18 @@ class Faces:
         wrong &= ~self.free(y)
         if len(self.groups):
             steep = self.lengths(slope) - weight * self.groups
-            vain = ((self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)) @ self.picks > 0
-            wrong = np.where(self.grouped, vain, wrong)
+            vain = (self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)
+            wrong = np.where(self.grouped, vain[self._of], wrong)
         return wrong
 
     def _moved(self, y: Array, slope: Array, wrong: np.ndarray, C: Array, weight: float) -> Array:
         """Return the point after each component or group that is held in vain was moved to where it is best."""
         y = y.copy()
         slope = slope.copy()
-        alone = wrong & ~self.grouped
+        alone = wrong & self._alone
         for j in alone.nonzero()[0].tolist():
             moved = self._best_component(j, float(y[j]), float(slope[j]), float(C[j, j]), weight)
-            slope += C[:, j] * (moved - y[j])
+            slope += C[j] * (moved - y[j])  # as its column, which is no row of memory
             y[j] = moved
         if not len(self.groups):
             return y

@@ -170,9 +170,10 @@ class Folds:
         if k == 0:
             return near
         other = self._met[k - 1][weight]
-        if near is None or self._programs[k].objective(other, weight) < self._programs[k].objective(near, weight):
+        faces, split = self._programs[k].faces, self._programs[k].split
+        if near is None or faces is None or split is None:
             return other
-        return near
+        return min(other, near, key=lambda z: faces.value(split.y(z), weight))
 
 
 def between(met: Mapping[float, Array], weight: float) -> Array | None:
