@@ -194,6 +194,11 @@ class Faces:
         return ~self.kinked
 
     @cached_property
+    def _many(self) -> int:
+        """How many groups there are."""
+        return len(self.groups)
+
+    @cached_property
     def _alone(self) -> np.ndarray:
         """Which components belong to no group."""
         return ~self.grouped
@@ -215,7 +220,7 @@ class Faces:
         value = float(self.price @ np.abs(y))
         if self._lined:
             value += float(self.g @ y)
-        if len(self.groups):
+        if self._many:
             value += float(self.groups @ self.lengths(y))
         if self.H is not None:
             value += float(0.5 * y @ self.H @ y)
@@ -253,7 +258,7 @@ class Faces:
     @cached_property
     def prices(self) -> Array:
         """Prices (n,) of the components, or of the groups that they belong to."""
-        if not len(self.groups):
+        if not self._many:
             return self.price
         return self.price + self.groups @ self.picks
 
@@ -290,7 +295,7 @@ class Faces:
             excess[np.isfinite(self.upper)] = 0.0
             rest[np.isfinite(self.lower)] = 0.0
         excess += rest
-        if len(self.groups):
+        if self._many:
             excess = np.where(self.grouped, self._over(left, weight), excess)
         left = left - excess
         young = self._young(y, left, price, weight * self.groups)
@@ -316,14 +321,14 @@ class Faces:
     def _young(self, y: Array, left: Array, price: Array, groups: Array) -> float:
         """Return left'y and the kinks at y, less the least that both together are anywhere in the box."""
         here = left * y + price * np.abs(y)
-        if not self.bounded and not len(self.groups):  # left is at most the price: zero is where both are least
+        if not self.bounded and not self._many:  # left is at most the price: zero is where both are least
             return float(here.sum())
         nearest = np.minimum(np.maximum(0.0, self.lower), self.upper)
         least = left * nearest + price * np.abs(nearest)
         for bound in (self.lower, self.upper):
             at = np.where(np.isfinite(bound), bound, nearest)
             least = np.minimum(least, left * at + price * np.abs(at))
-        if not len(self.groups):
+        if not self._many:
             return float(np.sum(here - least))
         single = float(np.sum((here - least)[~self.grouped]))
         return single + float(np.sum(self.picks @ here + groups * self.lengths(y)))
@@ -333,7 +338,7 @@ class Faces:
 
         Of what the equations see, the squares hold y' near y + step: |e|^2 / 4 - e'M step in their coordinates.
         """
-        if not excess.any():
+        if not np.count_nonzero(excess):
             return 0.0
         s, Vt = self.spectrum
         seen = Vt @ excess
@@ -344,7 +349,7 @@ class Faces:
             return cost
         unseen = excess - seen @ Vt
         unseen[np.abs(unseen) <= self.rounding(y, weight)] = 0.0
-        if not unseen.any():
+        if not np.count_nonzero(unseen):
             return cost
         priced = weight * self.prices
         if (priced[unseen != 0] == 0).any():
@@ -380,7 +385,7 @@ class Faces:
         arrived = False
         for _ in range(50 + 2 * len(y)):
             slope = self.slope(y, weight)
-            if len(self.groups):
+            if self._many:
                 slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
             fall = 0.0
@@ -418,7 +423,7 @@ class Faces:
     def _freed(self, y: Array, value: float, slope: Array, C: Array, weight: float) -> tuple[Array, float]:
         """Return the point after what is held in vain was moved to where it is best, and its value."""
         wrong = self._wrong(y, slope, weight)
-        if not wrong.any():
+        if not np.count_nonzero(wrong):
             return y, value
         moved = self._moved(y, slope, wrong, C, weight)
         return moved, self.value(moved, weight)
@@ -428,7 +433,7 @@ class Faces:
         free = (y != 0) | self._smooth
         if self.bounded:
             free &= (y > self.lower) & (y < self.upper)
-        if len(self.groups):
+        if self._many:
             free &= ~self.spread(self.lengths(y) == 0)
         return free
 
@@ -449,7 +454,7 @@ class Faces:
         room = self.price - np.sign(slope) * self.g
         single = ~self.grouped & (room > 0) & ~bare
         found = [0.0, *(np.abs(slope[single]) / room[single])]
-        if len(self.groups):
+        if self._many:
             found += [*(self.lengths(slope) / self.groups)]
         largest = float(np.max(found))
         if largest > 0:
@@ -459,7 +464,7 @@ class Faces:
     def bent(self, y: Array, weight: float) -> tuple[Array, Array]:
         """Return slope (n,) and curvature (n, n) of the penalty's kinked part where it is smooth, without its zeros."""
         slope = weight * self.price * np.sign(y)
-        if not len(self.groups):
+        if not self._many:
             return slope, np.zeros((0, 0))
         nu = self.lengths(y)
         inverse = np.divide(1.0, nu, out=np.zeros_like(nu), where=nu > 0)
@@ -472,7 +477,7 @@ class Faces:
     def bend(self, y: Array, weight: float) -> Array:
         """Return the penalty's Hessian (n, n) where it is smooth."""
         bend = self.bent(y, weight)[1]
-        if not len(self.groups):
+        if not self._many:
             bend = np.zeros((len(y), len(y)))
         if self.H is not None:
             bend = bend + weight * self.H
@@ -484,7 +489,7 @@ class Faces:
         y = y.copy()
         for place in self.places:
             y = np.where(np.abs(y - place) <= room, place, y)
-        if len(self.groups):
+        if self._many:
             y[self.spread(self.lengths(y) <= room)] = 0.0
         return y
 
@@ -496,7 +501,7 @@ class Faces:
         With its value, and whether it is the minimum of a quadratic.
         """
         ahead, there, whole = self._stepped(y, step, value, weight)
-        if not len(self.groups):
+        if not self._many:
             return ahead, there, whole
         if there > value - SHORT * fall:
             # where a group is nearly zero, the norm bends more than Newton's step sees
@@ -510,10 +515,11 @@ class Faces:
         F = self.free(y).nonzero()[0]
         if not len(F):
             return step, 0.0
-        if not len(self.groups):
+        if not self._many:
             g = (slope + (weight * self.price) * np.sign(y))[F]
             if C is self.gram and ridge == RIDGE:
-                _, found, info = _posv(self._raised.take(F, 0).take(F, 1), -g, lower=1, overwrite_a=1)
+                K = self._raised.take(F, 0).take(F, 1).T  # as LAPACK has it in memory
+                _, found, info = _posv(K, -g, lower=1, overwrite_a=1, overwrite_b=1)
                 if info == 0:
                     step[F] = found
                     return step, float(-g @ found)
@@ -538,7 +544,7 @@ class Faces:
         own = np.maximum(diagonal, UNSEEN * diagonal.max())
         for _ in range(20):
             K.flat[:: len(F) + 1] = diagonal + ridge * own
-            _, found, info = _posv(K, -g, lower=1)
+            _, found, info = _posv(K.T, -g, lower=1)
             if info == 0:
                 break
             ridge = 10 * ridge
@@ -575,7 +581,7 @@ class Faces:
         if self.bounded:
             inside = np.minimum(np.maximum(ahead, self.lower), self.upper)
         passed = (inside * y < 0) & self.kinked
-        if passed.any():
+        if np.count_nonzero(passed):
             inside[passed] = 0.0
             return inside, False
         return inside, inside is ahead or bool((inside == ahead).all())
@@ -584,7 +590,7 @@ class Faces:
         """Return how far along a step (at most 1) the first kink or bound is."""
         gap = self._stops - y
         passed = (gap * step > 0) & (np.abs(gap) < np.abs(step))
-        if not passed.any():
+        if not np.count_nonzero(passed):
             return 1.0
         places, components = passed.nonzero()
         return float((gap[places, components] / step[components]).min())
@@ -640,7 +646,7 @@ class Faces:
         else:  # what is held is zero
             wrong = np.abs(slope) > price + room
         wrong &= ~self.free(y)
-        if len(self.groups):
+        if self._many:
             steep = self.lengths(slope) - weight * self.groups
             vain = (self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)
             wrong = np.where(self.grouped, vain[self._of], wrong)
@@ -655,7 +661,7 @@ class Faces:
             moved = self._best_component(j, float(y[j]), float(slope[j]), float(C[j, j]), weight)
             slope += C[j] * (moved - y[j])  # as its column, which is no row of memory
             y[j] = moved
-        if not len(self.groups):
+        if not self._many:
             return y
         for k in np.unique(self.member[wrong & self.grouped]):
             inside = self.members[k]
