@@ -217,7 +217,7 @@ class Faces:
 
     def penalty(self, y: Array) -> float:
         """Return what the weight multiplies."""
-        value = float(self.price @ np.abs(y))
+        value = float(self.price.dot(np.abs(y)))
         if self._lined:
             value += float(self.g @ y)
         if self._many:
@@ -228,12 +228,25 @@ class Faces:
 
     def value(self, y: Array, weight: float) -> float:
         """Return the objective."""
-        r = self.M @ y - self.d
-        return float(r @ r) + weight * self.penalty(y)
+        r = self._residual(y)
+        return float(r.dot(r)) + weight * self.penalty(y)
+
+    def _residual(self, y: Array) -> Array:
+        """Return M y - d; a point's slope is asked for after its value."""
+        known = self._last.get("residual")
+        if known is None or known[0] is not y:
+            known = (y, self.M.dot(y) - self.d)
+            self._last["residual"] = known
+        return known[1]
+
+    @cached_property
+    def _last(self) -> dict[str, tuple[Array, Array]]:
+        """The last point, and its residual."""
+        return {}
 
     def slope(self, y: Array, weight: float) -> Array:
         """Return the gradient (n,) of the smooth part."""
-        slope = (self.M @ y - self.d) @ self._twice
+        slope = self._residual(y).dot(self._twice)
         if self._lined:
             slope += weight * self.g
         if self.H is not None:
@@ -242,7 +255,7 @@ class Faces:
 
     def rounding(self, y: Array, weight: float) -> Array:
         """Return what rounding may make of the slopes (n,)."""
-        terms = float(self.size @ np.abs(y)) + self.target
+        terms = float(self.size.dot(np.abs(y))) + self.target
         return (2 * SLOPE * terms) * self.size + (SLOPE * weight) * self._steepest
 
     @cached_property
@@ -522,7 +535,7 @@ class Faces:
                 _, found, info = _posv(K, -g, lower=1, overwrite_a=1, overwrite_b=1)
                 if info == 0:
                     step[F] = found
-                    return step, float(-g @ found)
+                    return step, -float(g.dot(found))
             K = C.take(F, 0).take(F, 1)
         else:
             kink, bend = self.bent(y, weight)
@@ -633,6 +646,7 @@ class Faces:
             if np.linalg.norm(without) <= weight * self.groups[k]:
                 slope = slope - C[:, inside] @ y[inside]
                 y[inside] = 0.0
+                self._last.clear()
         return slope
 
     def _wrong(self, y: Array, slope: Array, weight: float) -> np.ndarray:
