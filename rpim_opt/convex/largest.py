@@ -88,6 +88,14 @@ class Largest:
         factor = self.a / np.maximum(self.norms(r), NEAR_ZERO)
         return factor[self.which] * (r + self.shift)
 
+    def projected(self, rows: Array, r: Array) -> Array:
+        """Return the slopes (N, p) of the groups' numbers along the columns of rows (m, p), of residuals r (m,)."""
+        directions = self.directions(r)
+        each = self.sizes[0]
+        if not np.all(self.sizes == each):
+            return np.add.reduceat(directions[:, None] * rows, self.begin)
+        return np.einsum("nk,nkp->np", directions.reshape(-1, each), rows.reshape(-1, each, rows.shape[1]))
+
     def slope(self, r: Array, shares: Array) -> Array:
         """Return the slope (m,) of the groups' mean with shares (N,), which is a subgradient of the loss nearby."""
         return shares[self.which] * self.directions(r)

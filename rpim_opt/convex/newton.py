@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Kinked, Whitened
 
 MOST, SOON = 100, 30
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
@@ -27,8 +27,6 @@ DEAR = 200_000
 """Entries of the rows from which a second derivative is dear."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
-PROMISED = 1e-10
-"""Part of the objective by which it may be lower elsewhere, where points are compared."""
 SLOW = 0.1
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12

@@ -16,6 +16,8 @@ ACCEPTED = 1e-10
 """Duality gap, relative to the objective, that a method must reach."""
 SOUGHT = 1e-12
 """Duality gap, relative to the objective, that methods go on to while it falls."""
+PROMISED = 1e-10
+"""Part of the objective by which it may be lower elsewhere, where points are compared."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good point is taken."""
 HALF = 0.5
