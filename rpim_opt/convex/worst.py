@@ -149,7 +149,7 @@ class Worst(Whitened):
         values = loss.values(point.r)
         H = self._hessian(point, G)
         g = 2 * self.unit * self.pull * point.a
-        start = np.flatnonzero(point.shares)
+        start = point.shares.nonzero()[0]
         s = np.ones(len(values))
         if self.box is not None:
             room = np.abs(self._bounds.at - point.z[self._bounds.of])
@@ -174,7 +174,7 @@ class Worst(Whitened):
         heard, factor = self.loss.curvature(point.r, point.shares)
         H = np.zeros((len(self.unit), len(self.unit)))
         if len(heard):
-            places = np.flatnonzero(point.shares[self.loss.which])
+            places = point.shares[self.loss.which].nonzero()[0]
             rows = self.at.rows[places] * self.unit
             by_row = np.repeat(factor, self.loss.sizes[heard])
             across = G[heard] / self.loss.a[heard, None]
