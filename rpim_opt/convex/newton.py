@@ -253,7 +253,7 @@ class Newton(Whitened):
         gap, by_z = self.bound(point.z, point.a, slope)
         smooth = point.smooth
         loss, missing = self.loss.missed(point.r, smooth)
-        objective = loss + float(self.pull @ point.a**2)
+        objective = loss + float(self.pull.dot(point.a**2))
         state = Kinked(smooth.multipliers, point.kinked.sharpness, point.kinked.curved)
         return Ended(point.z, gap + missing, objective, loss, steps, state, by_z, smooth.slope, missing)
 
@@ -330,7 +330,7 @@ class Newton(Whitened):
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""
-        ahead = self.at.rows @ step
+        ahead = self.at.rows.dot(step)  # of short vectors, calls are dear: `dot` is a shorter one than `@`
         of_penalty = 2 * self.pull * step
 
         def at(t: float) -> Point:
@@ -339,7 +339,7 @@ class Newton(Whitened):
             return Point(point.z + t * (z - point.z), point.a + t * step, r, point.kinked, smooth)
 
         def rise(p: Point) -> float:
-            slope = float(p.smooth.slope @ ahead + p.a @ of_penalty)
+            slope = float(p.smooth.slope.dot(ahead) + p.a.dot(of_penalty))
             if np.isfinite(slope) and np.isfinite(p.smooth.without_kinks):
                 return slope
             return np.inf
@@ -352,5 +352,5 @@ class Newton(Whitened):
     def _place(self, point: Point) -> Array:
         """Return z (n,) of a point that a search has found: free of rounding, or inside the box."""
         if self.box is None:
-            return self.at.offset + self.at.B @ point.a
+            return self.at.offset + self.at.B.dot(point.a)
         return np.clip(point.z, *self.box)

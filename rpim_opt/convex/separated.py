@@ -220,7 +220,7 @@ class Separated:
 
     def _bent(self, r: Array) -> list[float]:
         """Return the value of every kink at a residual (m,)."""
-        return [float(factor @ self._norms(_along(of, r))) for factor, of in self.kinks]
+        return [float(factor.dot(self._norms(_along(of, r)))) for factor, of in self.kinks]
 
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
@@ -240,7 +240,7 @@ class Separated:
     def missed(self, r: Array, smoothed: Smoothed) -> tuple[float, float]:
         """Return the loss of a residual (m,), and what the multipliers there miss of its kinks."""
         bent = sum(self._bent(r))
-        reached = sum(float(y @ _along(of, r)) for (_, of), y in zip(self.kinks, smoothed.multipliers, strict=True))
+        reached = sum(float(y.dot(_along(of, r))) for (_, of), y in zip(self.kinks, smoothed.multipliers, strict=True))
         return smoothed.without_kinks + bent, bent - reached
 
     def curvature(self, r: Array, smoothed: Smoothed, sharpness: float) -> list[Curvature]:

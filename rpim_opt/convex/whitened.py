@@ -172,7 +172,7 @@ class Whitened:
 
     def slope(self, a: Array, of_loss: Array) -> Array:
         """Return the objective's slope by the coordinates in their units, (p,), from the loss's (m,)."""
-        return self.unit * (self.at.rows.T @ of_loss + 2 * self.pull * a)
+        return self.unit * (self.at.rows.T.dot(of_loss) + 2 * self.pull * a)
 
     def bound(self, z: Array, a: Array, slope: Array) -> tuple[float, Array | None]:
         """Return by how much a minorant of that slope (p,) may fall at most, and its slope by z (n,) in a box."""
@@ -180,7 +180,7 @@ class Whitened:
         if self.box is not None:
             by_z = self.back.T @ slope
             slope = (self.at.B * self.unit).T @ np.where(self.held(z, by_z), 0.0, by_z)
-        gap = float(slope**2 @ self._price)
+        gap = float((slope**2).dot(self._price))
         free = self.free
         if len(free):
             gap += FAR * float(np.abs(slope[free]) @ (1 + np.abs(a[free] / self.unit[free])))
