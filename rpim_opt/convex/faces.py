@@ -199,6 +199,11 @@ class Faces:
         return len(self.groups)
 
     @cached_property
+    def _plain(self) -> bool:
+        """Whether every component has a kink of its own, and no bound: a lasso."""
+        return not self._many and not self.bounded and bool(self.kinked.all())
+
+    @cached_property
     def _alone(self) -> np.ndarray:
         """Which components belong to no group."""
         return ~self.grouped
@@ -443,6 +448,8 @@ class Faces:
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
+        if self._plain:
+            return y != 0
         free = (y != 0) | self._smooth
         if self.bounded:
             free &= (y > self.lower) & (y < self.upper)
@@ -525,7 +532,7 @@ class Faces:
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
         step = np.zeros(len(y))
-        F = self.free(y).nonzero()[0]
+        F = self._places(y)
         if not len(F):
             return step, 0.0
         if not self._many:
@@ -542,6 +549,12 @@ class Faces:
             g = (slope + kink)[F]
             K = (C + bend).take(F, 0).take(F, 1)
         return self._solved(K, g, F, step, ridge)
+
+    def _places(self, y: Array) -> np.ndarray:
+        """Return the components that are on no kink and no bound."""
+        if self._plain:
+            return y.nonzero()[0]
+        return self.free(y).nonzero()[0]
 
     @cached_property
     def _raised(self) -> Array:
@@ -593,7 +606,9 @@ class Faces:
         inside = ahead
         if self.bounded:
             inside = np.minimum(np.maximum(ahead, self.lower), self.upper)
-        passed = (inside * y < 0) & self.kinked
+        passed = inside * y < 0
+        if not self._plain:
+            passed &= self.kinked
         if np.count_nonzero(passed):
             inside[passed] = 0.0
             return inside, False
