@@ -379,10 +379,17 @@ class Faces:
     # --- the way there ---------------------------------------------------------------------------------------------
 
     def near(self, weight: float) -> Array:
-        """Return a point (n,) from which the minimum is few steps away: that with squares instead of norms."""
+        """Return a point (n,) from which the minimum is few steps away.
+
+        That with squares instead of norms, or zero where that is lower: little is not zero then.
+        """
         s, Vt = self.spectrum
         target = Vt @ (self.M.T @ self.d)  # s times the coordinates of d
-        return (target / (s**2 + weight)) @ Vt
+        squared = (target / (s**2 + weight)) @ Vt
+        zero = np.zeros_like(squared)
+        if self.value(zero, weight) < self.value(squared, weight):
+            return zero
+        return squared
 
     def minimum(self, weight: float, start: Array | None = None) -> Face:
         """Return the minimum at a weight above zero, from a point (n,) near it."""
