@@ -53,7 +53,9 @@ def test_a_score_is_the_curvature_of_the_points_that_were_solved() -> None:
     assert select_curve._on_grid(program, weights)[1] == pytest.approx(menger(np.array(points)), rel=1e-9)
 
 
-@pytest.mark.parametrize(("formulation", "kinks"), [(ro.robust, False), (ro.sum_of_norms, True)], ids=["robust", "norms"])
+@pytest.mark.parametrize(
+    ("formulation", "kinks"), [(ro.robust, False), (ro.sum_of_norms, True)], ids=["robust", "norms"]
+)
 def test_a_path_that_meets_a_kink_is_looked_at_all_over_the_grid(formulation: ro.Formulation, kinks: bool) -> None:
     """Where configurations are met exactly, a path bends in jumps, and large steps may miss its sharpest corner."""
     model = simulated(configurations=15, noise=1e-4, seed=1)[0].linearize(np.zeros(34))
