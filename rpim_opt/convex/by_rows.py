@@ -50,6 +50,7 @@ class Met:
 
     def __init__(self, whole: Met | None = None) -> None:
         self._at: dict[float, Near] = {}
+        self._own: dict[float, Near] = {}  # those that are not of some of the data
         self.in_box: Array | None = None  # (n,), of a quadratic program
         self._whole = whole
 
@@ -62,13 +63,13 @@ class Met:
     def near(self, weight: float) -> list[Near]:
         """Return the minimum at the nearest weight, and the last one, which may be of a program more like this one.
 
-        Of some of the data the nearest one of the same data, too.
+        Of some of the data the nearest one of the same data, too, and that of all data at this weight.
         """
         if self._whole is not None:
             found = self._whole.near(weight)
-            own = self.nearest(weight)
-            if own is not None and all(own is not each for each in found):
-                found.append(own)
+            for other in (self.nearest(weight), self._whole._own.get(weight)):
+                if other is not None and all(other is not each for each in found):
+                    found.append(other)
             return found
         nearest = self.nearest(weight)
         if nearest is None:
@@ -80,12 +81,17 @@ class Met:
 
     def keep(self, weight: float, near: Near) -> None:
         """Keep a minimum; of too many weights the one that was met first goes."""
+        _keep(self._own, weight, near)
+        _keep(self._at, weight, near)
         if self._whole is not None:
-            self._whole.keep(weight, near)
-        self._at.pop(weight, None)
-        self._at[weight] = near
-        if len(self._at) > MOST:
-            del self._at[next(iter(self._at))]
+            _keep(self._whole._at, weight, near)
+
+
+def _keep(met: dict[float, Near], weight: float, near: Near) -> None:
+    met.pop(weight, None)
+    met[weight] = near
+    if len(met) > MOST:
+        del met[next(iter(met))]
 
 
 def by_rows(

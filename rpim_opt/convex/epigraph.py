@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 
@@ -19,6 +20,10 @@ MANY = 10**9
 """Changes that no search makes."""
 PARALLEL = 1e-12
 """Falls below this part of what lengths would allow are rounding."""
+
+_getrf: Any
+_getri: Any
+_getrf, _getri = get_lapack_funcs(("getrf", "getri"), (np.empty(1),))
 
 
 class Least(NamedTuple):
@@ -73,7 +78,7 @@ class Epigraph:
         enough = SLACK * max(float(np.max(np.abs(self.v))), TINY)
         while search.changes < most:
             slack = search.slack()
-            worst = int(np.argmax(slack))
+            worst = int(slack.argmax())
             if slack[worst] <= enough:
                 if search.exact():
                     return search.least()
@@ -119,7 +124,7 @@ class _Search:
                 return False
         while True:
             mu = self.x[self.many : self._size]
-            least = int(np.argmin(mu))
+            least = int(mu.argmin())
             if mu[least] >= -NEGATIVE:
                 return True
             if len(self.active) == 1:
@@ -139,10 +144,10 @@ class _Search:
     def _anew(self) -> bool:
         """Invert K; whether it could be."""
         K, y = self._matrix()
-        try:
-            B = np.linalg.inv(K)
-        except np.linalg.LinAlgError:
+        factor, order, singular = _getrf(K.T)  # K is symmetric, and then as LAPACK has it in memory
+        if singular:
             return False
+        B, _ = _getri(factor, order, overwrite_lu=1)
         if not np.isfinite(B).all():
             return False
         size = self._size
@@ -162,7 +167,7 @@ class _Search:
             return False
         while len(self.active) > 1:
             mu = self.x[self.many : self._size]
-            least = int(np.argmin(mu))
+            least = int(mu.argmin())
             if mu[least] >= -NEGATIVE:
                 break
             self._let_go(least)
@@ -230,11 +235,11 @@ class _Search:
     def _first(self, change: Array) -> tuple[float, int]:
         """Return how far a change goes until the first multiplier vanishes, and which."""
         mu = self.x[self.many : self._size]
-        falling = np.flatnonzero(change < 0)
+        falling = (change < 0).nonzero()[0]
         if not len(falling):
             return np.inf, -1
         ratios = np.maximum(mu[falling], 0.0) / -change[falling]
-        first = int(np.argmin(ratios))
+        first = int(ratios.argmin())
         return float(ratios[first]), int(falling[first])
 
     def _added(self, j: int, mu_j: float, change: Array, fall: float) -> None:

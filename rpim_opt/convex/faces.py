@@ -170,6 +170,15 @@ class Faces:
         return s[seen], Vt[seen]
 
     @cached_property
+    def _of(self) -> np.ndarray:
+        """Group (n,) of every component, the first one for those of none."""
+        return np.maximum(self.member, 0)
+
+    def spread(self, some: np.ndarray) -> np.ndarray:
+        """Return which components (n,) belong to some of the groups (K,)."""
+        return some[self._of] & self.grouped
+
+    @cached_property
     def members(self) -> list[np.ndarray]:
         """The components of every group."""
         return [np.flatnonzero(self.member == k) for k in range(len(self.groups))]
@@ -178,6 +187,26 @@ class Faces:
     def kinked(self) -> np.ndarray:
         """Which components (n,) have a kink of their own at zero."""
         return self.price > 0
+
+    @cached_property
+    def _smooth(self) -> np.ndarray:
+        """Which components have none."""
+        return ~self.kinked
+
+    @cached_property
+    def _many(self) -> int:
+        """How many groups there are."""
+        return len(self.groups)
+
+    @cached_property
+    def _plain(self) -> bool:
+        """Whether every component has a kink of its own, and no bound: a lasso."""
+        return not self._many and not self.bounded and bool(self.kinked.all())
+
+    @cached_property
+    def _alone(self) -> np.ndarray:
+        """Which components belong to no group."""
+        return ~self.grouped
 
     def lengths(self, v: Array) -> Array:
         """Return the norms of the groups (K,) of a vector (n,)."""
@@ -193,10 +222,10 @@ class Faces:
 
     def penalty(self, y: Array) -> float:
         """Return what the weight multiplies."""
-        value = float(self.price @ np.abs(y))
+        value = float(self.price.dot(np.abs(y)))
         if self._lined:
             value += float(self.g @ y)
-        if len(self.groups):
+        if self._many:
             value += float(self.groups @ self.lengths(y))
         if self.H is not None:
             value += float(0.5 * y @ self.H @ y)
@@ -204,12 +233,25 @@ class Faces:
 
     def value(self, y: Array, weight: float) -> float:
         """Return the objective."""
-        r = self.M @ y - self.d
-        return float(r @ r) + weight * self.penalty(y)
+        r = self._residual(y)
+        return float(r.dot(r)) + weight * self.penalty(y)
+
+    def _residual(self, y: Array) -> Array:
+        """Return M y - d; a point's slope is asked for after its value."""
+        known = self._last.get("residual")
+        if known is None or known[0] is not y:
+            known = (y, self.M.dot(y) - self.d)
+            self._last["residual"] = known
+        return known[1]
+
+    @cached_property
+    def _last(self) -> dict[str, tuple[Array, Array]]:
+        """The last point, and its residual."""
+        return {}
 
     def slope(self, y: Array, weight: float) -> Array:
         """Return the gradient (n,) of the smooth part."""
-        slope = (self.M @ y - self.d) @ self._twice
+        slope = self._residual(y).dot(self._twice)
         if self._lined:
             slope += weight * self.g
         if self.H is not None:
@@ -218,8 +260,13 @@ class Faces:
 
     def rounding(self, y: Array, weight: float) -> Array:
         """Return what rounding may make of the slopes (n,)."""
-        terms = float(self.size @ np.abs(y)) + self.target
-        return SLOPE * (2 * terms * self.size + weight * (self.prices + np.abs(self.g)))
+        terms = float(self.size.dot(np.abs(y))) + self.target
+        return (2 * SLOPE * terms) * self.size + (SLOPE * weight) * self._steepest
+
+    @cached_property
+    def _steepest(self) -> Array:
+        """What the penalty's slopes (n,) are at most, but for its square."""
+        return self.prices + np.abs(self.g)
 
     @cached_property
     def target(self) -> float:
@@ -229,7 +276,7 @@ class Faces:
     @cached_property
     def prices(self) -> Array:
         """Prices (n,) of the components, or of the groups that they belong to."""
-        if not len(self.groups):
+        if not self._many:
             return self.price
         return self.price + self.groups @ self.picks
 
@@ -249,14 +296,16 @@ class Faces:
             ridge = STIFFER * ridge
         return gap
 
-    def _gap(self, y: Array, slope: Array, weight: float, C: Array, step: Array) -> float:
+    def _gap(self, y: Array, slope: Array, weight: float, C: Array, step: Array | None) -> float:
         """Return by how much the objective at y may lie above its minimum: Fenchel's and Young's inequality.
 
         The tangent of the smooth part at any point is a lower bound of it, and with the kinks, whose minimum is known,
         one of the objective. It is taken where Newton's step leads, whose curvature counts: on the face the slope there
         is what the kinks need, whatever rounding made of it at y.
         """
-        left = slope + C @ step
+        left = slope
+        if step is not None:
+            left = slope + C @ step
         price = weight * self.price
         excess = np.minimum(left + price, 0.0)
         rest = np.maximum(left - price, 0.0)
@@ -264,14 +313,21 @@ class Faces:
             excess[np.isfinite(self.upper)] = 0.0
             rest[np.isfinite(self.lower)] = 0.0
         excess += rest
-        if len(self.groups):
+        if self._many:
             excess = np.where(self.grouped, self._over(left, weight), excess)
         left = left - excess
         young = self._young(y, left, price, weight * self.groups)
-        curved = float(np.sum((self.M @ step) ** 2))
+        return max(young, 0.0) + self._curved(step, weight) + self._cost(excess, y, step, weight)
+
+    def _curved(self, step: Array | None, weight: float) -> float:
+        """Return by how much the smooth part rises above its tangent where a step leads."""
+        if step is None:
+            return 0.0
+        seen = self.M @ step
+        curved = float(seen @ seen)
         if self.H is not None:
             curved += 0.5 * weight * max(float(step @ self.H @ step), 0.0)
-        return max(young, 0.0) + curved + self._cost(excess, y, step, weight)
+        return curved
 
     def _over(self, slope: Array, weight: float) -> Array:
         """Return what a slope (n,) has beyond the prices of the groups."""
@@ -283,31 +339,35 @@ class Faces:
     def _young(self, y: Array, left: Array, price: Array, groups: Array) -> float:
         """Return left'y and the kinks at y, less the least that both together are anywhere in the box."""
         here = left * y + price * np.abs(y)
-        if not self.bounded and not len(self.groups):  # left is at most the price: zero is where both are least
+        if not self.bounded and not self._many:  # left is at most the price: zero is where both are least
             return float(here.sum())
         nearest = np.minimum(np.maximum(0.0, self.lower), self.upper)
         least = left * nearest + price * np.abs(nearest)
         for bound in (self.lower, self.upper):
             at = np.where(np.isfinite(bound), bound, nearest)
             least = np.minimum(least, left * at + price * np.abs(at))
-        if not len(self.groups):
+        if not self._many:
             return float(np.sum(here - least))
         single = float(np.sum((here - least)[~self.grouped]))
         return single + float(np.sum(self.picks @ here + groups * self.lengths(y)))
 
-    def _cost(self, excess: Array, y: Array, step: Array, weight: float) -> float:
+    def _cost(self, excess: Array, y: Array, step: Array | None, weight: float) -> float:
         """Return what it costs a lower bound to take an excess (n,) off the slope after a step.
 
         Of what the equations see, the squares hold y' near y + step: |e|^2 / 4 - e'M step in their coordinates.
         """
-        if not excess.any():
+        if not np.count_nonzero(excess):
             return 0.0
         s, Vt = self.spectrum
         seen = Vt @ excess
+        cost = float(np.sum((seen / (2 * s)) ** 2))
+        if step is not None:
+            cost -= float(seen @ (Vt @ step))
+        if len(s) == len(y):
+            return cost
         unseen = excess - seen @ Vt
         unseen[np.abs(unseen) <= self.rounding(y, weight)] = 0.0
-        cost = float(np.sum((seen / (2 * s)) ** 2) - seen @ (Vt @ step))
-        if not unseen.any():
+        if not np.count_nonzero(unseen):
             return cost
         priced = weight * self.prices
         if (priced[unseen != 0] == 0).any():
@@ -319,10 +379,17 @@ class Faces:
     # --- the way there ---------------------------------------------------------------------------------------------
 
     def near(self, weight: float) -> Array:
-        """Return a point (n,) from which the minimum is few steps away: that with squares instead of norms."""
+        """Return a point (n,) from which the minimum is few steps away.
+
+        That with squares instead of norms, or zero where that is lower: little is not zero then.
+        """
         s, Vt = self.spectrum
         target = Vt @ (self.M.T @ self.d)  # s times the coordinates of d
-        return (target / (s**2 + weight)) @ Vt
+        squared = (target / (s**2 + weight)) @ Vt
+        zero = np.zeros_like(squared)
+        if self.value(zero, weight) < self.value(squared, weight):
+            return zero
+        return squared
 
     def minimum(self, weight: float, start: Array | None = None) -> Face:
         """Return the minimum at a weight above zero, from a point (n,) near it."""
@@ -333,7 +400,9 @@ class Faces:
         return self._minimum(weight, self.near(weight))
 
     def _minimum(self, weight: float, start: Array) -> Face:
-        y = np.minimum(np.maximum(self.snapped(start, NEAR), self.lower), self.upper)
+        y = self.snapped(start, NEAR)
+        if self.bounded:
+            y = np.minimum(np.maximum(y, self.lower), self.upper)
         C = self.curvature(weight)
         ridge = RIDGE
         value = self.value(y, weight)
@@ -341,17 +410,16 @@ class Faces:
         arrived = False
         for _ in range(50 + 2 * len(y)):
             slope = self.slope(y, weight)
-            if len(self.groups):
+            if self._many:
                 slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
             fall = 0.0
             if not arrived:
                 step, fall = self._newton(y, slope, C, weight, ridge)
             if fall > VANISHED * abs(value):
-                ahead, there = self._ahead(y, step, fall, value, C, weight)
+                ahead, there, whole = self._ahead(y, step, fall, value, C, weight)
                 if self._nearer(y, value, ahead, there):
-                    # squares on a face are a quadratic, whose minimum is one step away
-                    arrived = not len(self.groups) and np.array_equal(ahead, y + step)
+                    arrived = whole  # squares on a face are a quadratic, whose minimum is one step away
                     y, value = ahead, there
                     ridge = RIDGE
                     continue
@@ -363,7 +431,7 @@ class Faces:
             if not (there < value or arrived):
                 break
             if not there < value:
-                gap = self._gap(y, slope, weight, C, np.zeros(len(y)))
+                gap = self._gap(y, slope, weight, C, None)
                 if gap <= EXACT * value:
                     return Face(y, self.free(y), gap, value)
             arrived = False
@@ -380,18 +448,20 @@ class Faces:
     def _freed(self, y: Array, value: float, slope: Array, C: Array, weight: float) -> tuple[Array, float]:
         """Return the point after what is held in vain was moved to where it is best, and its value."""
         wrong = self._wrong(y, slope, weight)
-        if not wrong.any():
+        if not np.count_nonzero(wrong):
             return y, value
         moved = self._moved(y, slope, wrong, C, weight)
         return moved, self.value(moved, weight)
 
     def free(self, y: Array) -> np.ndarray:
         """Return which components (n,) are on no kink and no bound."""
-        free = (y != 0) | ~self.kinked
+        if self._plain:
+            return y != 0
+        free = (y != 0) | self._smooth
         if self.bounded:
             free &= (y > self.lower) & (y < self.upper)
-        if len(self.groups):
-            free &= ~self.grouped | ((self.lengths(y) > 0) @ self.picks > 0)
+        if self._many:
+            free &= ~self.spread(self.lengths(y) == 0)
         return free
 
     def largest(self) -> float | None:
@@ -411,7 +481,7 @@ class Faces:
         room = self.price - np.sign(slope) * self.g
         single = ~self.grouped & (room > 0) & ~bare
         found = [0.0, *(np.abs(slope[single]) / room[single])]
-        if len(self.groups):
+        if self._many:
             found += [*(self.lengths(slope) / self.groups)]
         largest = float(np.max(found))
         if largest > 0:
@@ -421,7 +491,7 @@ class Faces:
     def bent(self, y: Array, weight: float) -> tuple[Array, Array]:
         """Return slope (n,) and curvature (n, n) of the penalty's kinked part where it is smooth, without its zeros."""
         slope = weight * self.price * np.sign(y)
-        if not len(self.groups):
+        if not self._many:
             return slope, np.zeros((0, 0))
         nu = self.lengths(y)
         inverse = np.divide(1.0, nu, out=np.zeros_like(nu), where=nu > 0)
@@ -434,7 +504,7 @@ class Faces:
     def bend(self, y: Array, weight: float) -> Array:
         """Return the penalty's Hessian (n, n) where it is smooth."""
         bend = self.bent(y, weight)[1]
-        if not len(self.groups):
+        if not self._many:
             bend = np.zeros((len(y), len(y)))
         if self.H is not None:
             bend = bend + weight * self.H
@@ -442,42 +512,56 @@ class Faces:
 
     def snapped(self, y: Array, close: float) -> Array:
         """Return a point (n,) with what is close to a kink or bound, relative to the largest component, put on it."""
-        room = close * float(np.max(np.abs(y), initial=0.0))
+        room = close * float(np.abs(y).max(initial=0.0))
         y = y.copy()
         for place in self.places:
             y = np.where(np.abs(y - place) <= room, place, y)
-        if len(self.groups):
-            y = np.where(self.grouped & ((self.lengths(y) <= room) @ self.picks > 0), 0.0, y)
+        if self._many:
+            y[self.spread(self.lengths(y) <= room)] = 0.0
         return y
 
-    def _ahead(self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float) -> tuple[Array, float]:
-        """Return the point after a step, and where that comes short, after groups were moved one by one; its value."""
-        ahead, there = self._stepped(y, step, value, weight)
-        if len(self.groups) and there > value - SHORT * fall:
+    def _ahead(
+        self, y: Array, step: Array, fall: float, value: float, C: Array, weight: float
+    ) -> tuple[Array, float, bool]:
+        """Return the point after a step, and where that comes short, after groups were moved one by one.
+
+        With its value, and whether it is the minimum of a quadratic.
+        """
+        ahead, there, whole = self._stepped(y, step, value, weight)
+        if not self._many:
+            return ahead, there, whole
+        if there > value - SHORT * fall:
             # where a group is nearly zero, the norm bends more than Newton's step sees
             ahead = self._moved(ahead, self.slope(ahead, weight), self.grouped, C, weight)
-            return ahead, self.value(ahead, weight)
-        return ahead, there
+            there = self.value(ahead, weight)
+        return ahead, there, False
 
     def _newton(self, y: Array, slope: Array, C: Array, weight: float, ridge: float) -> tuple[Array, float]:
         """Return Newton's step (n,) on the face, and twice the fall that it promises."""
         step = np.zeros(len(y))
-        F = self.free(y).nonzero()[0]
+        F = self._places(y)
         if not len(F):
             return step, 0.0
-        if not len(self.groups):
+        if not self._many:
             g = (slope + (weight * self.price) * np.sign(y))[F]
             if C is self.gram and ridge == RIDGE:
-                _, found, info = _posv(self._raised.take(F, 0).take(F, 1), -g, lower=1, overwrite_a=1)
+                K = self._raised.take(F, 0).take(F, 1).T  # as LAPACK has it in memory
+                _, found, info = _posv(K, -g, lower=1, overwrite_a=1, overwrite_b=1)
                 if info == 0:
                     step[F] = found
-                    return step, float(-g @ found)
+                    return step, -float(g.dot(found))
             K = C.take(F, 0).take(F, 1)
         else:
             kink, bend = self.bent(y, weight)
             g = (slope + kink)[F]
             K = (C + bend).take(F, 0).take(F, 1)
         return self._solved(K, g, F, step, ridge)
+
+    def _places(self, y: Array) -> np.ndarray:
+        """Return the components that are on no kink and no bound."""
+        if self._plain:
+            return y.nonzero()[0]
+        return self.free(y).nonzero()[0]
 
     @cached_property
     def _raised(self) -> Array:
@@ -493,7 +577,7 @@ class Faces:
         own = np.maximum(diagonal, UNSEEN * diagonal.max())
         for _ in range(20):
             K.flat[:: len(F) + 1] = diagonal + ridge * own
-            _, found, info = _posv(K, -g, lower=1)
+            _, found, info = _posv(K.T, -g, lower=1)
             if info == 0:
                 break
             ridge = 10 * ridge
@@ -502,37 +586,49 @@ class Faces:
         step[F] = found
         return step, float(-g @ found)
 
-    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> tuple[Array, float]:
-        """Return the point after a step and its value: over all kinks where that is lower, else to the first."""
-        full = self._stopped(y, y + step)
+    def _stepped(self, y: Array, step: Array, value: float, weight: float) -> tuple[Array, float, bool]:
+        """Return the point after a step and its value: over all kinks where that is lower, else to the first.
+
+        And whether nothing stopped it.
+        """
+        full, whole = self._stopped(y, y + step)
         there = self.value(full, weight)
         if there < value:
-            return full, there
+            return full, there, whole
         share = self._first(y, step)
+        if share == 1 and there == value:
+            return full, there, whole
         for _ in range(40):
-            ahead = self._stopped(y, y + share * step)
+            ahead, _ = self._stopped(y, y + share * step)
             if share < 1:
                 ahead = self._snapped(y, step, ahead, share)
             there = self.value(ahead, weight)
             if there <= value:
-                return ahead, there
+                return ahead, there, False
             share = share / 2
-        return y, value
+        return y, value, False
 
-    def _stopped(self, y: Array, ahead: Array) -> Array:
-        """Return a point with components that passed a kink or a bound put on it."""
+    def _stopped(self, y: Array, ahead: Array) -> tuple[Array, bool]:
+        """Return a point with components that passed a kink or a bound put on it, and whether none did."""
+        inside = ahead
         if self.bounded:
-            ahead = np.minimum(np.maximum(ahead, self.lower), self.upper)
-        ahead[(ahead * y < 0) & self.kinked] = 0.0
-        return ahead
+            inside = np.minimum(np.maximum(ahead, self.lower), self.upper)
+        passed = inside * y < 0
+        if not self._plain:
+            passed &= self.kinked
+        if np.count_nonzero(passed):
+            inside[passed] = 0.0
+            return inside, False
+        return inside, inside is ahead or bool((inside == ahead).all())
 
     def _first(self, y: Array, step: Array) -> float:
         """Return how far along a step (at most 1) the first kink or bound is."""
         gap = self._stops - y
         passed = (gap * step > 0) & (np.abs(gap) < np.abs(step))
-        if not passed.any():
+        if not np.count_nonzero(passed):
             return 1.0
-        return float(np.min(np.divide(gap, step, out=np.ones_like(gap), where=passed)))
+        places, components = passed.nonzero()
+        return float((gap[places, components] / step[components]).min())
 
     @cached_property
     def _stops(self) -> Array:
@@ -572,6 +668,7 @@ class Faces:
             if np.linalg.norm(without) <= weight * self.groups[k]:
                 slope = slope - C[:, inside] @ y[inside]
                 y[inside] = 0.0
+                self._last.clear()
         return slope
 
     def _wrong(self, y: Array, slope: Array, weight: float) -> np.ndarray:
@@ -585,22 +682,22 @@ class Faces:
         else:  # what is held is zero
             wrong = np.abs(slope) > price + room
         wrong &= ~self.free(y)
-        if len(self.groups):
+        if self._many:
             steep = self.lengths(slope) - weight * self.groups
-            vain = ((self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)) @ self.picks > 0
-            wrong = np.where(self.grouped, vain, wrong)
+            vain = (self.lengths(y) == 0) & (steep > 4 * EPS * weight * self.groups)
+            wrong = np.where(self.grouped, vain[self._of], wrong)
         return wrong
 
     def _moved(self, y: Array, slope: Array, wrong: np.ndarray, C: Array, weight: float) -> Array:
         """Return the point after each component or group that is held in vain was moved to where it is best."""
         y = y.copy()
         slope = slope.copy()
-        alone = wrong & ~self.grouped
+        alone = wrong & self._alone
         for j in alone.nonzero()[0].tolist():
             moved = self._best_component(j, float(y[j]), float(slope[j]), float(C[j, j]), weight)
-            slope += C[:, j] * (moved - y[j])
+            slope += C[j] * (moved - y[j])  # as its column, which is no row of memory
             y[j] = moved
-        if not len(self.groups):
+        if not self._many:
             return y
         for k in np.unique(self.member[wrong & self.grouped]):
             inside = self.members[k]

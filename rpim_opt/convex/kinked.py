@@ -45,7 +45,8 @@ def minimum_on_faces(
     faces, split = _of(objective, damping)
     face = faces.minimum(weight, None if start is None else split.y(start))
     z = split.z(face.y)
-    r = objective.squared.triangle @ np.append(z, -1.0)
+    rows = objective.squared.triangle
+    r = rows[:, :-1] @ z - rows[:, -1]
     loss = float(r @ r) + objective.squared.offset
     return OnFaces(
         z, loss, faces.penalty(face.y) + split.constant, _held(objective, faces, face, weight), face.certain, face.good

@@ -66,6 +66,18 @@ class Largest:
 
     def norms(self, r: Array) -> Array:
         """Return |r_k + shift_k| (N,), or r itself where signs count."""
+        known = self._last.get("norms")
+        if known is None or known[0] is not r:  # value, slope and curvature ask for the same
+            known = (r, self._norms(r))
+            self._last["norms"] = known
+        return known[1]
+
+    @cached_property
+    def _last(self) -> dict[str, tuple[Array, Array]]:
+        """The last residual, and its norms."""
+        return {}
+
+    def _norms(self, r: Array) -> Array:
         s = r + self.shift
         if self.signed:
             return s
@@ -79,7 +91,7 @@ class Largest:
 
     def at(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
-        return float(np.max(self.values(r)))
+        return float(self.values(r).max())
 
     def directions(self, r: Array) -> Array:
         """Return the slope (m,) of every group's number by its own equations."""
@@ -87,6 +99,21 @@ class Largest:
             return self.a[self.which]
         factor = self.a / np.maximum(self.norms(r), NEAR_ZERO)
         return factor[self.which] * (r + self.shift)
+
+    def projected(self, rows: Array, r: Array) -> Array:
+        """Return the slopes (N, p) of the groups' numbers along the columns of rows (m, p), of residuals r (m,)."""
+        directions = self.directions(r)
+        each = self._alike
+        if not each:
+            return np.add.reduceat(directions[:, None] * rows, self.begin)
+        return np.einsum("nk,nkp->np", directions.reshape(-1, each), rows.reshape(-1, each, rows.shape[1]))
+
+    @cached_property
+    def _alike(self) -> int:
+        """Equations of every group that all have the same number; else 0."""
+        if np.ptp(self.sizes) > 0:
+            return 0
+        return int(self.sizes[0])
 
     def slope(self, r: Array, shares: Array) -> Array:
         """Return the slope (m,) of the groups' mean with shares (N,), which is a subgradient of the loss nearby."""
@@ -98,7 +125,7 @@ class Largest:
 
     def curvature(self, r: Array, shares: Array) -> tuple[np.ndarray, Array]:
         """Return the groups that have a share, and by what their norms' second derivatives are multiplied."""
-        heard = np.flatnonzero(shares)
+        heard = shares.nonzero()[0]
         if self.signed or self.starts is None:
             return heard[:0], np.empty(0)
         factor = shares[heard] * self.a[heard] / np.maximum(self.norms(r)[heard], NEAR_ZERO)

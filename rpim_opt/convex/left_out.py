@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,8 @@ DROPPED = 1e-13
 """Pivots below this belong to what nothing else decides."""
 RAISED, SAME = 1e-4, 1e-12
 """By how much norms are raised to see whether they matter to a loss; relative change of it that is rounding."""
+CLOSE = 3.0
+"""Ratio of weights up to which a path is about a line between them."""
 MANY = 1_000_000
 """Residuals that are in memory together, of many weights."""
 
@@ -133,28 +135,66 @@ class Folds:
     """
 
     def __init__(self, program: Program, parts: Sequence[np.ndarray]):
-        self._model = program.model
+        self._whole = program
         self._out = [np.isin(program.model.group, part) for part in parts]
         self._programs = list(_folds(program, parts))
         self._met: list[dict[float, Array]] = [{} for _ in parts]
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
+        if self._whole.worst is not None:  # most parts have no say in a largest norm: the minimum stays without them
+            self._whole.path(weights, rough=True)
         return np.hstack([self._norms(k, weights) for k in range(len(self._out))])
 
     def _norms(self, k: int, weights: Array) -> Array:
-        model, out, met = self._model, self._out[k], self._met[k]
-        near = None
-        if met:
-            near = met[min(met, key=lambda weight: abs(np.log(weight / np.max(weights))))]
-        Z = np.array([estimate.z for estimate in self._programs[k].path(weights, near, rough=True)])
-        if (weights > 0).all():
-            met |= dict(zip(weights, Z, strict=True))
+        model, out = self._whole.model, self._out[k]
+        Z = self._minima(k, weights)
         squares = (Z @ model.A[out].T - model.b[out]) ** 2
         _, which = np.unique(model.group[out], return_inverse=True)
         sums = np.zeros((len(weights), which.max() + 1))
         np.add.at(sums.T, which, squares.T)
         return np.sqrt(sums)
+
+    def _minima(self, k: int, weights: Array) -> Array:
+        """Return the solutions (K, n) without a part; of a penalty with kinks each from the nearest that is known."""
+        program, met = self._programs[k], self._met[k]
+        if program.faces is None or not (weights > 0).all():
+            return np.array([estimate.z for estimate in program.path(weights, rough=True)])
+        for weight in sorted({*weights.tolist()}, reverse=True):
+            met[weight] = program.path([weight], self._near(k, weight), rough=True)[0].z
+        return np.array([met[weight] for weight in weights.tolist()])
+
+    def _near(self, k: int, weight: float) -> Array | None:
+        """Return a point near the solution without a part: between its neighbours, or that without the part before."""
+        near = between(self._met[k], weight)
+        if k == 0:
+            return near
+        other = self._met[k - 1][weight]
+        faces, split = self._programs[k].faces, self._programs[k].split
+        if near is None or faces is None or split is None:
+            return other
+        return min(other, near, key=lambda z: faces.value(split.y(z), weight))
+
+
+def between(met: Mapping[float, Array], weight: float) -> Array | None:
+    """Return where a path (n,) is about at a weight: on a line between near neighbours, or at the nearest one.
+
+    The path of squares with kinks in the penalty is a line in the weight where it meets none.
+
+    >>> import numpy as np
+    >>> from rpim_opt.convex.left_out import between
+    >>> met = {1.0: np.array([0.0]), 2.0: np.array([4.0]), 90.0: np.array([9.0])}
+    >>> [between(met, weight).tolist() for weight in (1.5, 60.0)], between({}, 1.0)
+    ([[2.0], [9.0]], None)
+    """
+    if not met:
+        return None
+    lower = max((other for other in met if other <= weight), default=0.0)
+    upper = min((other for other in met if other >= weight), default=np.inf)
+    if lower < upper <= CLOSE * lower:
+        share = (weight - lower) / (upper - lower)
+        return (1 - share) * met[lower] + share * met[upper]
+    return met[min(met, key=lambda other: abs(np.log(other / weight)))]
 
 
 def solved_again(program: Program, weights: Array, parts: Sequence[np.ndarray]) -> Array:

@@ -13,9 +13,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.convex.whitened import FLAT, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Kinked, Whitened
 
-MOST, SOON = 100, 15
+MOST, SOON = 100, 30
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""
 BLUNT = 10.0
 """How sharp they then are, relative to those that a loss without multipliers begins with."""
@@ -27,8 +27,6 @@ DEAR = 200_000
 """Entries of the rows from which a second derivative is dear."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
-PROMISED = 1e-10
-"""Part of the objective by which it may be lower elsewhere, where points are compared."""
 SLOW = 0.1
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12
@@ -255,7 +253,7 @@ class Newton(Whitened):
         gap, by_z = self.bound(point.z, point.a, slope)
         smooth = point.smooth
         loss, missing = self.loss.missed(point.r, smooth)
-        objective = loss + float(self.pull @ point.a**2)
+        objective = loss + float(self.pull.dot(point.a**2))
         state = Kinked(smooth.multipliers, point.kinked.sharpness, point.kinked.curved)
         return Ended(point.z, gap + missing, objective, loss, steps, state, by_z, smooth.slope, missing)
 
@@ -301,7 +299,7 @@ class Newton(Whitened):
 
     def _hessian(self, point: Point) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
-        curvatures = self.loss.curvature(point.r, *point.kinked[:2])
+        curvatures = self.loss.curvature(point.r, point.smooth, point.kinked.sharpness)
         across = curvatures[0].across
         for more in curvatures[1:]:
             across = across + more.across
@@ -332,7 +330,7 @@ class Newton(Whitened):
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""
-        ahead = self.at.rows @ step
+        ahead = self.at.rows.dot(step)  # of short vectors, calls are dear: `dot` is a shorter one than `@`
         of_penalty = 2 * self.pull * step
 
         def at(t: float) -> Point:
@@ -341,7 +339,7 @@ class Newton(Whitened):
             return Point(point.z + t * (z - point.z), point.a + t * step, r, point.kinked, smooth)
 
         def rise(p: Point) -> float:
-            slope = float(p.smooth.slope @ ahead + p.a @ of_penalty)
+            slope = float(p.smooth.slope.dot(ahead) + p.a.dot(of_penalty))
             if np.isfinite(slope) and np.isfinite(p.smooth.without_kinks):
                 return slope
             return np.inf
@@ -354,5 +352,5 @@ class Newton(Whitened):
     def _place(self, point: Point) -> Array:
         """Return z (n,) of a point that a search has found: free of rounding, or inside the box."""
         if self.box is None:
-            return self.at.offset + self.at.B @ point.a
+            return self.at.offset + self.at.B.dot(point.a)
         return np.clip(point.z, *self.box)

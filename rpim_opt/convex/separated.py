@@ -33,12 +33,21 @@ class Curvature(NamedTuple):
     u: Array = NONE
 
 
+class Rounded(NamedTuple):
+    """A smoothed kink: t = sharpness s + y (m,), its norms (N,), and what part of t the multiplier anew is, (N,)."""
+
+    t: Array
+    length: Array
+    share: Array
+
+
 class Smoothed(NamedTuple):
     """A loss with kinks smoothed: its slope (m,), the kinks' multipliers anew, and the value of what is no kink."""
 
     slope: Array
     multipliers: list[Array]
     without_kinks: float
+    kinks: list[Rounded]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +117,10 @@ class Separated:
     def kinks(self) -> list[Kink]:
         """The kinks, as norms of groups or as absolute values of equations."""
         if self.starts is None:
-            return list(self.rows.kinks)
+            return [Kink(np.broadcast_to(factor, self.count), of) for factor, of in self.rows.kinks]
         if self.straight or np.all(self.at_zero == 0):
             return []
-        return [Kink(self.at_zero, PLAIN)]
+        return [Kink(np.broadcast_to(self.at_zero, len(self.starts)), PLAIN)]
 
     def slope_of_norms(self, v: Array) -> Array:
         """Return f_i' (N,) at norms of groups, on the right where there is a kink."""
@@ -211,39 +220,41 @@ class Separated:
 
     def _bent(self, r: Array) -> list[float]:
         """Return the value of every kink at a residual (m,)."""
-        return [float((factor * self._norms(_along(of, r))).sum()) for factor, of in self.kinks]
+        return [float(factor.dot(self._norms(_along(of, r)))) for factor, of in self.kinks]
 
     def smoothed(self, r: Array, y: list[Array], sharpness: float) -> Smoothed:
         """Return the loss with its kinks smoothed about multipliers, (m,) each."""
         value, slope = self._smooth(r)
         anew = []
+        rounded = []
         for (factor, of), old in zip(self.kinks, y, strict=True):
             t = sharpness * _along(of, r) + old
-            new = t * self._spread(np.minimum(1.0, factor / np.maximum(self._norms(t), NEAR_ZERO)))
+            length = np.maximum(self._norms(t), NEAR_ZERO)
+            share = np.minimum(1.0, factor / length)
+            new = t * self._spread(share)
             anew.append(new)
+            rounded.append(Rounded(t, length, share))
             slope = slope + of.a * new
-        return Smoothed(slope, anew, value)
+        return Smoothed(slope, anew, value, rounded)
 
     def missed(self, r: Array, smoothed: Smoothed) -> tuple[float, float]:
         """Return the loss of a residual (m,), and what the multipliers there miss of its kinks."""
         bent = sum(self._bent(r))
-        reached = sum(float(y @ _along(of, r)) for (_, of), y in zip(self.kinks, smoothed.multipliers, strict=True))
+        reached = sum(float(y.dot(_along(of, r))) for (_, of), y in zip(self.kinks, smoothed.multipliers, strict=True))
         return smoothed.without_kinks + bent, bent - reached
 
-    def curvature(self, r: Array, y: list[Array], sharpness: float) -> list[Curvature]:
+    def curvature(self, r: Array, smoothed: Smoothed, sharpness: float) -> list[Curvature]:
         """Return the second derivative of the smoothed loss, as a sum."""
         found = []
-        if self._curved.pieces or not y:
+        if self._curved.pieces or not smoothed.kinks:
             found.append(self._smooth_curvature(r))
-        for (factor, of), old in zip(self.kinks, y, strict=True):
-            t = sharpness * _along(of, r) + old
-            length = np.maximum(self._norms(t), NEAR_ZERO)
-            inside = length <= factor
+        for (factor, of), (t, length, share) in zip(self.kinks, smoothed.kinks, strict=True):
+            outside = length > factor
             if self.starts is None:
-                found.append(Curvature(of.a**2 * sharpness * inside))
+                found.append(Curvature(of.a**2 * sharpness * ~outside))
                 continue
-            across = sharpness * np.minimum(1.0, factor / length)
-            found.append(Curvature(self._spread(across), across * (inside - 1.0), t / self._spread(length)))
+            across = sharpness * share
+            found.append(Curvature(self._spread(across), -across * outside, t / self._spread(length)))
         return found
 
     def _smooth_curvature(self, r: Array) -> Curvature:

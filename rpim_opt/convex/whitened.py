@@ -16,8 +16,12 @@ ACCEPTED = 1e-10
 """Duality gap, relative to the objective, that a method must reach."""
 SOUGHT = 1e-12
 """Duality gap, relative to the objective, that methods go on to while it falls."""
+PROMISED = 1e-10
+"""Part of the objective by which it may be lower elsewhere, where points are compared."""
 VAIN = 3
 """Steps that lower the gap no more, after which a good point is taken."""
+HALF = 0.5
+"""Part of the gap before a step that one of a hasty method may leave, if it is larger than one met before."""
 FLAT = 1e-10
 """Curvature that unknowns without penalty have at least, where the data have about one."""
 FAR = 100.0
@@ -64,23 +68,33 @@ class Ended(NamedTuple):
 
 @dataclass
 class Best:
-    """The point with the smallest gap that a method has met, and how many after it had none smaller."""
+    """The point with the smallest gap that a method has met, and how many after it had none smaller.
+
+    Of those, how many at last came no nearer: where kinks are sharp, the first step may lead far from a small gap.
+    """
 
     ended: Ended
     vain: int = 0
+    stuck: int = 0
+    last: float = np.inf
 
     def meets(self, ended: Ended) -> None:
         """Take note of another point."""
         self.vain += 1
+        self.stuck += 1
+        if ended.gap <= HALF * self.last:
+            self.stuck = 0
+        self.last = ended.gap
         if ended.gap < self.ended.gap:
             self.ended = ended
             self.vain = 0
+            self.stuck = 0
 
     def will_do(self, sought: float = SOUGHT, hasty: bool = False) -> bool:
         """Whether nothing is left to go on for: the gap is as sought, or falls no more and is good or one is hasty."""
         if self.ended.gap <= sought * abs(self.ended.objective):
             return True
-        return self.vain >= VAIN and (self.ended.good or hasty)
+        return (self.vain >= VAIN and self.ended.good) or (hasty and self.stuck >= VAIN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +172,7 @@ class Whitened:
 
     def slope(self, a: Array, of_loss: Array) -> Array:
         """Return the objective's slope by the coordinates in their units, (p,), from the loss's (m,)."""
-        return self.unit * (self.at.rows.T @ of_loss + 2 * self.pull * a)
+        return self.unit * (self.at.rows.T.dot(of_loss) + 2 * self.pull * a)
 
     def bound(self, z: Array, a: Array, slope: Array) -> tuple[float, Array | None]:
         """Return by how much a minorant of that slope (p,) may fall at most, and its slope by z (n,) in a box."""
@@ -166,7 +180,7 @@ class Whitened:
         if self.box is not None:
             by_z = self.back.T @ slope
             slope = (self.at.B * self.unit).T @ np.where(self.held(z, by_z), 0.0, by_z)
-        gap = float(slope**2 @ self._price)
+        gap = float((slope**2).dot(self._price))
         free = self.free
         if len(free):
             gap += FAR * float(np.abs(slope[free]) @ (1 + np.abs(a[free] / self.unit[free])))

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.epigraph import Epigraph, Least
 from rpim_opt.convex.largest import Largest
-from rpim_opt.convex.whitened import ACCEPTED, FLAT, SOUGHT, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import ACCEPTED, FLAT, PROMISED, SOUGHT, Best, Ended, Kinked, Whitened
 
 MOST, CHANGES = 40, 1000
 """Quadratic programs, and changes of the set in each, after which another method is asked."""
@@ -58,7 +58,8 @@ class Worst(Whitened):
     at, weight, box
         As for `Whitened`.
     rough
-        Whether a gap will do that is small enough for a rule, which compares points.
+        Whether a gap will do that is small enough for a rule, which compares points, or that a quadratic program
+        promises to lower the objective by no more than `PROMISED` of it.
     """
 
     loss: Largest
@@ -82,6 +83,8 @@ class Worst(Whitened):
             ahead = self._next(point, steps)
             if ahead is None:
                 break
+            if ahead.ended.close:
+                return ahead.ended
             point = ahead
             best.meets(point.ended)
         return best.ended
@@ -95,12 +98,14 @@ class Worst(Whitened):
         return Point(z, a, r, shares, Ended(z, gap, objective, loss, steps, Kinked([shares], 1.0), by_z, of_loss))
 
     def _next(self, point: Point, steps: int) -> Point | None:
-        """Return the point after a quadratic program; None where that leads nowhere."""
+        """Return the point after a quadratic program, or the same where it is close; None where that leads nowhere."""
         least = self._step(point)
         if least is None:
             return None
-        whole = self._moved(point, least, 1.0, steps)
         promised = point.ended.objective - least.t - float(self.pull @ (point.a + self.unit * least.d) ** 2)
+        if self.rough and promised <= PROMISED * abs(point.ended.objective):
+            return point._replace(ended=point.ended._replace(close=True))
+        whole = self._moved(point, least, 1.0, steps)
         near = NEAR * abs(point.ended.objective)
         if whole.ended.gap <= (1 - FALL) * point.ended.gap and whole.ended.gap <= near:
             return whole
@@ -140,12 +145,11 @@ class Worst(Whitened):
 
     def _step(self, point: Point) -> Least | None:
         loss = self.loss
-        directions = loss.directions(point.r)
-        G = np.add.reduceat(directions[:, None] * self.at.rows, loss.begin) * self.unit
+        G = loss.projected(self.at.rows, point.r) * self.unit
         values = loss.values(point.r)
-        H = self._hessian(point, directions)
+        H = self._hessian(point, G)
         g = 2 * self.unit * self.pull * point.a
-        start = np.flatnonzero(point.shares)
+        start = point.shares.nonzero()[0]
         s = np.ones(len(values))
         if self.box is not None:
             room = np.abs(self._bounds.at - point.z[self._bounds.of])
@@ -162,20 +166,18 @@ class Worst(Whitened):
         rows = np.vstack([-by_step[low], by_step[high]])
         return Bounds(np.append(low, high), np.append(lower[low], upper[high]), rows)
 
-    def _hessian(self, point: Point, directions: Array) -> Array:
-        """Return the second derivative (p, p) of the shares' mean and the penalty, by coordinates in their units."""
+    def _hessian(self, point: Point, G: Array) -> Array:
+        """Return the second derivative (p, p) of the shares' mean and the penalty, by coordinates in their units.
+
+        G (N, p) are the slopes of the groups' numbers.
+        """
         heard, factor = self.loss.curvature(point.r, point.shares)
         H = np.zeros((len(self.unit), len(self.unit)))
         if len(heard):
-            places = np.flatnonzero(point.shares[self.loss.which])
+            places = point.shares[self.loss.which].nonzero()[0]
             rows = self.at.rows[places] * self.unit
-            sizes = self.loss.sizes[heard]
-            first = np.cumsum(sizes) - sizes
-            which = np.repeat(np.arange(len(heard)), sizes)
-            along = directions[places] / self.loss.a[self.loss.which[places]]
-            across = np.add.reduceat(along[:, None] * rows, first)
-            H = rows.T @ (factor[which][:, None] * rows) - across.T @ (factor[:, None] * across)
-        flat = np.zeros(len(H))
-        flat[self.pull == 0] = FLAT
-        H.flat[:: len(H) + 1] += 2 * self.pull * self.unit**2 + flat
+            by_row = np.repeat(factor, self.loss.sizes[heard])
+            across = G[heard] / self.loss.a[heard, None]
+            H = rows.T @ (by_row[:, None] * rows) - across.T @ (factor[:, None] * across)
+        H.flat[:: len(H) + 1] += np.maximum(2 * self.pull * self.unit**2, FLAT)
         return H

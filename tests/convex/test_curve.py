@@ -47,10 +47,28 @@ def test_the_curvature_is_that_of_the_curve() -> None:
 def test_a_score_is_the_curvature_of_the_points_that_were_solved() -> None:
     model = simulated(configurations=20, noise=1e-4, seed=1)[0].linearize(np.zeros(34))
     program = ro.convex.pose(ro.lasso, model)
-    weights = weight_grid(program, 12)
+    weights = weight_grid(program, 12)[:-1]  # at the last one the penalty is zero, which has no logarithm
     path = program.path(weights)
     points = [[0.5 * np.log(each.loss), 0.5 * np.log(each.penalty)] for each in path]
     assert select_curve._on_grid(program, weights)[1] == pytest.approx(menger(np.array(points)), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("formulation", "kinks"), [(ro.robust, False), (ro.sum_of_norms, True)], ids=["robust", "norms"]
+)
+def test_a_path_that_meets_a_kink_is_looked_at_all_over_the_grid(formulation: ro.Formulation, kinks: bool) -> None:
+    """Where configurations are met exactly, a path bends in jumps, and large steps may miss its sharpest corner."""
+    model = simulated(configurations=15, noise=1e-4, seed=1)[0].linearize(np.zeros(34))
+    weights = weight_grid(ro.convex.pose(ro.tikhonov, model), 40)
+    path = ro.convex.pose(formulation, model).path(weights)
+    met = [np.min(program_norms) <= 1e-3 * np.median(program_norms)
+           for program_norms in (ro.convex.pose(formulation, model).norms(each.z) for each in path)]  # fmt: skip
+    assert any(met) == kinks
+    some, score = select_curve._on_grid(ro.convex.pose(formulation, model), weights)
+    assert (len(some) == len(weights)) == kinks
+    whole = menger(0.5 * np.log([[each.loss, each.penalty] for each in path]))
+    assert some[np.argmax(score)] == weights[np.argmax(whole)]
+    assert score.max() == pytest.approx(whole.max(), rel=1e-3)
 
 
 def test_about_a_corner_two_weights_on_both_sides_are_looked_at_and_its_neighbours() -> None:

@@ -146,8 +146,9 @@ def test_a_step_never_raises_the_objective_nor_leaves_the_box(kind: str) -> None
         for size in (0.1, 1.0, 10.0):
             slope = faces.slope(y, 1.0) + faces.bent(y, 1.0)[0]
             step = -size * slope / np.linalg.norm(slope)
-            ahead, there = faces._stepped(y, step, value, 1.0)
+            ahead, there, whole = faces._stepped(y, step, value, 1.0)
             assert faces.value(ahead, 1.0) == there <= value
+            assert whole == np.array_equal(ahead, y + step)
             assert (ahead >= faces.lower).all()
             assert (ahead <= faces.upper).all()
             share = faces._first(y, step)

@@ -53,6 +53,26 @@ def test_folds_of_triangles_are_fits_without_their_rows(formulation: ro.Formulat
         place += len(part)
 
 
+@pytest.mark.parametrize(
+    ("formulation", "off"),
+    [(ro.tikhonov, 1e-9), (BOXED, 1e-7), (ro.lasso, 1e-7), (GROUPS, 1e-6), (ro.sum_of_norms, 1e-4), (ro.minimax, 1e-4)],
+    ids=lambda v: getattr(v, "name", ""),
+)
+def test_weights_asked_for_later_get_what_they_would_have_got_alone(formulation: ro.Formulation, off: float) -> None:
+    """Wherever they begin: between known weights, or with another part left out.
+
+    What a rule compares is within 1e-10 of its minimum where Newton's method or quadratic programs find it: norms
+    within 1e-5 of the root of that.
+    """
+    program = ro.convex.pose(formulation, MODEL)
+    parts = [np.array([0, 5]), np.array([1]), np.arange(6, 12)]
+    folds = Folds(program, parts)
+    folds.norms(np.array([40.0, 2.0, 0.3]))
+    later = np.array([1.2, 3.0, 0.3, 40.0])
+    alone = np.vstack([Folds(ro.convex.pose(formulation, MODEL), parts).norms(later[[k]]) for k in range(4)])
+    assert folds.norms(later) == pytest.approx(alone, rel=off)
+
+
 def test_a_step_of_squares_is_exact_where_the_face_stays() -> None:
     for formulation in (ro.tikhonov, BOXED, ro.lasso):
         program = ro.convex.pose(formulation, MODEL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import cvxpy as cp
@@ -13,7 +14,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.select import SELECTORS, disagreement
 from rpim_opt.convex.select_curve import _points, menger
-from rpim_opt.convex.select_held_out import _held_out, held_out_error
+from rpim_opt.convex.select_held_out import AHEAD, _end_of_fall, _held_out, held_out_error
 from rpim_opt.convex.select_linear import _lowest
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.problem.linear import LinearModel
@@ -278,6 +279,38 @@ def test_two_steps_are_those_of_the_paper() -> None:
     assert chosen.weight == chosen.weights[k]
     assert chosen.interior == (0 < k < 9)
     assert ("a wider search would go on" in chosen.note) != chosen.interior
+
+
+class Fall:
+    """A program whose residual norm falls by a tenth a weight, down to the one where the fall ends."""
+
+    def __init__(self, end: int, closed_form: bool):
+        self.closed_form = closed_form
+        self.end = end
+        self.asked: list[float] = []
+
+    def path(self, weights: np.ndarray, near: Any = None, rough: bool = False) -> list[SimpleNamespace]:
+        assert (near is None) == (not self.asked)
+        assert near is None or near == self.asked[-1]
+        places = len(self.asked) + np.arange(len(weights))
+        self.asked += weights.tolist()
+        norms = 0.9 ** np.minimum(places, self.end) * 0.991 ** np.maximum(places - self.end, 0)
+        return [SimpleNamespace(z=w, loss=norm**2) for w, norm in zip(weights, norms, strict=True)]
+
+
+@pytest.mark.parametrize("end", [0, 3, AHEAD - 2, AHEAD - 1, AHEAD, 17, 28])
+def test_a_fall_ends_where_one_more_step_brings_less_than_a_hundredth(end: int) -> None:
+    weights = np.geomspace(1.0, 1e-10, 30)
+    whole, some = Fall(end, closed_form=True), Fall(end, closed_form=False)
+    assert _end_of_fall(whole, weights) == _end_of_fall(some, weights) == weights[end]  # type: ignore[arg-type]
+    assert len(whole.asked) == 30
+    assert some.asked == weights[: AHEAD * ((end + 1) // AHEAD + 1)].tolist()  # no farther than where that is seen
+
+
+def test_a_fall_without_end_leaves_the_weight() -> None:
+    weights = np.geomspace(1.0, 1e-10, 30)
+    for closed_form in (True, False):
+        assert _end_of_fall(Fall(29, closed_form), weights) == weights[0]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("best", [0, 1, 8, 9])

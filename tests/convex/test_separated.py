@@ -111,7 +111,7 @@ def test_slope_and_curvature_are_the_derivatives(name: str) -> None:
     assert found.slope == pytest.approx(slope, rel=1e-6, abs=1e-6)
     bend = np.array([(one.slope - other.slope) / 2e-6 for one, other in ahead])
     whole = np.zeros((loss.count, loss.count))
-    for across, along, u in loss.curvature(r, y, SHARPNESS):
+    for across, along, u in loss.curvature(r, found, SHARPNESS):
         whole += np.diag(np.broadcast_to(across, loss.count))
         if len(u):
             whole += np.outer(u, u) * np.equal.outer(loss.which, loss.which) * along[loss.which]
@@ -165,7 +165,7 @@ def test_away_from_zero_norms_have_no_kinks(name: str) -> None:
     assert away.slope_of_norms(v) == pytest.approx(slopes, rel=1e-7)
     bend = np.array([(away.smoothed(r + d, [], 1.0).slope - away.smoothed(r - d, [], 1.0).slope) / (2 * h)
                      for d in h * np.eye(loss.count)])  # fmt: skip
-    (curvature,) = away.curvature(r, [], 1.0)
+    (curvature,) = away.curvature(r, away.smoothed(r, [], 1.0), 1.0)
     same = np.equal.outer(loss.which, loss.which)
     whole = np.diag(curvature.across) + same * np.outer(curvature.u, curvature.u) * curvature.along[loss.which]
     assert whole == pytest.approx(bend, rel=1e-5, abs=1e-6)
