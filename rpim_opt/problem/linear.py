@@ -12,6 +12,7 @@ from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
@@ -126,7 +127,7 @@ def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
     n = A.shape[1] + 1
     together = min(n, WIDE if n >= MANY else NARROW)
     above = 0 if R is None else len(R)
-    stacked = np.empty((max(above + len(b), n), n), order="F")
+    stacked = room("stacked", n, max(above + len(b), n)).T
     stacked[:above] = 0 if R is None else R
     stacked[above : above + len(b), :-1] = A
     stacked[above : above + len(b), -1] = b

@@ -12,6 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
@@ -497,7 +498,7 @@ class CalibrationProblem(Tabled):
         return replace(weighed, offset=offset)
 
     def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model of `linearize` some rows at a time, block by block.
+        """Yield the linear model of `linearize` some rows at a time, block by block; each stands until the next one.
 
         Parameters
         ----------
@@ -523,7 +524,7 @@ class CalibrationProblem(Tabled):
             each = len(block.measurement.components)
             for start in range(0, len(block.row), most):
                 part = slice(start, start + most)
-                A, b = self._equations(i, x, part)
+                A, b = self._equations(i, x, part, passing=most < len(block.row))
                 group = np.repeat(self.data.configuration[block.row[part]], each)
                 yield LinearModel(A, b, group, self._identified, constrained)
 
@@ -533,15 +534,19 @@ class CalibrationProblem(Tabled):
         only = self.robots if isinstance(self.robots, Robot) else None
         return identified_of(only, self.parameters, self.data)
 
-    def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
+    def _equations(self, i: int, x: Array, part: slice, passing: bool) -> tuple[Array, Array]:
         """Return whitened, scaled A and b of some rows of a block; the columns of A stand together, as LAPACK asks."""
         whitening = self._whitening[i]
         L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part)
+        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part, passing=True)
         scale = self.parameters.free.scale
-        columns = _weighted(L, jacobian.transpose(1, 2, 0), scale)
-        A = columns.reshape(len(scale), -1).T
-        r = _weighted(L, residual.transpose(2, 1, 0), np.ones(1)).ravel()
+        N, k, n = jacobian.shape
+        if passing:
+            columns = room("columns", n, N, k)
+        else:
+            columns = np.empty((n, N, k))
+        A = _weighted(L, jacobian.transpose(1, 2, 0), scale, columns).reshape(n, -1).T
+        r = _weighted(L, residual.transpose(2, 1, 0), np.ones(1), np.empty((1, N, k))).ravel()
         return A, r + A @ (x / scale)
 
     def _scattered(self, x: Array, most: int, constrained: bool) -> Iterator[LinearModel]:
@@ -815,11 +820,13 @@ class CalibrationProblem(Tabled):
             begin += k * len(block.row)
         return blocks
 
-    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+    def _evaluate(
+        self, block: Block, what: str, x: Array, part: slice = slice(None), passing: bool = False
+    ) -> list[Array]:
         rows = self._rows(block, part)
         function = self._functions(block)[what]
         with phase("evaluation"):
-            return evaluated(function, [x, self.parameters.nominal], rows)
+            return evaluated(function, [x, self.parameters.nominal], rows, passing)
 
     def _functions(self, block: Block) -> Functions:
         if id(block) not in self._structures:
@@ -910,10 +917,9 @@ def _cholesky(covariance: Array) -> Array:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
 
-def _weighted(L: Array, values: Array, scale: Array) -> Array:
-    """Return L (N or 1, k, k) times values (k, c, N) of every row times scales (c,), as (c, N, k)."""
-    k, c, N = values.shape
-    found = np.empty((c, N, k))
+def _weighted(L: Array, values: Array, scale: Array, found: Array) -> Array:
+    """Return L (N or 1, k, k) times values (k, c, N) of every row times scales (c,), in ``found`` (c, N, k)."""
+    k = len(values)
     nonzero = np.any(L, axis=0)
     for i in range(k):
         first, *others = np.flatnonzero(nonzero[i])  # a triangle's diagonal has no zero

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.room import room
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.compiled import compiled
 from rpim_opt.robot.kinematics import call_rows
@@ -59,7 +60,7 @@ def _effort(_: ca.Function) -> _Effort:
     return _Effort()
 
 
-def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array, passing: bool = False) -> list[Array]:
     """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows.
 
     Of many rows the values of every number stand side by side in memory: (N, c, r) arrays whose first axis is dense.
@@ -68,11 +69,18 @@ def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     ----------
     function, shared, rows
         As `call_rows` has them.
+    passing
+        Whether the caller is done with the values when it next asks in the same thread.
     """
     way = _quickest(function, len(shared), len(rows))
     if way is None:
         return call_rows(function, shared, rows)
-    numbers = _on_columns(way, shared, rows)
+    size = sum(r * c for r, c in way.shapes)
+    if passing:
+        numbers = room("evaluated", size, len(rows))
+    else:
+        numbers = np.empty((size, len(rows)))
+    _on_columns(way, shared, rows, numbers)
     found = []
     end = 0
     for r, c in way.shapes:
@@ -204,10 +212,9 @@ def _own(way: Abreast, _thread: int) -> _Own:
     return _Own(way)
 
 
-def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array) -> Array:
-    """Return the numbers (numbers, N) of a table (N, k)."""
+def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Array) -> None:
+    """Find the numbers (numbers, N) of a table (N, k)."""
     N = len(rows)
-    found = np.empty((sum(r * c for r, c in way.shapes), N))
 
     def evaluate(begin: int) -> None:
         own = _own(way, threading.get_ident())
@@ -218,7 +225,6 @@ def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array) -> Array:
             _together(own, rows[start : start + WIDTH], found[:, start : start + WIDTH])
 
     on_all_cores(evaluate, range(0, N, SHARE))
-    return found
 
 
 def _together(own: _Own, rows: Array, found: Array) -> None:
