@@ -24,6 +24,8 @@ from rpim_opt.robot.posture import SYMBOLS
 
 WIDTH = 256
 """Rows abreast in the virtual machine: their numbers stay in the processor's second cache."""
+NARROW = 64
+"""Rows abreast of small tables."""
 VECTOR = 16
 """Rows abreast in machine code: two of the widest vectors."""
 SHARE = 16 * WIDTH
@@ -93,29 +95,31 @@ def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
     """Return how a function is evaluated at some rows more; None for one after the other."""
     effort = _effort(function)
     effort.rows += rows
+    count = WIDTH
+    while rows <= count // 2 and count > VECTOR:  # few of them are evaluated for nothing
+        count //= 2
     if effort.rows < PAYS:
         return None
     if effort.rows >= SOME and function.n_instructions() <= LONGEST:
-        made = _machine_code(function, shared, effort.rows >= MANY)
+        made = _machine_code(function, shared, count // VECTOR, effort.rows >= MANY)
         if made is not None:
             return made
-    return abreast(function, shared)
+    return abreast(function, shared, max(count, NARROW))
 
 
 @lru_cache(maxsize=256)
-def _machine_code(function: ca.Function, shared: int, make: bool) -> Abreast | None:
+def _machine_code(function: ca.Function, shared: int, times: int, make: bool) -> Abreast | None:
     way = abreast(function, shared, VECTOR)
     if way is None:
         return None
     made = compiled(way.rows, make)
     if made is None:
         return None
-    times = WIDTH // VECTOR
     return way._replace(rows=ca.Function.map(made, "rows", "serial", times, [0], [], {}), times=times)
 
 
 @lru_cache(maxsize=256)
-def abreast(function: ca.Function, shared: int, width: int = WIDTH) -> Abreast | None:
+def abreast(function: ca.Function, shared: int, width: int) -> Abreast | None:
     """Return a function of scalar operations on many rows; None for one that calls others.
 
     Parameters
@@ -199,6 +203,7 @@ class _Own:
 
     def __init__(self, way: Abreast):
         rows = way.rows
+        self.count = way.times * way.width
         common = np.zeros(rows.size1_in(0))
         self.table = np.zeros((way.times, rows.size2_in(1) // way.times, way.width))
         self.numbers = np.zeros((way.times, rows.size2_out(0) // way.times, way.width))
@@ -221,22 +226,26 @@ def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Array
         for own_values, values in zip(own.shared, shared, strict=True):
             own_values[:] = values
         own.common.evaluate()
-        for start in range(begin, min(begin + SHARE, N), WIDTH):
-            _together(own, rows[start : start + WIDTH], found[:, start : start + WIDTH])
+        for start in range(begin, min(begin + SHARE, N), own.count):
+            part = slice(start, start + own.count)
+            _together(own, rows[part], found[:, part])
 
     on_all_cores(evaluate, range(0, N, SHARE))
 
 
 def _together(own: _Own, rows: Array, found: Array) -> None:
-    """Evaluate some rows, at most `WIDTH`, in one call; the last one stands for those that are not there."""
-    N = len(rows)
-    if N < WIDTH:
-        rows = np.pad(rows, ((0, WIDTH - N), (0, 0)), mode="edge")
+    """Evaluate as many rows as go into one call, or fewer; the last one stands for those that are not there."""
+    there = len(rows)
+    if there < own.count:
+        given = rows
+        rows = np.empty((own.count, given.shape[1]))
+        rows[:there] = given
+        rows[there:] = given[-1]
     inputs = own.table.transpose(1, 0, 2)
     inputs[:] = rows.T.reshape(inputs.shape)
     own.rows.evaluate()
     numbers = own.numbers.transpose(1, 0, 2)
-    if N == WIDTH:
-        found.reshape(numbers.shape)[:] = numbers
+    if there < own.count:
+        found[:] = numbers.reshape(len(found), own.count)[:, :there]
     else:
-        found[:] = numbers.reshape(len(found), WIDTH)[:, :N]
+        found.reshape(numbers.shape)[:] = numbers
