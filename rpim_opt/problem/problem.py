@@ -919,10 +919,9 @@ def _cholesky(covariance: Array) -> Array:
 
 def _weighted(L: Array, values: Array, scale: Array, found: Array) -> Array:
     """Return L (N or 1, k, k) times values (k, c, N) of every row times scales (c,), in ``found`` (c, N, k)."""
-    k = len(values)
-    nonzero = np.any(L, axis=0)
-    for i in range(k):
-        first, *others = np.flatnonzero(nonzero[i])  # a triangle's diagonal has no zero
+    nonzero = np.any(L, axis=0).tolist()
+    for i, terms in enumerate(nonzero):
+        first, *others = [j for j, there in enumerate(terms) if there]  # a triangle's diagonal has no zero
         np.multiply(values[first], _factors(L[:, i, first], scale), out=found[:, :, i])
         for j in others:
             found[:, :, i] += values[j] * _factors(L[:, i, j], scale)
