@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -174,7 +175,7 @@ def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callabl
 def labels(table: Columns, N: int) -> tuple[str, ...]:
     """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
     if "label" not in table:
-        label = tuple(str(i) for i in range(1, N + 1))
+        label = _numbers(N)
     else:
         label = texts(table["label"], "label")
         require_unique(label, "label")
@@ -183,6 +184,12 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
             if not name:
                 raise InputError(f"row {label[i]}, column {column}", "''", "a name")
     return label
+
+
+@lru_cache(maxsize=8)
+def _numbers(N: int) -> tuple[str, ...]:
+    """Return the labels of rows that have none; tables in parts are as long as each other, and read again and again."""
+    return tuple(map(str, range(1, N + 1)))
 
 
 def require_unique(names: Sequence[str], column: str) -> None:

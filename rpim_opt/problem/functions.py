@@ -73,6 +73,30 @@ class Kept:
                 self._functions[structure, measurement] = asked(structure, measurement)
             return self._functions[structure, measurement]
 
+    def __getstate__(self) -> dict[tuple[Structure, Measurement], dict[str, str]]:
+        """Return what cannot be asked for elsewhere: answers of a user's functions, as they were."""
+        return {
+            key: {name: function.serialize() for name, function in functions.items()}
+            for key, functions in self._functions.items()
+            if not _is_pure(*key)
+        }
+
+    def __setstate__(self, kept: dict[tuple[Structure, Measurement], dict[str, str]]) -> None:
+        self._functions = {
+            key: {name: _restored(text) for name, text in functions.items()} for key, functions in kept.items()
+        }
+
+
+@lru_cache(maxsize=256)
+def _restored(text: str) -> ca.Function:
+    """Return a function that was sent, the same one every time: what was prepared for many rows of it is not lost."""
+    return ca.Function.deserialize(text)
+
+
+def _is_pure(structure: Structure, measurement: Measurement) -> bool:
+    """Whether the functions depend on nothing but what is asked."""
+    return measurement in _READY and not structure.terms
+
 
 def asked(structure: Structure, measurement: Measurement) -> Functions:
     """Return the functions of a row.
@@ -85,7 +109,7 @@ def asked(structure: Structure, measurement: Measurement) -> Functions:
     InputError
         For a residual with more or fewer components than the measurement declares.
     """
-    if measurement in _READY and not structure.terms:
+    if _is_pure(structure, measurement):
         return _ready(structure, measurement)
     with SYMBOLS:
         expressions = _expressions(structure, measurement)

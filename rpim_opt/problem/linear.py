@@ -12,6 +12,7 @@ from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
@@ -106,7 +107,11 @@ class LinearModel(Brief):
 BLOCK = 430_000
 """Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
 triangles of the blocks cost little beside them."""
-_geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
+_geqrt: Any = get_lapack_funcs("geqrt", dtype=float)
+NARROW, WIDE = 8, 32
+"""Columns that are reduced together, of matrices with few and with many columns: as is quickest."""
+MANY = 100
+"""Columns from which there are many."""
 
 
 def reduced_rows(rows: Array, R: Array | None = None) -> Array:
@@ -115,15 +120,19 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
 
 
 def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
-    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR."""
+    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR.
+
+    LAPACK's blocked one whose blocks are reduced by halves: twice as fast as the usual one where rows are many.
+    """
     n = A.shape[1] + 1
+    together = min(n, WIDE if n >= MANY else NARROW)
     above = 0 if R is None else len(R)
-    stacked = np.empty((max(above + len(b), n), n), order="F")
+    stacked = room("stacked", n, max(above + len(b), n)).T
     stacked[:above] = 0 if R is None else R
     stacked[above : above + len(b), :-1] = A
     stacked[above : above + len(b), -1] = b
     stacked[above + len(b) :] = 0.0
-    factors = _geqrf(stacked, lwork=64 * n, overwrite_a=1)[0]
+    factors = _geqrt(together, stacked, overwrite_a=1)[0]
     return np.triu(factors[:n])
 
 

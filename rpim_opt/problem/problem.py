@@ -12,6 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
+from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
@@ -29,8 +30,7 @@ from rpim_opt.problem.loads import (
 )
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
-from rpim_opt.robot.compiled import quickest
-from rpim_opt.robot.kinematics import call_rows
+from rpim_opt.robot.abreast import evaluated
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
@@ -498,7 +498,7 @@ class CalibrationProblem(Tabled):
         return replace(weighed, offset=offset)
 
     def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model of `linearize` some rows at a time, block by block.
+        """Yield the linear model of `linearize` some rows at a time, block by block; each stands until the next one.
 
         Parameters
         ----------
@@ -524,7 +524,7 @@ class CalibrationProblem(Tabled):
             each = len(block.measurement.components)
             for start in range(0, len(block.row), most):
                 part = slice(start, start + most)
-                A, b = self._equations(i, x, part)
+                A, b = self._equations(i, x, part, passing=most < len(block.row))
                 group = np.repeat(self.data.configuration[block.row[part]], each)
                 yield LinearModel(A, b, group, self._identified, constrained)
 
@@ -534,22 +534,19 @@ class CalibrationProblem(Tabled):
         only = self.robots if isinstance(self.robots, Robot) else None
         return identified_of(only, self.parameters, self.data)
 
-    def _equations(self, i: int, x: Array, part: slice) -> tuple[Array, Array]:
-        """Return whitened, scaled A and b of some rows of a block."""
+    def _equations(self, i: int, x: Array, part: slice, passing: bool) -> tuple[Array, Array]:
+        """Return whitened, scaled A and b of some rows of a block; the columns of A stand together, as LAPACK asks."""
         whitening = self._whitening[i]
         L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part)
-        each = np.diagonal(L[0])
+        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part, passing=True)
         scale = self.parameters.free.scale
-        if len(L) == 1 and np.count_nonzero(L[0] - np.diag(each)) == 0:
-            # independent and the same for all rows: a product of numbers is several times faster than one of matrices
-            r = (residual[:, 0] * each).ravel()
-            jacobian *= each[:, None]  # in place: a copy of many rows costs as much as to evaluate them
-            A = jacobian.reshape(-1, len(x))
+        N, k, n = jacobian.shape
+        if passing:
+            columns = room("columns", n, N, k)
         else:
-            r = (L @ residual.transpose(0, 2, 1)).ravel()
-            A = (L @ jacobian).reshape(-1, len(x))
-        A *= scale
+            columns = np.empty((n, N, k))
+        A = _weighted(L, jacobian.transpose(1, 2, 0), scale, columns).reshape(n, -1).T
+        r = _weighted(L, residual.transpose(2, 1, 0), np.ones(1), np.empty((1, N, k))).ravel()
         return A, r + A @ (x / scale)
 
     def _scattered(self, x: Array, most: int, constrained: bool) -> Iterator[LinearModel]:
@@ -823,11 +820,13 @@ class CalibrationProblem(Tabled):
             begin += k * len(block.row)
         return blocks
 
-    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+    def _evaluate(
+        self, block: Block, what: str, x: Array, part: slice = slice(None), passing: bool = False
+    ) -> list[Array]:
         rows = self._rows(block, part)
-        function = quickest(self._functions(block)[what], len(rows), len(block.row))
+        function = self._functions(block)[what]
         with phase("evaluation"):
-            return call_rows(function, [x, self.parameters.nominal], rows)
+            return evaluated(function, [x, self.parameters.nominal], rows, passing)
 
     def _functions(self, block: Block) -> Functions:
         if id(block) not in self._structures:
@@ -860,22 +859,18 @@ class CalibrationProblem(Tabled):
 
     def _rows(self, block: Block, part: slice) -> Array:
         """Return joint values of the model, what the joints bear, and measured values, side by side."""
-        start, stop, _ = part.indices(len(block.row))
-        if stop - start == len(block.row):
-            if id(block) not in self._kept:
-                self._kept[id(block)] = self._stacked(block, part)
-            return self._kept[id(block)]
-        return self._stacked(block, part)
+        if id(block) not in self._kept:
+            self._kept[id(block)] = self._stacked(block)
+        return self._kept[id(block)][part]
 
     @cached_property
     def _kept(self) -> dict[int, Array]:
         return {}
 
-    def _stacked(self, block: Block, part: slice) -> Array:
+    def _stacked(self, block: Block) -> Array:
         robot = self.arms[block.robot]
-        y = block.y[part]
-        joints = (block.q[part] @ robot.joint_map.T).reshape(len(y), -1)
-        return np.hstack([joints, *columns(robot, block, part), self._of_sessions(block, part), y])
+        joints = (block.q @ robot.joint_map.T).reshape(len(block.y), -1)
+        return np.hstack([joints, *columns(robot, block, slice(None)), self._of_sessions(block), block.y])
 
     @cached_property
     def _sessions(self) -> dict[str, tuple[str, ...]]:
@@ -887,14 +882,16 @@ class CalibrationProblem(Tabled):
             for robot in self.arms
         }
 
-    def _of_sessions(self, block: Block, part: slice) -> Array:
+    def _of_sessions(self, block: Block) -> Array:
         """Return 1 where a row is of a session that shifts anything, (N, sessions)."""
-        names = block.session_names[part]
-        prefixes = {name: session_prefix(name) for name in dict.fromkeys(names)}
-        mine = np.array([prefixes[name] for name in names], dtype=object)
-        return (
-            np.array([mine == prefix for prefix in self._sessions[block.robot]], dtype=float).reshape(-1, len(mine)).T
-        )
+        known = self._sessions[block.robot]
+        found = np.zeros((len(block.row), len(known)))
+        if known:
+            prefixes = {name: session_prefix(name) for name in dict.fromkeys(block.session_names)}
+            mine = np.array([prefixes[name] for name in block.session_names], dtype=object)
+            for i, prefix in enumerate(known):
+                found[:, i] = mine == prefix
+        return found
 
 
 def error_dimensions(block: Block) -> list[str]:
@@ -918,3 +915,18 @@ def _cholesky(covariance: Array) -> Array:
         return np.asarray(np.linalg.cholesky(covariance), dtype=float)
     except np.linalg.LinAlgError:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
+
+
+def _weighted(L: Array, values: Array, scale: Array, found: Array) -> Array:
+    """Return L (N or 1, k, k) times values (k, c, N) of every row times scales (c,), in ``found`` (c, N, k)."""
+    nonzero = np.any(L, axis=0).tolist()
+    for i, terms in enumerate(nonzero):
+        first, *others = [j for j, there in enumerate(terms) if there]  # a triangle's diagonal has no zero
+        np.multiply(values[first], _factors(L[:, i, first], scale), out=found[:, :, i])
+        for j in others:
+            found[:, :, i] += values[j] * _factors(L[:, i, j], scale)
+    return found
+
+
+def _factors(entries: Array, scale: Array) -> Array:
+    return scale[:, None] * entries

@@ -15,14 +15,16 @@ from rpim_opt.problem.linear import LinearModel, Reweigh, by_twos, from_triangle
 from rpim_opt.problem.problem import CalibrationProblem
 
 ROWS = 4096
-"""Rows that are evaluated and reduced together: as many as a processor's cache holds."""
+"""Rows that are weighed and reduced together, of losses that are no squares."""
+FEW = 1024
+"""Rows that are evaluated and reduced together: as many as a core's cache holds."""
 
 
 @one_blas_thread
 def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
     """Return the model of ``problem.linearize(x)`` as its triangle: n + 1 equations, the same |A z - b| for every z.
 
-    Rows are evaluated, whitened and rotated into the triangle `ROWS` at a time, so that memory does not grow with
+    Rows are evaluated, whitened and rotated into the triangle `FEW` at a time, so that memory does not grow with
     their number.
 
     Parameters
@@ -45,7 +47,7 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
     ((35, 34), 120)
     """
     if reweigh is None:
-        return _rotated(problem.pieces(x, ROWS))
+        return _rotated(problem.pieces(x, FEW))
     groups = whole_configurations(problem.data, ROWS)
     return _rotated(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
 

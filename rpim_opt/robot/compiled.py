@@ -19,47 +19,22 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes
 from rpim_opt.basics.writing import scratch_folder, write_files
 
-FLAGS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+FLAGS = ("-O3", "-march=native", "-ffp-contract=off", "-fPIC", "-shared")
 """No product is fused with a sum, so that machine code has the virtual machine's last bits."""
 SWITCH = "RPIM_OPT_COMPILE"
 """Environment variable; 0 leaves everything to CasADi's virtual machine."""
 PATIENCE = 120
 """Seconds that a compiler gets."""
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
-SOME, LARGE, MANY = 1000, 20_000, 100_000
-"""Rows from which a library is worth loading; rows of a table, or evaluated in all, from which it is worth making."""
-
-
-class _Effort:
-    """Rows at which a function was evaluated."""
-
-    rows = 0
-
-
-@lru_cache(maxsize=256)
-def _effort(_: ca.Function) -> _Effort:
-    return _Effort()
-
-
-def quickest(function: ca.Function, rows: int, of: int) -> ca.Function:
-    """Return what evaluates a function at some rows more ``of`` a table: machine code where that pays, or itself.
-
-    The values have the same bits, so that it does not matter what was evaluated before.
-    """
-    effort = _effort(function)
-    effort.rows += rows
-    if max(effort.rows, of) < SOME:
-        return function
-    return compiled(function, make=of >= LARGE or effort.rows >= MANY) or function
 
 
 @lru_cache(maxsize=256)
 def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
-    """Return the function as machine code, five times as fast as CasADi's virtual machine; None where that fails.
+    """Return the function as machine code, a few times as fast as CasADi's virtual machine; None where that fails.
 
     Without ``make`` only a library that was made before is taken.
 
-    The library's name is a digest of its source, of the compiler and of the machine, so that a stale one is never
+    The library's name is a digest of its source, of the compiler and of the processor, so that a stale one is never
     taken, and the digest of its content stands beside it, so that a damaged one is made anew. A folder or a library
     that others may write to is not used.
     """
@@ -70,7 +45,7 @@ def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
     generator = ca.CodeGenerator(function.name())
     generator.add(function)
     source = generator.dump()
-    made_of = "\0".join([source, *compiler, _version(compiler), *FLAGS, platform.machine(), version("casadi")])
+    made_of = "\0".join([source, *compiler, _version(compiler), *FLAGS, _processor(compiler), version("casadi")])
     library = (
         folder / f"{function.name()}-{hashlib.sha256(made_of.encode(errors='surrogateescape')).hexdigest()[:32]}.so"
     )
@@ -100,6 +75,16 @@ def _version(compiler: tuple[str, ...]) -> str:
         return _run([*compiler, "--version"]).decode(errors="replace")
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+@lru_cache
+def _processor(compiler: tuple[str, ...]) -> str:
+    """Return what the compiler knows of this processor: homes may be shared by machines with other ones."""
+    try:
+        said = _run([*compiler, *FLAGS[:2], "-dM", "-E", "-x", "c", os.devnull]).decode(errors="replace")
+    except (OSError, subprocess.SubprocessError):
+        said = ""
+    return platform.machine() + said
 
 
 def _run(command: list[str]) -> bytes:

@@ -7,6 +7,7 @@ import pickle
 import stat
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -219,3 +220,68 @@ def test_where_nothing_can_be_compiled_the_virtual_machine_stays(whole, tmp_path
     native.compiled.cache_clear()
     assert native.compiled(function) is None
     native.compiled.cache_clear()
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(400, 7), (500, 34), (300, 120), (40, 120)])
+def test_a_triangle_is_that_of_lapacks_usual_reduction(rows: int, columns: int) -> None:
+    """Up to signs and rounding; whichever columns LAPACK reduces together."""
+    matrix = np.random.default_rng(columns).normal(size=(rows, columns))
+    R = reduced_rows(matrix)
+    want = np.linalg.qr(matrix, mode="r")
+    found = R[: len(want)] * (np.sign(np.diag(R[: len(want)])) * np.sign(np.diag(want)))[:, None]
+    np.testing.assert_allclose(found, want, rtol=0, atol=1e-13 * np.abs(want).max())
+    assert not R[len(want) :].any()
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_rows_are_whitened_by_their_covariances(alike: bool, whole: CalibrationProblem) -> None:
+    rng = np.random.default_rng(3)
+    factors = np.tril(rng.uniform(0.1, 1.0, (1 if alike else 50, 3, 3))) + np.eye(3)
+    data = whole.data.take(range(50))
+    V = 1e-10 * factors @ factors.transpose(0, 2, 1)
+    problem = whole.on(replace(data, blocks=(replace(data.blocks[0], covariance=V),)))
+    x = 0.1 * whole.parameters.free.scale
+    model = problem.linearize(x)
+    residual, jacobian = problem.slopes(x)
+    W = np.linalg.inv(1e-5 * factors)
+    A = (W @ jacobian.reshape(50, 3, -1)).reshape(150, -1) * whole.parameters.free.scale
+    np.testing.assert_allclose(model.A, A, rtol=0, atol=1e-12 * np.abs(A).max())
+    r = (W @ residual.reshape(50, 3, 1)).ravel()
+    np.testing.assert_allclose(model.b, r + A @ np.full(len(x), 0.1), rtol=0, atol=1e-12 * np.abs(model.b).max())
+
+
+def test_what_workers_get_holds_no_function_that_they_know(whole: CalibrationProblem) -> None:
+    """A function that arrives anew with every part would be prepared anew for its rows."""
+    frozen = streaming.sketch(whole.frozen())
+    frozen.linearize(0 * whole.parameters.free.nominal)
+    sent = pickle.dumps(frozen)
+    assert len(sent) < 20_000  # functions of this arm take twenty times that
+    functions = [jacobian_of(pickle.loads(sent)) for _ in range(2)]
+    assert functions[0] is functions[1]
+    assert functions[0] is jacobian_of(whole)
+
+
+def test_workers_get_a_users_function_as_it_was_asked_and_the_same_with_every_part() -> None:
+    asked = []
+    size = [1.0]
+
+    def model(T, *, q):
+        asked.append(size[0])
+        return size[0] * T[:3, 3]
+
+    mine = ro.data.Measurement("mine", model, dict.fromkeys("xyz", "length"), noise={"position": "length"}, sees=("q",))
+    ready = ro.load("position").problem
+    data = replace(ready.data, blocks=(replace(ready.data.blocks[0], measurement=mine),))
+    frozen = ready.on(data).frozen()
+    want = frozen.linearize(0 * ready.parameters.free.nominal)
+    count = len(asked)
+    kept = frozen.asked.__getstate__()
+    size[0] = 2.0
+    first, second = type(frozen.asked)(), type(frozen.asked)()
+    first.__setstate__(kept)
+    second.__setstate__(kept)
+    there = replace(frozen, asked=first).linearize(0 * ready.parameters.free.nominal)
+    assert len(asked) == count
+    np.testing.assert_array_equal(there.A, want.A)
+    (key,) = kept
+    assert first(*key)["jacobian"] is second(*key)["jacobian"]

@@ -1,0 +1,251 @@
+"""CasADi functions of many rows abreast: every operation is done on a row of numbers before the next one begins.
+
+CasADi's virtual machine spends most of its time between operations. Here it does each on `WIDTH` rows at once, so that
+a row takes a fifteenth of the time; machine code does the same on the processor's vectors. What depends on the inputs
+that all rows share is computed once. Operations and their order stay, and with them every bit of the values.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.room import room
+from rpim_opt.basics.threads import on_all_cores
+from rpim_opt.robot.compiled import compiled
+from rpim_opt.robot.kinematics import call_rows
+from rpim_opt.robot.posture import SYMBOLS
+
+WIDTH = 256
+"""Rows abreast in the virtual machine: their numbers stay in the processor's second cache."""
+NARROW = 64
+"""Rows abreast of small tables."""
+VECTOR = 16
+"""Rows abreast in machine code: two of the widest vectors."""
+SHARE = 16 * WIDTH
+"""Rows that one thread evaluates before it takes more."""
+PAYS = 2_000
+"""Rows, at once or in all, from which it pays to set them abreast: that takes as long as to evaluate them."""
+SOME, MANY = 20_000, 10_000_000
+"""Rows evaluated in all from which a library is worth loading, and worth making, which takes a compiler seconds."""
+LONGEST = 6_000
+"""Operations of a function that is compiled: a compiler takes more than its share of time for longer ones."""
+
+
+class Abreast(NamedTuple):
+    """A function of rows in two: ``common`` (shared inputs) and ``rows`` (that, rows (width, k)) -> (width, numbers).
+
+    ``shapes`` are those of the function's outputs; ``times`` is how many tables of so many rows one call evaluates.
+    """
+
+    common: ca.Function
+    rows: ca.Function
+    width: int
+    shapes: tuple[tuple[int, int], ...]
+    times: int = 1
+
+
+class _Effort:
+    """Rows at which a function was evaluated."""
+
+    rows = 0
+
+
+@lru_cache(maxsize=256)
+def _effort(_: ca.Function) -> _Effort:
+    return _Effort()
+
+
+def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array, passing: bool = False) -> list[Array]:
+    """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows.
+
+    Of many rows the values of every number stand side by side in memory: (N, c, r) arrays whose first axis is dense.
+
+    Parameters
+    ----------
+    function, shared, rows
+        As `call_rows` has them.
+    passing
+        Whether the caller is done with the values when it next asks in the same thread.
+    """
+    way = _quickest(function, len(shared), len(rows))
+    if way is None:
+        return call_rows(function, shared, rows)
+    size = sum(r * c for r, c in way.shapes)
+    if passing:
+        numbers = room("evaluated", size, len(rows))
+    else:
+        numbers = np.empty((size, len(rows)))
+    _on_columns(way, shared, rows, numbers)
+    found = []
+    end = 0
+    for r, c in way.shapes:
+        begin, end = end, end + r * c
+        found.append(numbers[begin:end].reshape(c, r, len(rows)).transpose(2, 0, 1))
+    return found
+
+
+def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
+    """Return how a function is evaluated at some rows more; None for one after the other."""
+    effort = _effort(function)
+    effort.rows += rows
+    count = WIDTH
+    while rows <= count // 2 and count > VECTOR:  # few of them are evaluated for nothing
+        count //= 2
+    if effort.rows < PAYS:
+        return None
+    if effort.rows >= SOME and function.n_instructions() <= LONGEST:
+        made = _machine_code(function, shared, count // VECTOR, effort.rows >= MANY)
+        if made is not None:
+            return made
+    return abreast(function, shared, max(count, NARROW))
+
+
+@lru_cache(maxsize=256)
+def _machine_code(function: ca.Function, shared: int, times: int, make: bool) -> Abreast | None:
+    way = abreast(function, shared, VECTOR)
+    if way is None:
+        return None
+    made = compiled(way.rows, make)
+    if made is None:
+        return None
+    return way._replace(rows=ca.Function.map(made, "rows", "serial", times, [0], [], {}), times=times)
+
+
+@lru_cache(maxsize=256)
+def abreast(function: ca.Function, shared: int, width: int) -> Abreast | None:
+    """Return a function of scalar operations on many rows; None for one that calls others.
+
+    Parameters
+    ----------
+    function
+        Inputs: one column for each of ``shared``, then one column that changes with the row.
+    shared
+        Number of inputs that are the same for all rows.
+    width
+        Rows.
+    """
+    if not function.is_a("SXFunction"):
+        return None
+    with SYMBOLS:
+        inputs = function.sx_in()
+        numbers = ca.cse(ca.vertcat(*map(ca.vec, function.call(inputs))))
+        given = ca.vertcat(*inputs[:shared])
+        left, symbols, values = ca.extract_parametric(numbers, given, {"extract_trivial": True})
+        common = ca.Function("common", inputs[:shared], [ca.vertcat(ca.SX(0, 1), *values)])
+        scalar = ca.Function("scalar", [ca.vertcat(ca.SX(0, 1), *symbols), inputs[-1]], [left])
+        rows = _widened(scalar, width)
+    if rows is None:
+        return None
+    return Abreast(common, rows, width, tuple(function.size_out(i) for i in range(function.n_out())))
+
+
+def _widened(scalar: ca.Function, width: int) -> ca.Function | None:
+    """Return a function (common, row) -> numbers with the rows of a table (width, k) in the place of a row."""
+    common = ca.MX.sym("common", scalar.size1_in(0))
+    table = ca.MX.sym("rows", width, scalar.size1_in(1))
+    inputs = (ca.vertsplit(common), ca.horzsplit(table))
+    column = ca.MX.zeros(width, 1)
+    values: dict[int, ca.MX] = {}
+    found = [column] * scalar.size1_out(0)
+    for k in range(scalar.n_instructions()):
+        operation = scalar.instruction_id(k)
+        taken = scalar.instruction_input(k)
+        put = scalar.instruction_output(k)
+        if operation == ca.OP_OUTPUT:
+            found[put[1]] = _dense(values[taken[0]], width)
+        elif operation == ca.OP_INPUT:
+            values[put[0]] = inputs[taken[0]][taken[1]]
+        elif operation == ca.OP_CONST:
+            values[put[0]] = ca.MX(scalar.instruction_constant(k))
+        elif operation in (ca.OP_CALL, ca.OP_PARAMETER):
+            return None
+        else:
+            values[put[0]] = _operation(operation, [values[i] for i in taken])
+    return ca.Function("abreast", [common, table], [ca.horzcat(*found)])
+
+
+def _operation(operation: int, values: list[Any]) -> ca.MX:
+    if len(values) == 1:
+        return ca.MX.unary(operation, values[0])
+    return ca.MX.binary(operation, *values)
+
+
+def _dense(values: ca.MX, width: int) -> ca.MX:
+    """Return a number of every row (width, 1), where it may be one for all."""
+    values = ca.densify(values)
+    if values.numel() == width:
+        return values
+    return ca.repmat(values, width, 1)
+
+
+class _Memory:
+    """A function's inputs and its output in one thread, set once: CasADi takes longer to set them than to evaluate."""
+
+    def __init__(self, function: ca.Function, inputs: Sequence[Array], output: Array):
+        self.inputs = inputs
+        buffer: Any
+        buffer, self.evaluate = function.buffer()
+        for i, values in enumerate(inputs):
+            buffer.set_arg(i, values.data)
+        buffer.set_res(0, output.data)
+        self._buffer = buffer
+
+
+class _Own:
+    """The memory of both functions in one thread: ``table`` (times, k, width) gives ``numbers`` (times, n, width)."""
+
+    def __init__(self, way: Abreast):
+        rows = way.rows
+        self.count = way.times * way.width
+        common = np.zeros(rows.size1_in(0))
+        self.table = np.zeros((way.times, rows.size2_in(1) // way.times, way.width))
+        self.numbers = np.zeros((way.times, rows.size2_out(0) // way.times, way.width))
+        self.shared = [np.zeros(way.common.size1_in(i)) for i in range(way.common.n_in())]
+        self.common = _Memory(way.common, self.shared, common)
+        self.rows = _Memory(rows, [common, self.table], self.numbers)
+
+
+@lru_cache(maxsize=64)
+def _own(way: Abreast, _thread: int) -> _Own:
+    return _Own(way)
+
+
+def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Array) -> None:
+    """Find the numbers (numbers, N) of a table (N, k)."""
+    N = len(rows)
+
+    def evaluate(begin: int) -> None:
+        own = _own(way, threading.get_ident())
+        for own_values, values in zip(own.shared, shared, strict=True):
+            own_values[:] = values
+        own.common.evaluate()
+        for start in range(begin, min(begin + SHARE, N), own.count):
+            part = slice(start, start + own.count)
+            _together(own, rows[part], found[:, part])
+
+    on_all_cores(evaluate, range(0, N, SHARE))
+
+
+def _together(own: _Own, rows: Array, found: Array) -> None:
+    """Evaluate as many rows as go into one call, or fewer; the last one stands for those that are not there."""
+    there = len(rows)
+    if there < own.count:
+        given = rows
+        rows = np.empty((own.count, given.shape[1]))
+        rows[:there] = given
+        rows[there:] = given[-1]
+    inputs = own.table.transpose(1, 0, 2)
+    inputs[:] = rows.T.reshape(inputs.shape)
+    own.rows.evaluate()
+    numbers = own.numbers.transpose(1, 0, 2)
+    if there < own.count:
+        found[:] = numbers.reshape(len(found), own.count)[:, :there]
+    else:
+        found.reshape(numbers.shape)[:] = numbers
