@@ -26,7 +26,8 @@ SAME_SIZE, SAME_PLACE = 0.02, 0.01
 CLOSE = 0.1
 """Scales (RMS) up to which the mean at one linearization stands for a fit."""
 NEAR, STEPS = 1e-3, 6
-"""Tolerance and steps of the fits in between: sizes are others where they lead, and the last fit is exact."""
+"""Tolerance of the fits in between, and steps of the first, twice as many in every later one: the first sizes change
+soon, and the last fit is exact."""
 DISTINCT = 0.3
 """Logarithms of sizes by which two optima differ."""
 
@@ -146,9 +147,10 @@ class Learning:
         rounds
             How often the evidence is asked.
         """
-        fit = self._once(problem, x, before, several=before is None)
-        for _ in range(rounds - 1):
-            again = self._once(problem, fit.x, fit.point.logs, several=before is None and fit.several)
+        fit = self._once(problem, x, before, several=before is None, steps=STEPS)
+        for k in range(1, rounds):
+            several = before is None and fit.several
+            again = self._once(problem, fit.x, fit.point.logs, several, STEPS * 2**k)
             moved = _moved(again.x, fit.x, again.laid)
             resized = np.abs(again.point.logs - fit.point.logs).max()
             before = fit.point.logs  # other sides were tried twice
@@ -157,7 +159,7 @@ class Learning:
                 break
         return fit
 
-    def _once(self, problem: CalibrationProblem, x: Array, before: Array | None, several: bool) -> Fit:
+    def _once(self, problem: CalibrationProblem, x: Array, before: Array | None, several: bool, steps: int) -> Fit:
         """Return sizes at one linearization, and the deviations that they lead to."""
         evidence = self.evidence(problem, x)
         starts = [] if before is None else [before]
@@ -170,7 +172,7 @@ class Learning:
         mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
         if _moved(mean, x, laid) > CLOSE:  # too far for one linearization
             penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-            mean = nearby(laid, penalized, 1.0, x, NEAR, STEPS)
+            mean = nearby(laid, penalized, 1.0, x, NEAR, steps)
         return Fit(problem, evidence, point, others, laid, mean)
 
     def widths(self, problem: CalibrationProblem, point: Point) -> Array:
