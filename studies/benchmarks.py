@@ -22,7 +22,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 import rpim_opt as ro
 from rpim_opt.basics.phases import clock
@@ -252,7 +251,7 @@ def _rows(count: int) -> dict[str, Any]:
 
     def copied() -> Any:
         np.copyto(own, columns)
-        return get_lapack_funcs("geqrf", dtype=float)(own, lwork=64 * own.shape[1], overwrite_a=1)
+        return OTHERS.usual_qr(own)
 
     return {
         "seconds": seconds,
