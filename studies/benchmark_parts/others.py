@@ -112,9 +112,12 @@ def large_model(parameters: int) -> dict[str, float]:
     }
 
 
+_geqrf: Any = get_lapack_funcs("geqrf", dtype=float)
+
+
 def usual_qr(columns: Array) -> Any:
     """Return LAPACK's usual QR (geqrf) of rows (m, n) whose columns stand together; they are overwritten."""
-    return get_lapack_funcs("geqrf", dtype=float)(columns, lwork=64 * columns.shape[1], overwrite_a=1)
+    return _geqrf(columns, lwork=64 * columns.shape[1], overwrite_a=1)
 
 
 def reflectors(count: int, each: int) -> CalibrationProblem:
