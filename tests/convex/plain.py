@@ -64,6 +64,7 @@ def plain(formulation: ro.Formulation, model: ro.problem.LinearModel, weight: fl
     return solved(loss + weight * penalty, limits, z)
 
 
+@np.errstate(invalid="ignore")  # z may be beyond a function's domain by rounding
 def solved(objective: Any, limits: list[Any], z: Any) -> Plain:
     """Minimize, tightly where Clarabel can; parameters are numbers."""
     size = 1.0
