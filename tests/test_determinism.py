@@ -73,13 +73,13 @@ def require_near(found: dict[str, list[float]], wanted: dict[str, list[float]], 
 def test_kernels_of_linear_algebra_change_what_rounding_does(kernel: str) -> None:
     if kernel == "SkylakeX" and "avx512f" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("a processor without these instructions")
-    require_near(answers(OPENBLAS_CORETYPE=kernel), answers(PYTHONHASHSEED="0"), 1e-9)
+    require_near(answers(OPENBLAS_CORETYPE=kernel), answers(PYTHONHASHSEED="0"), 1e-8)  # to which passes are repeated
 
 
 WAYS = {
     "one after the other": {"PAYS": 10**9},
     "abreast": {"PAYS": 1},
-    "machine code": {"PAYS": 1, "SOME": 1, "MANY": 1},
+    "machine code": {"PAYS": 1, "SOME": 1, "MANY": 1, "LONGEST": 10**9},
 }
 
 
@@ -90,6 +90,8 @@ def test_every_way_to_evaluate_has_the_same_bits(name: str, monkeypatch: pytest.
     """So that it does not matter which of them a process has come to use."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     problem = ro.load(name).problem
+    for kept in (module._machine_code, module.compiled):  # problems may share a function, whose library is elsewhere
+        kept.cache_clear()
     found = {}
     for way, pays in WAYS.items():
         with monkeypatch.context() as patch:
