@@ -124,9 +124,8 @@ def _require_convex(where: str, expression: Any) -> None:
         raise InputError(where, found, accepted)
 
 
-def configuration_norms(r: Array, groups: np.ndarray) -> Array:
-    """Return the norm of every configuration's part of a residual (m,), in the order of their numbers."""
-    which = np.unique(groups, return_inverse=True)[1]
+def configuration_norms(r: Array, which: np.ndarray) -> Array:
+    """Return the norm of every configuration's part of a residual (m,), ``which`` (m,) the place of each equation's."""
     return np.sqrt(np.bincount(which, r**2))
 
 

@@ -15,7 +15,6 @@ from rpim_opt.convex.interior import Found
 from rpim_opt.convex.largest import Largest
 from rpim_opt.convex.newton import DEAR, Newton
 from rpim_opt.convex.objective import Damping, Objective
-from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.whitened import Ended, Kinked
 from rpim_opt.convex.worst import Worst
@@ -166,5 +165,4 @@ def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinate
         L.append(np.sqrt(weight) * form.matrix)
         c.append(np.sqrt(weight) * form.c)
     both = Quadratic(np.vstack(L), np.concatenate(c))
-    model = objective.model
-    return coordinates(ridge(model, both), model.A, model.b, objective.order)
+    return coordinates(objective.model, both, objective.order)

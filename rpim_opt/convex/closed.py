@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
+FAR_APART = 1e-8
+"""Ratio of pivots below which a matrix may not have full rank."""
+_gels: Any = get_lapack_funcs("gels", dtype=float)
 Bounds = tuple[Array, Array]
 """Lower and upper (n,)."""
 
@@ -16,13 +22,23 @@ Bounds = tuple[Array, Array]
 def minimum(objective: Objective, weight: float, damping: Damping | None) -> Array:
     """Return the unconstrained minimum (n,)."""
     if damping is not None:
-        A, b = objective.stacked(weight, damping)
-        return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=float)
+        return _least_squares(*objective.stacked(weight, damping))
     z = objective.ridge.minima(np.array([weight]))[0]
     if _plain(objective):
         return z
     A, b = objective.stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
     return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
+
+
+def _least_squares(A: Array, b: Array) -> Array:
+    """Return z (n,) where |A z - b| is least: by QR, and by singular values where its pivots are far apart."""
+    n = A.shape[1]
+    if len(A) >= n > 0:
+        factors, z, _ = _gels(A, b)
+        pivots = np.abs(factors.diagonal())
+        if pivots.min() > FAR_APART * pivots.max():
+            return np.asarray(z[:n], dtype=float)
+    return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=float)
 
 
 def _plain(objective: Objective) -> bool:

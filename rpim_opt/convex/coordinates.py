@@ -8,7 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.convex.quadratic import ridge
+from rpim_opt.convex.structure import Quadratic
+from rpim_opt.problem.linear import LinearModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +59,14 @@ class Coordinates:
         return np.diag(self.gram).copy()
 
 
-def coordinates(form: Ridge, A: Array, b: Array, order: np.ndarray) -> Coordinates:
+def coordinates(model: LinearModel, penalty: Quadratic | None, order: np.ndarray) -> Coordinates:
     """Return the coordinates in which data and penalty are both diagonal; ``order`` (m,) sorts equations by groups."""
+    form = ridge(model, penalty)
     B = np.hstack([form.B, form.free])
-    rows = A @ B
-    left = b - A @ form.offset
+    rows = model.A @ B
+    left = model.b - model.A @ form.offset
     if (np.diff(order) != 1).any():  # most tables are sorted, and a copy costs as much as the product
         rows, left = rows[order], left[order]
     penalized = np.arange(B.shape[1]) < form.B.shape[1]
-    return Coordinates(form.offset, B, rows, left, penalized, rows.T @ rows)
+    few = model.triangle[:-1, :-1] @ B  # rows whose squares are those of all
+    return Coordinates(form.offset, B, rows, left, penalized, few.T @ few)

@@ -82,7 +82,7 @@ class Squares:
         r = model.A @ z - model.b
         which = np.arange(len(r))
         if self.over == "configuration":
-            which = np.unique(model.group, return_inverse=True)[1]
+            which = model.members[0]
         norms = np.sqrt(np.bincount(which, r**2))
         v = np.maximum(norms, SMALL)
         priced = term(self.loss, len(v), f"formulation '{self.name}', loss")

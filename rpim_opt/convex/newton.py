@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
+from rpim_opt.convex.squares import weighed_squares
 from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Kinked, Whitened
 
 MOST, SOON = 100, 30
@@ -25,6 +26,8 @@ SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 DEAR = 200_000
 """Entries of the rows from which a second derivative is dear."""
+SOME = 61
+"""Of every so many rows one tells the second derivative that most may have; a prime, which meets all of a reading."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
 SLOW = 0.1
@@ -313,20 +316,17 @@ class Newton(Whitened):
         """Return what curvatures of the equations add."""
         rows = self.at.rows
         if rows.size >= DEAR:  # most of them may have the same
-            usual = float(np.partition(across, len(across) // 2)[len(across) // 2])
+            usual = float(np.median(across[::SOME]))
             other = np.flatnonzero(across != usual)
             if 2 * len(other) <= len(rows):
-                X = rows[other]
-                return usual * self.at.gram + X.T @ ((across[other] - usual)[:, None] * X)
-        X = np.sqrt(across)[:, None] * rows
-        return X.T @ X
+                return usual * self.at.gram + weighed_squares(rows[other], across[other] - usual)
+        return weighed_squares(rows, across)
 
     def _along(self, curvature: Curvature) -> Array:
         """Return what the curvatures along the groups' directions add."""
         _, along, u = curvature
         bent = along.nonzero()[0]
-        X = self.loss.projected(self.at.rows, u, bent)
-        return X.T @ (along[bent][:, None] * X)
+        return weighed_squares(self.loss.projected(self.at.rows, u, bent), along[bent])
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""

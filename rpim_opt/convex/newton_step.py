@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.left_out import Rows, by_size, solved, taken
 from rpim_opt.convex.program import Estimate, Program
+from rpim_opt.convex.squares import TOGETHER, weighed_squares
 
 SMALL = 1e-5
 """Residuals below this part of the median are at a loss's kink, if it has one."""
@@ -75,7 +79,7 @@ class NewtonStep:
     @cached_property
     def which(self) -> np.ndarray:
         """The place (m,) of each equation's configuration."""
-        return np.unique(self.program.model.group, return_inverse=True)[1]
+        return self.program.model.members[0]
 
     @cached_property
     def parts(self) -> list[Rows]:
@@ -121,30 +125,37 @@ class NewtonStep:
         root = np.zeros_like(values)
         kept = values > DROPPED * np.max(values, initial=0.0)
         root[kept] = 1 / np.sqrt(values[kept])
-        X = A @ (vectors * root)
         norms = np.zeros(len(loss.extra))
-        for some in self.parts:
-            norms[some.configurations] = self._left(some, X, r, loss)
+        for some, left in zip(self.parts, self._left(A, vectors * root, r, loss), strict=True):
+            norms[some.configurations] = left
         return norms
 
     def _bent(self, A: Array, loss: Curved) -> Array:
         """Return the second derivative (p, p) of the loss along columns (m, p)."""
-        X = np.sqrt(np.maximum(loss.rows, 0.0))[:, None] * A
-        bent = X.T @ X
+        bent = weighed_squares(A, np.maximum(loss.rows, 0.0))
         if not loss.extra.any():
             return bent
         for some in self.parts:
             along = np.einsum("gk,gkp->gp", taken(loss.u, some.places), taken(A, some.places))
-            bent += along.T @ (loss.extra[some.configurations, None] * along)
+            bent += weighed_squares(along, loss.extra[some.configurations])
         return bent
 
-    def _left(self, some: Rows, X: Array, r: Array, loss: Curved) -> Array:
+    def _left(self, A: Array, B: Array, r: Array, loss: Curved) -> Iterator[Array]:
+        """Yield the norms (G,) of left-out residuals of the parts, whose second derivative's inverse is B B'."""
+        for some in self.parts:
+            first = range(0, len(some.configurations), TOGETHER)
+            blocks = [Rows(*(each[k : k + TOGETHER] for each in some)) for k in first]
+            yield np.concatenate(on_all_cores(lambda block: self._left_of(block, A, B, r, loss), blocks))
+
+    def _left_of(self, some: Rows, A: Array, B: Array, r: Array, loss: Curved) -> Array:
         """Return the norms (G,) of left-out residuals of some configurations."""
         places = some.places
         k = places.shape[1]
         u, across = loss.u[places.T], loss.rows[places.T]
-        X_g = taken(X, places)
-        S = np.einsum("gip,gjp->ijg", X_g, X_g)
+        X = (taken(A, places).reshape(places.size, len(B)) @ B).reshape(*places.shape, len(B))
+        S = np.empty((k, k, len(places)))
+        for i, j in combinations_with_replacement(range(k), 2):
+            S[i, j] = S[j, i] = np.einsum("gp,gp->g", X[:, i], X[:, j])
         W = np.eye(k)[:, :, None] * across + loss.extra[some.configurations] * u[:, None] * u
         # S (1 - W S)^-1 = (1 - S W)^-1 S
         M = np.repeat(np.eye(k)[:, :, None], len(places), axis=2)

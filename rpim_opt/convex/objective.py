@@ -273,8 +273,7 @@ class Objective(Brief):
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of z in which the squares of data and penalty are diagonal, of a loss that is no square."""
-        form = ridge(self.model, self.penalty_form)
-        return coordinates(form, self.model.A, self.model.b, self.order)
+        return coordinates(self.model, self.penalty_form, self.order)
 
     # --- values ------------------------------------------------------------------------------------------------
 
@@ -341,7 +340,7 @@ class Objective(Brief):
 
     def norms(self, z: Array) -> Array:
         """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
-        return configuration_norms(self.model.A @ z - self.model.b, self.model.group)
+        return configuration_norms(self.model.A @ z - self.model.b, self.model.members[0])
 
     def violation(self, z: Array) -> float:
         """Return by how much z (n,) misses the constraints, in units of the scales; of ``largest`` relative to it.
@@ -421,9 +420,9 @@ class Objective(Brief):
         """
         if self.loss_form is not None:
             return None
-        count = np.unique(self.model.group, return_counts=True)[1]
+        which, count = self.model.members
         norms = self.norms(z)
-        keep = (norms <= outlying(norms, count))[np.unique(self.model.group, return_inverse=True)[1]]
+        keep = (norms <= outlying(norms, count))[which]
         residual = self.model.A @ z - self.model.b
         return self._posed.trusted(norms, count, residual[keep])
 

@@ -446,7 +446,7 @@ def posed(formulation: Formulation, model: LinearModel) -> Posed:
         formulation = _for_triangle(formulation, model.equations)
     if formulation.loss in INVARIANT and formulation.loss_over == "equation" and not np.isfinite(formulation.largest):
         m = n + 1  # rows of the triangle say all
-    groups = np.unique(model.group, return_inverse=True)[1]
+    groups = model.members[0]
     p = model.parameters
     signature: tuple[Any, ...] = ()
     if formulation.constraints or formulation.penalty_over is not None:
@@ -516,7 +516,7 @@ class Unposed(Posed):
     ):
         self.formulation, self.parameters = formulation, model.parameters
         self.n = model.A.shape[1]
-        self.groups = np.unique(model.group, return_inverse=True)[1]
+        self.groups = model.members[0]
         self.equations = len(model.b)
         self.limited, self.constrained, self.predicts = False, True, False
         self.constraints, self.own = [], []

@@ -63,7 +63,7 @@ class Trusted:
 
     def keeps(self, model: LinearModel, z: Array) -> np.ndarray:
         """Return which equations (m,) are trusted at z (n,)."""
-        _, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
+        which, count = model.members
         norms = np.sqrt(np.bincount(which, (model.A @ z - model.b) ** 2))
         return (norms <= limits(self.noise, self.configurations, count))[which]
 

@@ -90,6 +90,12 @@ class LinearModel(Brief):
         with phase("reduction"):
             return triangle_of(self.A, self.b)
 
+    @cached_property
+    def members(self) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) the place of every equation's configuration in the order of their numbers; (N,) how many each has."""
+        _, which, count = np.unique(self.group, return_inverse=True, return_counts=True)
+        return which, count
+
     @property
     def rank(self) -> int:
         """Number of directions in the parameters that the data see."""

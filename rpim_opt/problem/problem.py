@@ -560,8 +560,8 @@ class CalibrationProblem(Tabled):
             if len(rows) < len(self.data):
                 problem = self.on(self.data.take(rows))
             residual, jacobian = problem.slopes(x)
-            A = problem._whitened(problem.contrasts(jacobian)) * scale
-            r = problem._whitened(problem.contrasts(residual[:, None]))[:, 0]
+            both = problem._whitened(problem.contrasts(np.column_stack([jacobian * scale, residual])))
+            A, r = np.ascontiguousarray(both[:, :-1]), both[:, -1]
             yield LinearModel(A, r + A @ (x / scale), problem.groups, self._identified, constrained)
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
@@ -598,16 +598,16 @@ class CalibrationProblem(Tabled):
     def _whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise, configuration by configuration."""
         found = np.empty_like(values)
-        for stack, L in self._factors:
-            found[stack.index] = np.linalg.solve(L, values[stack.index])
+        for stack, inverse in self._inverses:
+            found[stack.index] = inverse @ values[stack.index]
         return found
 
     @cached_property
-    def _factors(self) -> list[tuple[Stack, Array]]:
-        """Covariances of whole configurations as L L'."""
+    def _inverses(self) -> list[tuple[Stack, Array]]:
+        """L^-1 of the covariances L L' of whole configurations."""
         scatter = self.scatter or Scatter()
         stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        return [(stack, _cholesky(stack.covariance(scatter))) for stack in stacks]
+        return [(stack, np.linalg.inv(_cholesky(stack.covariance(scatter)))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.

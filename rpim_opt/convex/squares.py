@@ -1,0 +1,35 @@
+"""Sums of squares over many rows, in blocks that a processor's cache holds and on all cores."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.threads import on_all_cores
+
+TOGETHER = 8192
+"""Rows that are worked on together."""
+
+
+def weighed_squares(rows: Array, weight: Array) -> Array:
+    """Return rows' diag(weight) rows, (p, p), of rows (m, p) and weights (m,) of any sign.
+
+    >>> import numpy as np
+    >>> from rpim_opt.convex.squares import weighed_squares
+    >>> weighed_squares(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([1.0, -1.0]))
+    array([[ -8., -10.],
+           [-10., -12.]])
+    """
+    least, most = weight.min(initial=0.0), weight.max(initial=0.0)
+
+    def squares(start: int) -> Array:
+        some, by = rows[start : start + TOGETHER], weight[start : start + TOGETHER, None]
+        if least < 0 < most:
+            return some.T @ (by * some)
+        some = np.sqrt(np.abs(by)) * some  # a product with itself costs half
+        return some.T @ some
+
+    total = sum(on_all_cores(squares, range(0, max(len(rows), 1), TOGETHER)))
+    if most == 0:
+        return -total
+    return total

@@ -1,0 +1,16 @@
+"""Sums of squares over many rows."""
+
+import numpy as np
+import pytest
+
+from rpim_opt.convex.squares import TOGETHER, weighed_squares
+
+
+@pytest.mark.parametrize("rows", [0, 1, 7, TOGETHER, 2 * TOGETHER + 5])
+@pytest.mark.parametrize("signs", [(1.0,), (-1.0,), (0.0,), (1.0, -1.0, 0.0)])
+def test_squares_in_blocks_are_those_of_all_rows(rows: int, signs: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(rows)
+    X = rng.normal(size=(rows, 3))
+    weight = rng.uniform(0.5, 2.0, rows) * rng.choice(signs, rows)
+    whole = np.einsum("ki,k,kj->ij", X, weight, X)
+    assert weighed_squares(X, weight) == pytest.approx(whole, rel=1e-12, abs=1e-12 * max(rows, 1))
