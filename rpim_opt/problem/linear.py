@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.lapack import qr_in_place
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Brief, counted
@@ -113,7 +112,6 @@ class LinearModel(Brief):
 BLOCK = 430_000
 """Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
 triangles of the blocks cost little beside them."""
-_geqrt: Any = get_lapack_funcs("geqrt", dtype=float)
 NARROW, WIDE = 8, 32
 """Columns that are reduced together, of matrices with few and with many columns: as is quickest."""
 MANY = 100
@@ -126,10 +124,7 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
 
 
 def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
-    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR.
-
-    LAPACK's blocked one whose blocks are reduced by halves: twice as fast as the usual one where rows are many.
-    """
+    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR."""
     n = A.shape[1] + 1
     together = min(n, WIDE if n >= MANY else NARROW)
     above = 0 if R is None else len(R)
@@ -138,8 +133,8 @@ def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
     stacked[above : above + len(b), :-1] = A
     stacked[above : above + len(b), -1] = b
     stacked[above + len(b) :] = 0.0
-    factors = _geqrt(together, stacked, overwrite_a=1)[0]
-    return np.triu(factors[:n])
+    qr_in_place(stacked, together)
+    return np.triu(stacked[:n])
 
 
 def triangle_of(A: Array, b: Array) -> Array:
