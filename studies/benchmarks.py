@@ -87,7 +87,7 @@ def cases(quick: bool) -> list[dict[str, Any]]:
 def run(part: str, count: int = 0, tool: str = "", method: str = "") -> dict[str, Any]:
     """Return the times of one part [s], or its memory [MB]."""
     if part == "peer":
-        found = load_study(find_study("peers")).run(tool, "clean52", 0, bool(count))
+        found = load_study(find_study("peers")).run(tool, "clean52", 0, bool(count), anew=True)
         return {key: value for key, value in found.items() if key.endswith(": seconds")}
     if part in ("rows", "cluster"):
         command = [sys.executable, "-P", __file__, part, str(count)]  # -P: selectors.py here is not Python's

@@ -35,7 +35,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
 from rpim_opt.basics.files import write_json
 from rpim_opt.basics.text import markdown
-from rpim_opt.basics.writing import write_text
+from rpim_opt.basics.writing import write_bytes, write_text
 from rpim_opt.study import Metric, Report
 
 QUESTION = "Is rpim_opt more accurate than pybotics, robotkinecal, figaroh and SciPy on the same measurements?"
@@ -177,8 +177,11 @@ def asked(tool: str, situation: str, quick: bool) -> list[str]:
     return found
 
 
-def run(tool: str, situation: str, seed: int, quick: bool) -> dict[str, Any]:
-    """Return position errors at other configurations [mm], largest corrections and seconds of a tool's settings."""
+def run(tool: str, situation: str, seed: int, quick: bool, anew: bool = False) -> dict[str, Any]:
+    """Return position errors at other configurations [mm], largest corrections and seconds of a tool's settings.
+
+    What a peer answers to the same files is asked once and kept; ``anew`` asks it now, for seconds of today.
+    """
     settings = asked(tool, situation, quick)
     script = HERE / "peer_scripts" / f"run_{tool}.py"
     with tempfile.TemporaryDirectory() as scratch:
@@ -186,18 +189,31 @@ def run(tool: str, situation: str, seed: int, quick: bool) -> dict[str, Any]:
         true = write_problem(folder, situation, seed)
         if tool not in PACKAGES:
             return _answered(sys.executable, script, folder, settings, true)
-        kept = HERE / ".environments" / tool / "answers" / f"{_digest(tool, script, folder, settings)}.json"
-        if not kept.is_file():
+        kept = HERE / ".environments" / tool / "answers" / _digest(tool, script, folder, settings)
+        found = _kept(kept)
+        if found is None or anew:
             program = str(HERE / ".environments" / tool / "bin" / "python")
             found = _answered(program, script, folder, settings, true)
+            text = json.dumps(found).encode()
             kept.parent.mkdir(exist_ok=True)
-            write_json(kept, found)
-        return json.loads(kept.read_text())
+            write_bytes(kept, hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
+        return found
+
+
+def _kept(path: Path) -> dict[str, Any] | None:
+    """Return an answer that was kept below the digest of its text, or nothing where none is whole."""
+    if not path.is_file():
+        return None
+    digest, _, text = path.read_bytes().partition(b"\n")
+    if hashlib.sha256(text).hexdigest().encode() != digest:
+        return None
+    return json.loads(text)
 
 
 def _digest(tool: str, script: Path, folder: Path, settings: list[str]) -> str:
-    """Return what a peer's answer depends on: its package, our script for it, the problem's files and the settings."""
-    parts = [PACKAGES[tool][0].encode(), script.read_bytes(), json.dumps(settings).encode()]
+    """Return what a peer's answer depends on: its package, our scripts for it, the problem's files and the settings."""
+    parts = [PACKAGES[tool][0].encode(), script.read_bytes(), script.with_name("common.py").read_bytes()]
+    parts += [json.dumps(settings).encode()]
     parts += [path.name.encode() + b"\0" + path.read_bytes() for path in sorted(folder.iterdir())]
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
@@ -207,7 +223,8 @@ def _answered(program: str, script: Path, folder: Path, settings: list[str], tru
     command = [program, str(script), str(folder), *settings]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RpimError(f"{script.name} ended with {done.returncode}: {done.stderr.strip().splitlines()[-1]}")
+        said = done.stderr.strip().rpartition("\n")[2]  # nothing, of a process that was killed
+        raise RpimError(f"{script.name} ended with {done.returncode}: {said}")
     answers = json.loads(done.stdout.strip().splitlines()[-1])
     found = {"imports": answers.pop("imports"), "versions": answers.pop("versions")}
     for setting, answer in answers.items():
