@@ -15,6 +15,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
+from rpim_opt.problem import parts
+from rpim_opt.robot import abreast
+from rpim_opt.study import grid
 from studies.gallery import pages
 from tests import ROOT
 from tests.test_cli import run
@@ -25,6 +29,7 @@ from matplotlib import image, pyplot
 
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in pages.pages()}
 README = PAGES["README"]
+STUDIES = (ROOT / "studies" / "README.md").read_text(encoding="utf-8")
 BLOCKS = [(page, snippet) for page, text in PAGES.items() for snippet in pages.snippets(text)]
 PYTHON = [(page, program) for page, text in PAGES.items() for program in pages.programs(text)]
 SHELL = [(page, snippet.code.splitlines()) for page, snippet in BLOCKS if snippet.language == "sh"]
@@ -101,15 +106,20 @@ def test_commands(block: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: P
             assert run(monkeypatch, *named) == 0
 
 
-def test_the_main_table_is_the_studys() -> None:
+def rows_of(study: str) -> list[dict[str, Any]]:
+    """Return the replicates of a study's result."""
     from pyarrow import parquet
 
-    from rpim_opt.study import grid
+    return parquet.read_table(ROOT / "studies" / "results" / study / "replicates.parquet").to_pylist()
 
+
+def test_the_main_table_is_the_studys() -> None:
     peers = grid.load_study(grid.find_study("peers"))
-    path = ROOT / "studies" / "results" / "peers" / "replicates.parquet"
-    rows = peers.by_method(parquet.read_table(path).to_pylist())
+    rows = peers.by_method(rows_of("peers"))
     table = README.split("## Beside other tools")[1].replace("**", "")
+    head = next(line for line in table.splitlines() if line.startswith("| RMS error"))
+    counts = [int(count) for count in re.findall(r"\| (\d+)", head)]
+    assert counts == [count for count, _ in peers.SITUATIONS.values()]
     lines = re.findall(r"^\| (\w+, \w.*?) \| (.*) \|$", table, flags=re.MULTILINE)
     assert len(lines) >= 8
     for method, cells in lines:
@@ -125,29 +135,136 @@ def test_the_main_table_is_the_studys() -> None:
             assert figure.strip() == said, (method, situation)
 
 
-def test_the_table_of_real_arms_is_the_studys() -> None:
-    from pyarrow import parquet
+OURS = "rpim_opt, command"
+STRUCTURAL = "figaroh, structural"
+MAP = "figaroh, map"
+AS_WELL = 0.03
+"""How far geometric means of errors may be apart, relative to each other, where a text says that both do as well."""
 
-    path = ROOT / "studies" / "results" / "real_data" / "replicates.parquet"
-    rows = parquet.read_table(path).to_pylist()
+
+def errors_of_peers(situation: str) -> dict[str, Array]:
+    """Return RMS errors of the same arms [mm] for every method, infinite where it failed."""
+    peers = grid.load_study(grid.find_study("peers"))
+    rows = sorted(peers.by_method(rows_of("peers")), key=lambda row: row["seed"])
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row["situation"] == situation:
+            error = row["rms_mm"]
+            found.setdefault(row["method"], []).append(np.inf if error is None else error)
+    return {method: np.array(errors) for method, errors in found.items()}
+
+
+def times(one: Array, other: Array) -> float:
+    """Return the geometric mean of the errors' ratios."""
+    return float(np.exp(np.mean(np.log(one / other))))
+
+
+def complete(errors: dict[str, Array]) -> set[str]:
+    """Return the complete models of others that are fitted by coordinates: pybotics has no parallel axes' angle."""
+    return {method for method in errors if not method.startswith(("pybotics", "rpim_opt"))}
+
+
+def test_where_others_do_as_well_is_the_studys() -> None:
+    said = (
+        "From 15 configurations on, where nothing is wrong with data or arm, every complete model fitted by coordinates"
+    )
+    assert f"{said} does as well (figaroh's `structural` from 52 on)" in README
+    for situation in ("clean15", "clean25"):
+        errors = errors_of_peers(situation)
+        well = {method for method in complete(errors) if abs(times(errors[method], errors[OURS]) - 1) < AS_WELL}
+        assert {"robotkinecal, documented", MAP, "scipy, lm"} <= well
+        assert complete(errors) - well == {STRUCTURAL}
+    errors = errors_of_peers("clean10")
+    assert abs(times(errors[MAP], errors[OURS]) - 1) < AS_WELL
+    assert "figaroh's priors, told the noise, do as well with ten" in README
+    told = grid.load_study(grid.find_study("peers")).METHODS
+    assert "noise" in told[MAP]
+    assert "noise" not in told[OURS]
+
+
+def test_by_how_much_others_are_better_is_the_studys() -> None:
+    better = []
+    for situation in ("clean52", "clean200"):
+        errors = errors_of_peers(situation)
+        for method in complete(errors):
+            better.append(100 * (1 - times(errors[method], errors[OURS])))
+            of_arms = 1 - errors[method] / errors[OURS]
+            (most,) = of_arms[of_arms > 0.2]  # on one arm
+            assert round(1 / most) == 3  # by a third
+            assert f"on one arm of {len(of_arms)} by a third" in README
+    assert f"with 52 or more even {min(better):.0f} to {max(better):.0f} % better than the command" in README
+
+
+def test_where_the_difference_is_is_the_studys() -> None:
+    """Few data, blunders and sag, with the figures that the list of studies has of them."""
+    assert "The difference is few data, blunders and sag." in README
+    few, some, clean, blunders, sag = map(errors_of_peers, ("clean10", "clean25", "clean52", "blunders52", "physics52"))
+    least_squares = times(few["scipy, lm"], few[OURS])
+    assert least_squares > 1.2
+    said = "our command and figaroh's priors with the noise told are equally good ({} and {} mm)"
+    assert said.format(*(f"{times(few[method], np.ones(1)):.3f}" for method in (OURS, MAP))) in STUDIES
+    assert f"least squares has {least_squares:.2f} times our error" in STUDIES
+    assert f"figaroh's `structural` ({times(some[STRUCTURAL], some[OURS]):.2f} times our error)" in STUDIES
+    better = 100 * (1 - times(clean["scipy, lm"], clean[OURS]))
+    assert f"plain least squares is {better:.0f} % better than our command" in STUDIES
+    cost = [
+        100 * (times(blunders[method], clean[before]) - 1)
+        for method, before in ((OURS, OURS), ("figaroh, map, threshold", MAP))
+    ]
+    said = "Three blunders cost our command {:.0f} %, and figaroh {:.0f} % with a threshold set by hand"
+    assert said.format(*cost) in STUDIES
+    others = [times(errors, np.ones(1)) for method, errors in sag.items() if method != OURS]
+    ours = times(sag[OURS], np.ones(1))
+    assert min(others) > 2 * ours
+    assert times(blunders["scipy, lm"], blunders[OURS]) > 2
+    assert f"{ours:.3f} mm against {min(others):.3f} or more without gravity" in STUDIES
+
+
+def test_figures_of_benchmarks_in_texts_are_the_studys() -> None:
+    metrics = json.loads((ROOT / "studies" / "results" / "benchmarks" / "metrics.json").read_text())
+    assert f"{1 / metrics['over SciPy']:.2g} times as fast as SciPy" in STUDIES
+    over = [value for name, value in metrics.items() if name.endswith("over ours")]
+    assert len(over) == 5
+    said = " to ".join(f"{float(f'{end(over):.1g}'):.0f}" for end in (min, max))
+    assert f"{said} times as fast as the peers" in STUDIES
+    rows = rows_of("benchmarks")
+    by_count = {row["count"]: row for row in rows if row["part"] in ("rows", "cluster")}
+    each = {count: 1e6 * row["seconds"] / row["passes"] / count for count, row in by_count.items()}
+    million = 10**6
+    assert f"A million configurations take {each[million]:.1f} us each and pass" in STUDIES
+    assert f"ten million on a Dask cluster of two processes {each[10 * million]:.1f} us" in STUDIES
+    megabytes = {count: row["peak_mb"] for count, row in by_count.items()}
+    assert "in the memory of a hundred thousand" in STUDIES
+    assert megabytes[million] < 1.1 * megabytes[million // 10]
+    said = (
+        f"A million configurations take {each[million]:.1f} microseconds each and pass, in {megabytes[million]:.0f} MB"
+    )
+    assert said in PAGES["large_data"]
+
+
+def test_figures_of_large_data_are_the_codes() -> None:
+    assert f"From {parts.KEPT:,} equations on only the triangle" in PAGES["large_data"]
+    assert f"Kinematics are evaluated on {abreast.WIDTH} rows at once" in PAGES["large_data"]
+    assert abreast.MANY == 10**7
+    assert "the work is worth it (ten million rows)" in PAGES["large_data"]
+
+
+AUTO = "learned, model auto"
+
+
+def test_the_table_of_real_arms_is_the_studys() -> None:
+    rows = rows_of("real_data")
     lines = re.findall(r"^\| (10|20|all) \| (.*) %? \|$", README, flags=re.MULTILINE)
     assert len(lines) == 3
     for count, cells in lines:
         own = [row for row in rows if str(row["count"] or "all") == count]
         stated = [cell.strip(" %") for cell in cells.split("|")]
-        ours = np.array([row["learned, model auto"] for row in own])
+        ours = np.array([row[AUTO] for row in own])
         for other, figure in zip(("least squares", "reml"), stated, strict=False):
             ratios = ours / [row[other] for row in own]
             assert f"{np.exp(np.mean(np.log(ratios))):.2f}" == figure, (count, other)
-        assert f"{max(row['learned, model auto'] / row['reml'] for row in own):.2f}" == stated[2]
-        assert f"{100 * np.mean([row['learned, model auto, covers'] for row in own]):.0f}" == stated[3]
-
-
-def rows_of(study: str) -> list[dict[str, Any]]:
-    """Return the replicates of a study's result."""
-    from pyarrow import parquet
-
-    return parquet.read_table(ROOT / "studies" / "results" / study / "replicates.parquet").to_pylist()
+        assert f"{max(row[AUTO] / row['reml'] for row in own):.2f}" == stated[2]
+        assert f"{100 * np.mean([row[f'{AUTO}, covers'] for row in own]):.0f}" == stated[3]
 
 
 def over(rows: list[dict[str, Any]], one: str, other: str) -> str:
@@ -162,25 +279,43 @@ def test_figures_of_real_arms_in_texts_are_the_studys() -> None:
     said = "geometry alone has {} and {} of REML's error with 10 and 20 configurations, and {} with all"
     assert said.format(*geometry) in README
     ten = [row for row in rows if row["count"] == 10]
-    auto = [over(ten, "learned, model auto", other) for other in ("least squares", "reml")]
+    auto = [over(ten, AUTO, other) for other in ("least squares", "reml")]
     said = "{} times the error of least squares with ten configurations, and {} times that of REML"
     assert said.format(*auto) in PAGES["weights"]
-    others = [row["learned, model auto"] / row["reml"] for row in rows if "cable" not in row["name"]]
+    of_counts = [[row for row in rows if (row["count"] or None) == count] for count in (None, 20, 10)]
+    squares, reml = ([over(own, AUTO, other) for own in of_counts] for other in ("least squares", "reml"))
+    said = (
+        "has {} times the error of least squares with all configurations, {} with twenty and {} with ten; {}, {} and {}"
+    )
+    assert f"{said.format(*squares, *reml)} of that of one weight by REML" in STUDIES
+    assert f"Of the held-out readings {100 * np.mean([row[f'{AUTO}, covers'] for row in rows]):.0f} % are" in STUDIES
+    others = [row[AUTO] / row["reml"] for row in rows if "cable" not in row["name"]]
     assert f"none is above {max(others):.2f}" in README
 
 
 def test_figures_of_simulated_arms_in_texts_are_the_studys() -> None:
     rows = rows_of("noise_and_poses")
     unknown = [row for row in rows if row["truth"] == "unknown"]
-    ratios = {
-        rule: [over([row for row in unknown if row["count"] == n], rule, "least_squares") for n in (8, 10, 15, 52)]
-        for rule in ("learned", "reml")
-    }
-    said = "{}, {}, {} and {} times the error of least squares with 8, 10, 15 and 52 configurations".format
-    assert said(*ratios["learned"]) in PAGES["weights"]
-    assert "(REML {}, {}, {} and {})".format(*ratios["reml"]) in PAGES["weights"]
-    worst = max(row["learned"] / row["least_squares"] for row in unknown if row["count"] == 10)
-    assert f"{worst:.0f} times worse" in PAGES["limitations"]
+    of_counts = {n: [row for row in unknown if row["count"] == n] for n in (8, 10, 15, 25, 52)}
+    learned, reml = (
+        {n: over(own, rule, "least_squares") for n, own in of_counts.items()} for rule in ("learned", "reml")
+    )
+    said = f"{learned[8]}, {learned[10]}, {learned[15]} and"
+    of = "times the error of least squares with 8, 10, 15 and"
+    assert f"{said} {learned[52]} {of} 52 configurations" in PAGES["weights"]
+    assert f"(REML {reml[8]}, {reml[10]}, {reml[15]} and {reml[52]})" in PAGES["weights"]
+    rest = f"(REML {reml[8]}, {reml[10]}, {reml[15]}, {reml[25]}), and {learned[52]} with 52"
+    assert f"{said} {learned[25]} {of} 25 configurations {rest}" in STUDIES
+    covers = [100 * np.mean([row["learned_covers"] for row in own]) for own in of_counts.values()]
+    assert f"its intervals cover {min(covers):.0f} to {max(covers):.0f} % of readings" in STUDIES
+    ten, eight = (
+        {rule: max(row[rule] / row["least_squares"] for row in of_counts[n]) for rule in ("learned", "reml")}
+        for n in (10, 8)
+    )
+    said = f"{ten['reml']:.0f} times worse than least squares, the default {ten['learned']:.0f} times worse"
+    assert f"{said}, and with eight {eight['learned']:.0f} times" in PAGES["limitations"]
+    said = f"{ten['learned']:.1f} times worse than least squares, {eight['learned']:.1f} times with eight"
+    assert f"{said} (REML {ten['reml']:.0f} and {eight['reml']:.0f})" in STUDIES
 
 
 def test_figures_of_one_size_in_texts_are_the_studys() -> None:
