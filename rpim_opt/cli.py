@@ -160,7 +160,8 @@ def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) ->
         say("looking at what a quick fit leaves")
         lacking = foreseen(instance.problem)
     document = {"title": instance.title, "source": instance.source, **found.content(), "lack_of_fit": None}
-    text = f"{instance.title}\n{instance.source}\n\n{found}"
+    head = "\n".join(filter(None, [instance.title, instance.source]))
+    text = f"{head}\n\n{found}"
     if lacking is not None:
         document["lack_of_fit"] = lacking.content()
         text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
@@ -339,7 +340,10 @@ def validate(
     out: Annotated[Path | None, typer.Option(help="CSV file for the errors, row by row.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named."""
+    """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
+
+    Exit code 1 if an error is above the limit, or a mistake in the measurements is likely.
+    """
     with progress() as say:
         from rpim_opt.store.result_file import load_result
         from rpim_opt.use.validation import read_measurements, validate
@@ -355,7 +359,7 @@ def validate(
     if limit is not None:
         text += f"\nThe largest error is {1e3 * found.largest:.4f} mm, {'above' if failed else 'within'} {limit:g} mm."
     show(text + written_line(out), {**document, "within_limit": None if limit is None else not failed}, as_json)
-    if failed:
+    if failed or found.mistake:
         raise typer.Exit(1)
 
 

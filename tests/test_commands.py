@@ -294,6 +294,42 @@ def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, 
     assert "left out: temperature." in said
 
 
+def test_new_measurements_in_another_unit_are_named(monkeypatch, capsys, cell, made, tmp_path) -> None:
+    """Each in the words of what to write; no new result is made from them."""
+    for units, said in (("deg,m", "name the columns q1_rad"), ("rad,mm", "name the columns x_m, y_m, z_m")):
+        arguments = [str(made / "results"), str(cell / "later.csv"), "--units", units]
+        assert run(monkeypatch, "validate", *arguments) == 1
+        *_, last = capsys.readouterr().out.strip().splitlines()
+        assert last.startswith("Likely: ")
+        assert said in last
+        assert run(monkeypatch, "validate", *arguments, "--json") == 1
+        assert json.loads(capsys.readouterr().out)["mistake"] == last
+        assert run(monkeypatch, "update", *arguments, "--out", str(tmp_path / "next")) == 2
+        assert f"accepted: {said}" in capsys.readouterr().err
+        assert not (tmp_path / "next").exists()
+        assert run(monkeypatch, "monitor", *arguments) == 1
+        assert said in capsys.readouterr().out
+
+
+def test_two_units_that_are_wrong_are_both_named(monkeypatch, capsys, cell, tmp_path) -> None:
+    """And nothing that fits as well as the first of them, but not with the second."""
+    arguments = ["--robot", str(cell / "arm.urdf"), "--data", str(cell / "measured.csv"), "--units", "deg,mm"]
+    assert run(monkeypatch, "new", str(tmp_path / "arm"), *arguments) == 0
+    capsys.readouterr()
+    assert run(monkeypatch, "inspect", str(tmp_path / "arm")) == 0
+    (said,) = [line for line in capsys.readouterr().out.splitlines() if "times better" in line]
+    lengths, turns = "measured lengths a thousand times larger", "joint values read as radians, not degrees"
+    assert f"{lengths} and {turns}: " in said or f"{turns} and {lengths}: " in said
+
+
+def test_a_title_without_a_source_has_no_empty_line_below(monkeypatch, capsys, made) -> None:
+    for command in ("inspect", "calibrate"):
+        assert run(monkeypatch, command, str(made)) == 0
+        title, empty, first, *_ = capsys.readouterr().out.splitlines()
+        assert (title, empty) == ("arm", "")
+        assert first.split()[:2] in (["joint", "unit"], ["parameter", "unit"])
+
+
 def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:
     """Of 40 sets of 50 new rows each with the declared noise, hardly one has a row beyond its bound."""
     problem, truth = simulated(("theta?", "d?", "a?", "tool_[xyz]", "base_*"), noise=5e-5, seed=1)

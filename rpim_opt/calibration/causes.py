@@ -10,8 +10,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.readings import better_reading
+from rpim_opt.problem.readings import Better, better_reading
 from rpim_opt.problem.suspects import (
     exchanged_rows,
     moved,
@@ -81,6 +82,35 @@ def likely_causes(result: Outcome) -> list[str]:
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
         return [*head, NOTHING]
     return []
+
+
+def better_fitting(result: Outcome, data: Dataset) -> Better | None:
+    """Return the reading of new measurements that fits far better; None where they are near, or none does.
+
+    Asked where their errors are beyond `HOPELESS` times what the instrument is stated to have.
+
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.calibration.causes import better_fitting
+    >>> instance = ro.load("position")
+    >>> result = ro.calibrate(instance.problem)
+    >>> block = instance.validation.blocks[0]
+    >>> wrong = replace(instance.validation, blocks=(replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]]),))
+    >>> better_fitting(result, instance.validation), better_fitting(result, wrong).what
+    (None, 'joints 2 and 3 exchanged')
+    """
+    problem = result.problem.sample().on(data)
+    if len(problem.arms) > 1 or noise_ratio(problem, result.errors(data)) <= HOPELESS:
+        return None
+    return better_reading(problem)
+
+
+def misread(result: Outcome, data: Dataset) -> str:
+    """Return what `better_fitting` finds as a sentence, empty for nothing."""
+    better = better_fitting(result, data)
+    if better is None:
+        return ""
+    return f"Likely: {better.sentence}"
 
 
 def named(causes: Sequence[str]) -> bool:

@@ -37,11 +37,12 @@ BEAM = 8
 
 
 class Reading(NamedTuple):
-    """Another reading: what was mistaken, what to write, and the points as they are then."""
+    """Another reading: what was mistaken, what to write, the points as they are then, and readings that fit as well."""
 
     what: str
     remedy: str
     change: Callable[[Points], Points]
+    others: tuple[Reading, ...] = ()
 
 
 class Better(NamedTuple):
@@ -227,15 +228,14 @@ def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
         current = each.change(current)
         best = size
         if best < BETTER * stated and best < WRONG:
-            return _compared(chain, points, stated, current, best)
+            return _compared(robot, chain, points, stated, best)
     if stated > WRONG and not points.seen:
         pair = _pair(robot, points)
         if pair is not None and pair[1] < min(best, BETTER * stated):
             chain, best = pair
-            current = chain[1].change(chain[0].change(points))
     if not chain or not best < BETTER * stated:
         return None
-    return _compared(chain, points, stated, current, best)
+    return _compared(robot, chain, points, stated, best)
 
 
 def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:
@@ -252,10 +252,35 @@ def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:
     return min(found, key=lambda each: each[1], default=None)
 
 
-def _compared(chain: list[Reading], points: Points, stated: float, changed: Points, left: float) -> Better:
-    what = " and ".join(each.what for each in chain)
-    remedy = "; ".join(each.remedy for each in chain)
-    return Better(what, remedy, stated * points.extent, left * changed.extent)
+def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float, left: float) -> Better:
+    """Return mistakes in words, each with what fits as well in its place: some are the same but for base and tool."""
+    same = [[each, *_in_place(robot, chain, i, points, left)] for i, each in enumerate(chain)]
+    what = " and ".join(", or ".join(each.what for each in place) for place in same)
+    remedy = "; ".join(", or ".join(each.remedy for each in place) for place in same)
+    return Better(what, remedy, stated * points.extent, left * _changed(chain, points).extent)
+
+
+def _in_place(robot: Robot, chain: list[Reading], i: int, points: Points, left: float) -> list[Reading]:
+    """Return what fits as well as a mistake; of one with others behind it, what still does with them."""
+    if i == len(chain) - 1:
+        return list(chain[i].others)
+    start = _changed(chain[:i], points)
+    count = len(chain[i].change(start).row)
+    found = []
+    for other in chain[i].others:
+        changed = other.change(start)
+        if len(changed.row) == count:  # the mistakes behind it are of so many rows
+            size = float(misfits(robot, [_changed(chain[i + 1 :], changed)])[0])
+            if size <= SAME * left:
+                found.append(other)
+    return found
+
+
+def _changed(chain: Sequence[Reading], points: Points) -> Points:
+    """Return the points as they are without some mistakes."""
+    for each in chain:
+        points = each.change(points)
+    return points
 
 
 def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Reading | None, float]:
@@ -268,15 +293,8 @@ def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Readin
     whole = misfits(robot, [readings[i].change(points) for i in near])
     k = int(np.argmin(whole))
     same = [readings[i] for i, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
-    return _either(readings[near[k]], same), float(whole[k])
-
-
-def _either(best: Reading, same: list[Reading]) -> Reading:
-    """Return a reading that names all that fit as well: some are one and the same, but for base and reflector."""
-    others = [each for each in same if each is not best][:2]
-    what = ", or ".join(each.what for each in (best, *others))
-    remedy = ", or ".join(each.remedy for each in (best, *others))
-    return best._replace(what=what, remedy=remedy)
+    best = readings[near[k]]
+    return best._replace(others=tuple(each for each in same if each is not best)[:2]), float(whole[k])
 
 
 def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
@@ -303,7 +321,7 @@ def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
     each, size = _best(robot, points, readings)
     if each is None or not size < BETTER * stated:
         return None
-    return _compared([each], points, stated, each.change(points), size)
+    return _compared(robot, [each], points, stated, size)
 
 
 def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
@@ -319,4 +337,4 @@ def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
     if not best < BETTER * stated:
         return None
     other = Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', lambda points: points)
-    return _compared([other], points, stated, points, best)
+    return _compared(robot, [other], points, stated, best)

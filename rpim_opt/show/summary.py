@@ -138,7 +138,7 @@ def _remarks(result: Calibration) -> list[str]:
 def describe(result: Calibration, found: Mapping[str, Any]) -> str:
     """Return the tables of a `summary`."""
     stated = [f"{FIELDS[key]}: {text}" for key, text in found["details"].items()]
-    head = "\n".join([found["title"], found["source"], *stated])
+    head = "\n".join([*filter(None, [found["title"], found["source"]]), *stated])
     lines = [f"{head}\n", result.parameter_table(), ""]
     lines.append(table(["error [mm]", "rows", "mean", "RMS", "max"], [_row(e, "mm") for e in found["errors"]]))
     if found["orientation"]:

@@ -37,6 +37,8 @@ class Monitoring:
         (N,) their cumulative sum (`cusum.cumulative`), and what it passes rarely.
     drift
         The change that explains them best; None where chance does.
+    mistake
+        Another reading of the checks that fits far better, in a sentence; empty where there is none.
 
     Examples
     --------
@@ -56,6 +58,7 @@ class Monitoring:
     sums: Array
     limit: float
     drift: Drift | None = None
+    mistake: str = ""
 
     @property
     def beyond(self) -> tuple[int, ...]:
@@ -106,6 +109,7 @@ class Monitoring:
             "since": began,
             "limit": self.limit,
             "moved": moved,
+            "mistake": self.mistake,
             "rows": self._rows(),
         }
 
@@ -146,6 +150,8 @@ class Monitoring:
             lines.append("No parameter and no frame explains it alone.")
         else:
             lines.append(self._moved(self.drift))
+        if self.mistake:
+            lines.append(self.mistake)
         return lines
 
     def _moved(self, drift: Drift) -> str:

@@ -11,6 +11,7 @@ from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.times import seconds, time_column
@@ -92,6 +93,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         sums=cumulative(found.deviate),
         limit=limit(count, rare),
         drift=likeliest(carried, problem, rare),
+        mistake=misread(result, data),
     )
 
 

@@ -15,6 +15,7 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.contact_words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
@@ -56,6 +57,8 @@ class Validation:
         How far touches are from their points and planes, the worst first.
     remarks
         What a reader of errors of touches has to know.
+    mistake
+        Another reading of the measurements that fits far better, in a sentence; empty where there is none.
 
     Examples
     --------
@@ -79,6 +82,7 @@ class Validation:
     outside: Outside = field(default_factory=Outside)
     touched: tuple[Scatter, ...] = ()
     remarks: tuple[str, ...] = ()
+    mistake: str = ""
 
     @property
     def largest(self) -> float:
@@ -105,6 +109,7 @@ class Validation:
             "outside": [self.label[i] for i in self.outside.rows],
             "touched": [each.content() for each in self.touched],
             "remarks": self.remarks,
+            "mistake": self.mistake,
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
         }  # fmt: skip
@@ -130,7 +135,10 @@ class Validation:
         tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
         if self.touched:
             tables.append(table(HEADER, scatter_rows(self.touched)))
-        return "\n".join([*tables, self._judgement(), *self.outside.sentences(), *self.remarks])
+        said = [self._judgement(), *self.outside.sentences(), *self.remarks]
+        if self.mistake:
+            said.append(self.mistake)
+        return "\n".join([*tables, *said])
 
     def _judgement(self) -> str:
         if not np.isfinite(self.sigmas).any():
@@ -183,6 +191,7 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     return Validation(
         data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"),
         *judged(result, data), result.outside(data), touched, tuple(remarks),
+        misread(result, data),
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -75,6 +76,17 @@ def test_one_wrong_check_is_named() -> None:
     y[7] += 1e-3
     found = ro.use.monitor(result, ro.Dataset.of(block.q[:, 0], y, SIGMA))
     assert found.beyond == (7,)
+
+
+def test_checks_in_another_unit_are_no_drift() -> None:
+    result, data = checked(0, np.zeros(CHECKS))
+    assert ro.use.monitor(result, data).mistake == ""
+    (block,) = data.blocks
+    found = ro.use.monitor(result, replace(data, blocks=(replace(block, y=block.y / 1e3),)))
+    assert found.drifts
+    assert "with measured lengths a thousand times larger: name the columns x_m, y_m, z_m." in found.mistake
+    assert found.mistake in str(found)
+    assert found.content()["mistake"] == found.mistake
 
 
 def test_times_order_the_checks() -> None:

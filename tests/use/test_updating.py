@@ -199,12 +199,17 @@ def test_the_command(monkeypatch, capsys, tmp_path, crashed: Robot, first) -> No
 
 def test_bad_input_is_one_sentence(monkeypatch, capsys, tmp_path, crashed: Robot, first) -> None:
     ro.store.save_result(first, tmp_path / "result.json")
-    turned = replace(crashed.after.blocks[0], y=crashed.after.blocks[0].y[::-1])
-    another = replace(crashed.after, blocks=(turned,))
+    (block,) = crashed.after.blocks
+
+    def with_points(y: np.ndarray) -> ro.Dataset:
+        return replace(crashed.after, blocks=(replace(block, y=y),))
+
     tables = {
         "columns": (table(crashed.after, drop=("q6_rad",)), "q6"),
         "values": (table(crashed.after, drop=("z_m",)), "z"),
-        "robot": (table(another), "mm off, whatever is let go"),
+        "robot": (table(with_points(block.y[[3, 0, 6, 7, 1, 5, 2, 4]])), "mm off, whatever is let go"),
+        "order": (table(with_points(block.y[::-1])), "the rows of joint values in the reverse order, accepted: turn"),
+        "units": (table(with_points(block.y / 1e3)), "measured lengths a thousand times larger, accepted: name"),
     }
     for name, (text, said) in tables.items():
         (tmp_path / f"{name}.csv").write_text(text, encoding="utf-8")
