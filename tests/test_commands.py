@@ -304,8 +304,13 @@ def test_new_measurements_in_another_unit_are_named(monkeypatch, capsys, cell, m
         assert said in last
         assert run(monkeypatch, "validate", *arguments, "--json") == 1
         assert json.loads(capsys.readouterr().out)["mistake"] == last
-        assert run(monkeypatch, "update", *arguments, "--out", str(tmp_path / "next")) == 2
-        assert f"accepted: {said}" in capsys.readouterr().err
+        result, rows, *unit = arguments
+        for refusing in (
+            ["update", *arguments, "--out", str(tmp_path / "next")],
+            ["accept", result, "--data", rows, *unit, "--limit", "0.2"],
+        ):
+            assert run(monkeypatch, *refusing) == 2
+            assert f"accepted: {said}" in capsys.readouterr().err
         assert not (tmp_path / "next").exists()
         assert run(monkeypatch, "monitor", *arguments) == 1
         assert said in capsys.readouterr().out

@@ -14,6 +14,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
+from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.checked import Checked, checked
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.reaching import Reaching, Share, reaching, share
@@ -155,7 +156,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     Raises
     ------
     InputError
-        Where nothing is required, for a region that the robot has not or does not reach.
+        Where nothing is required, for a region that the robot has not or does not reach, and for measurements of
+        which another reading (another unit, exchanged joints) fits far better.
 
     Examples
     --------
@@ -168,6 +170,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     requirement = requirement or result.record.requirement
     if requirement is None:
         raise InputError("acceptance", "no limit", "a limit [mm]: --limit, or limit_mm in [acceptance]")
+    if data is not None:
+        refuse_misread(result, data)
     region = region_of(result, requirement)
     q = region.drawn()
     seen = checked(result, region, requirement, data)

@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
@@ -103,6 +104,14 @@ def better_fitting(result: Outcome, data: Dataset) -> Better | None:
     if len(problem.arms) > 1 or noise_ratio(problem, result.errors(data)) <= HOPELESS:
         return None
     return better_reading(problem)
+
+
+def refuse_misread(result: Outcome, data: Dataset) -> None:
+    """Raise an InputError for new measurements of which `better_fitting` finds another reading."""
+    better = better_fitting(result, data)
+    if better is not None:
+        left = f"readings {1e3 * better.stated:.3g} mm off, and {1e3 * better.left:.3g} mm with {better.what}"
+        raise InputError("the new measurements", left, better.remedy)
 
 
 def misread(result: Outcome, data: Dataset) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.causes import better_fitting
+from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.structure import identity
@@ -139,10 +139,7 @@ def _readings(found: Calibration, group: np.ndarray) -> list[Reading]:
 
 def _require_this_robot(result: Calibration, found: Calibration, data: Dataset) -> None:
     """Refuse readings that another unit or order explains, or further off than the robot ever was uncalibrated."""
-    better = better_fitting(result, data)
-    if better is not None:
-        left = f"readings {1e3 * better.stated:.3g} mm off, and {1e3 * better.left:.3g} mm with {better.what}"
-        raise InputError("the new measurements", left, better.remedy)
+    refuse_misread(result, data)
     before = float(np.nanmax(result.nominal_errors()))
     missed = float(np.sqrt(np.nanmean(found.errors(data) ** 2)))
     if missed > STRANGE * before:

@@ -145,7 +145,7 @@ class Validation:
             return "The calibration has no covariance for these rows: how large errors may be is not known."
         covered = ""
         if self.coverage is not None:
-            covered = f" {self.coverage:.0%} of the coordinates lie in their 95 % intervals of a reading."
+            covered = f" {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals of a reading."
         if not self.beyond:
             return f"No row is beyond what the prediction's uncertainty allows.{covered}"
         named = ", ".join(
