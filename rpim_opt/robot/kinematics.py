@@ -19,7 +19,7 @@ from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.joint_terms import displacement, motion
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.posture import Posture, Symbol
-from rpim_opt.robot.terms import Place, Term
+from rpim_opt.robot.terms import Term
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -164,14 +164,14 @@ def chain(
     Where a term displaces the tool, that is part of it.
     """
     factors = list(itertools.chain.from_iterable(_by_joint(joint_types, posture, value, terms)))
-    return factors + _displaced("tool", joint_types, len(joint_types), posture, value, terms)
+    return factors + _displaced(displacement("tool", joint_types, len(joint_types), posture, value, terms))
 
 
 def _by_joint(
     joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term]
 ) -> Iterator[list[ca.SX]]:
     """Yield the factors up to every joint's frame from the one before."""
-    before = _displaced("base", joint_types, 1, posture, value, terms)
+    before = _displaced(displacement("base", joint_types, 1, posture, value, terms))
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
         moved = motion(joint_types, i, posture, value, terms)
@@ -179,20 +179,13 @@ def _by_joint(
             theta = theta + moved
         else:
             d = d + moved
-        yield [*before, *link(alpha, a, theta, d, beta), *_displaced("link", joint_types, i, posture, value, terms)]
+        after = _displaced(displacement("link", joint_types, i, posture, value, terms))
+        yield [*before, *link(alpha, a, theta, d, beta), *after]
         before = []
 
 
-def _displaced(
-    at: Place,
-    joint_types: Sequence[str],
-    i: int,
-    posture: Posture,
-    value: Callable[[str], Symbol],
-    terms: Sequence[Term],
-) -> list[ca.SX]:
+def _displaced(by: ca.SX | None) -> list[ca.SX]:
     """Return the factors by which terms displace a frame; none where none does."""
-    by = displacement(at, joint_types, i, posture, value, terms)
     if by is None:
         return []
     return placed((0,) * 6, ca.vertsplit(by))
