@@ -89,7 +89,7 @@ def position_noise(source: Source) -> Array:
 
 def coverage_factor(freedom: float, confidence: float) -> float:
     """Return the quantile k of Student's t at (1 + confidence) / 2, with at least one degree of freedom."""
-    return float(stdtrit(max(freedom, 1.0), (1 + confidence) / 2))
+    return float(coverage_factors(np.asarray(freedom), confidence))
 
 
 def coverage_factors(freedom: Array, confidence: float) -> Array:
