@@ -194,8 +194,7 @@ class PartitionedProblem:
         """Yield one problem a part, read in this process; no two parts share the number of a configuration."""
         configurations = 0
         for number, part in enumerate(self.parts, start=1):
-            data = _read(self._dropped, (number, part))
-            _require_sessions(self.parameters, number, data)
+            data = _read(self.parameters, self._dropped, (number, part))
             if len(data):
                 label = tuple(f"{number}:{name}" for name in data.label)
                 yield self.on(replace(data, label=label, configuration=data.configuration + configurations))
@@ -299,8 +298,7 @@ def _on_part(
     dropped: frozenset[str],
     part: tuple[int, Part],
 ) -> Any:
-    data = _read(dropped, part)
-    _require_sessions(known.parameters, part[0], data)
+    data = _read(known.parameters, dropped, part)
     return what(known.on(data)) if len(data) else None
 
 
@@ -313,13 +311,16 @@ def _require_sessions(parameters: Parameters, number: int, data: Dataset) -> Non
         raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
 
 
-def _read(dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
-    """Return the measurements of a part, without what was dropped of it."""
+def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
+    """Return the measurements of a part, without what was dropped of it, or refuse their sessions."""
     number, read = part
     mine = f"{number}:"
     out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}
     data = read()
-    return data.without(out) if out else data
+    if out:
+        data = data.without(out)
+    _require_sessions(parameters, number, data)
+    return data
 
 
 def _reduced(x: Array, reweigh: Reweigh | None, problem: CalibrationProblem) -> LinearModel:
