@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
@@ -237,38 +237,48 @@ class Read(NamedTuple):
 
 def read_table(result: Calibration, source: Any, measurement: str | None, units: str) -> Read:
     """Return what a table says; arguments as for `read_measurements`."""
-    blocks = result.problem.data.blocks
-    kinds = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
-    name = measurement or (next(iter(kinds)) if len(kinds) == 1 else "")
-    if name not in kinds:
-        raise InputError("measurement", f"'{name}'" if name else "several", choices(name, kinds))
+    kind = _kind(result, measurement)
     given = parse_units(units)
     try:
-        columns, left_out, raw = _columns(source, result.problem.robot, kinds[name], given)
-        if left_out and not columns:
-            accepted = f"joints' values and {', '.join(kinds[name].columns)}"
-            raise InputError("the header", f"nothing that is known among {', '.join(left_out)}"[:200], accepted)
+        columns, left_out, raw = _columns(source, result.problem.robot, kind, given)
         board = board_of(result.problem.sample().data)
-        if kinds[name].by_camera and board and not any(column.startswith("target_") for column in columns):
+        if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
             columns = on_board(columns, board)
-        data = read_data(columns, result.problem.robot, _noise(result, kinds[name]), kinds[name])
+        data = read_data(columns, result.problem.robot, _noise(result, kind), kind)
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
     return Read(data, left_out, raw)
+
+
+def _kind(result: Calibration, name: str | None) -> Measurement:
+    """Return the calibration's kind of measurement of a name, or its only one."""
+    blocks = result.problem.data.blocks
+    kinds = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
+    if name:
+        return pick(kinds, name, "measurement")
+    if len(kinds) != 1:
+        raise InputError("measurement", "several", choices("", kinds))
+    return next(iter(kinds.values()))
 
 
 def _columns(
     source: Any, robot: Robot, kind: Measurement, units: Mapping[str, str]
 ) -> tuple[Columns, tuple[str, ...], Columns]:
     """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
-    if not isinstance(source, str | Path):
+    if isinstance(source, str | Path):
+        found = understand(Path(source), robot, kind, Asked(units=units))
+        if found.numbered and kind.name == "pose":
+            raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+        columns, raw = found.columns, found.raw
+        left_out = tuple(each.column for each in found.meant if each.meaning == "left out")
+    else:
         raw = read_columns(source)
         renamed = rename(raw, robot, kind, units)
-        return renamed.columns, renamed.left_out, raw
-    found = understand(Path(source), robot, kind, Asked(units=units))
-    if found.numbered and kind.name == "pose":
-        raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-    return found.columns, tuple(each.column for each in found.meant if each.meaning == "left out"), found.raw
+        columns, left_out = renamed.columns, renamed.left_out
+    if left_out and not columns:
+        accepted = f"joints' values and {', '.join(kind.columns)}"
+        raise InputError("the header", f"nothing that is known among {', '.join(left_out)}"[:200], accepted)
+    return columns, left_out, raw
 
 
 def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:
