@@ -497,8 +497,8 @@ class CalibrationProblem(Tabled):
         weighed, offset = reweigh(model, x / self.parameters.free.scale)
         return replace(weighed, offset=offset)
 
-    def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model of `linearize` some rows at a time, block by block; each stands until the next one.
+    def pieces(self, x: Array, most: int, passing: bool = False) -> Iterator[LinearModel]:
+        """Yield the linear model of `linearize` some rows at a time, block by block.
 
         Parameters
         ----------
@@ -506,6 +506,8 @@ class CalibrationProblem(Tabled):
             (n,) deviations [SI].
         most
             Rows of a piece.
+        passing
+            Whether the caller is done with a piece when it asks for the next one, which is then written over it.
 
         Examples
         --------
@@ -524,7 +526,7 @@ class CalibrationProblem(Tabled):
             each = len(block.measurement.components)
             for start in range(0, len(block.row), most):
                 part = slice(start, start + most)
-                A, b = self._equations(i, x, part, passing=most < len(block.row))
+                A, b = self._equations(i, x, part, passing)
                 group = np.repeat(self.data.configuration[block.row[part]], each)
                 yield LinearModel(A, b, group, self._identified, constrained)
 

@@ -47,7 +47,7 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
     ((35, 34), 120)
     """
     if reweigh is None:
-        return _rotated(problem.pieces(x, FEW))
+        return _rotated(problem.pieces(x, FEW, passing=True))
     groups = whole_configurations(problem.data, ROWS)
     return _rotated(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
 
