@@ -404,29 +404,20 @@ class Faces:
         if self.bounded:
             y = np.minimum(np.maximum(y, self.lower), self.upper)
         C = self.curvature(weight)
-        ridge = RIDGE
         value = self.value(y, weight)
         step = np.zeros(len(y))
+        ridge = RIDGE
         arrived = False
         for _ in range(50 + 2 * len(y)):
             slope = self.slope(y, weight)
             if self._many:
-                slope = self._emptied(y, slope, C, weight)
+                y, slope = self._emptied(y, slope, C, weight)
                 value = self.value(y, weight)
-            fall = 0.0
             if not arrived:
-                step, fall = self._newton(y, slope, C, weight, ridge)
-            if fall > VANISHED * abs(value):
-                ahead, there, whole = self._ahead(y, step, fall, value, C, weight)
-                if self._nearer(y, value, ahead, there):
-                    arrived = whole  # squares on a face are a quadratic, whose minimum is one step away
-                    y, value = ahead, there
-                    ridge = RIDGE
+                step, stepped, ridge = self._onward(y, value, slope, C, weight, ridge)
+                if stepped is not None:
+                    y, value, arrived = stepped  # squares on a face are a quadratic, whose minimum is one step away
                     continue
-                if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
-                    ridge = STIFFER * ridge
-                    continue
-            ridge = RIDGE
             ahead, there = self._freed(y, value, slope, C, weight)
             if not (there < value or arrived):
                 break
@@ -438,6 +429,19 @@ class Faces:
             y, value = ahead, there
         slope = self.slope(y, weight)
         return Face(y, self.free(y), self.gap(y, slope, weight, step), value)
+
+    def _onward(
+        self, y: Array, value: float, slope: Array, C: Array, weight: float, ridge: float
+    ) -> tuple[Array, tuple[Array, float, bool] | None, float]:
+        """Return Newton's step (n,), where to go on as `_ahead` returns it, None for nowhere, and with what ridge."""
+        step, fall = self._newton(y, slope, C, weight, ridge)
+        if fall > VANISHED * abs(value):
+            stepped = self._ahead(y, step, fall, value, C, weight)
+            if self._nearer(y, value, *stepped[:2]):
+                return step, stepped, RIDGE
+            if ridge < FIRM:  # what rounding makes of a direction that nothing holds spoils the step
+                return step, (y, value, False), STIFFER * ridge
+        return step, None, RIDGE
 
     def _nearer(self, y: Array, value: float, ahead: Array, there: float) -> bool:
         """Whether a step is one: the objective falls, or it is the same on a smaller face."""
@@ -655,8 +659,8 @@ class Faces:
             ahead = np.where(reached, place, ahead)
         return ahead
 
-    def _emptied(self, y: Array, slope: Array, C: Array, weight: float) -> Array:
-        """Put groups to zero (in place) where that is best with the others as they are; return the slope then."""
+    def _emptied(self, y: Array, slope: Array, C: Array, weight: float) -> tuple[Array, Array]:
+        """Return the point with groups put to zero where that is best with the others as they are, and the slope."""
         blocks = self.blocks
         if self.H is not None:
             blocks = C * self.together
@@ -667,9 +671,8 @@ class Faces:
             without = slope[inside] - block @ y[inside]
             if np.linalg.norm(without) <= weight * self.groups[k]:
                 slope = slope - C[:, inside] @ y[inside]
-                y[inside] = 0.0
-                self._last.clear()
-        return slope
+                y = np.where(self.member == k, 0.0, y)
+        return y, slope
 
     def _wrong(self, y: Array, slope: Array, weight: float) -> np.ndarray:
         """Return which held components (n,) the objective falls along."""
