@@ -172,10 +172,14 @@ class Loop:
         quiet = state.quiet + 1 if nothing else 0
         if state.choice.settled and (promised <= best or quiet >= QUIET or self._stalled(state)):
             return replace(state, outcome="rest")
+        return self._tried(replace(state, quiet=quiet), straight, promised, short, nothing)
+
+    def _tried(self, state: State, straight: Array, promised: float, short: bool, nothing: bool) -> State:
+        """Return the state after a step to the minimum (n,) of the convex program, or along the residual's curve."""
         z = self._bent(state, straight)
         candidate = state.program.on(self.linearized(z, state.z))
         merit = _merit(candidate, z, state.choice.weight)
-        state = replace(state, evaluations=state.evaluations + 1, quiet=quiet)
+        state = replace(state, evaluations=state.evaluations + 1)
         gain = (state.merit - merit) / promised if promised > 0 else 1.0
         stepped = merit <= state.merit + ROUNDING * abs(state.merit) + state.floor
         state = self._damped(state, gain, promised, z)
