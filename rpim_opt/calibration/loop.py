@@ -180,8 +180,11 @@ class Loop:
         candidate = state.program.on(self.linearized(z, state.z))
         merit = _merit(candidate, z, state.choice.weight)
         state = replace(state, evaluations=state.evaluations + 1)
-        gain = (state.merit - merit) / promised if promised > 0 else 1.0
-        stepped = merit <= state.merit + ROUNDING * abs(state.merit) + state.floor
+        rounding = ROUNDING * abs(state.merit) + state.floor
+        gain = 1.0
+        if promised > 0 and not (nothing and abs(state.merit - merit) <= rounding):  # else rounding would damp
+            gain = (state.merit - merit) / promised
+        stepped = merit <= state.merit + rounding
         state = self._damped(state, gain, promised, z)
         if not stepped:
             state = replace(state, refused=state.refused + 1)
