@@ -15,7 +15,7 @@ from rpim_opt.convex.whitened import ACCEPTED, FLAT, PROMISED, SOUGHT, Best, End
 
 MOST, CHANGES = 40, 1000
 """Quadratic programs, and changes of the set in each, after which another method is asked."""
-HALVES = 12
+HALVES = 11
 """How often a step is halved at most."""
 SOON = 10
 """Quadratic programs after which a neighbour was too far to begin with."""
@@ -109,17 +109,22 @@ class Worst(Whitened):
         near = NEAR * abs(point.ended.objective)
         if whole.ended.gap <= (1 - FALL) * point.ended.gap and whole.ended.gap <= near:
             return whole
+        return self._shortened(point, least, whole, promised, steps)
+
+    def _shortened(self, point: Point, least: Least, whole: Point, promised: float, steps: int) -> Point | None:
+        """Return the point after a step that keeps enough of its promise: all of it, bent, or part; None for none."""
+        objective = point.ended.objective
+        if objective - whole.ended.objective >= FALL * promised:
+            return whole
+        bent = self._moved(point, self._bent(least, whole), 1.0, steps)
+        if objective - bent.ended.objective >= FALL * promised:
+            return bent
         t = 1.0
-        ahead = whole
-        if point.ended.objective - ahead.ended.objective < FALL * promised:
-            bent = self._moved(point, self._bent(least, whole), 1.0, steps)
-            if point.ended.objective - bent.ended.objective >= FALL * promised:
-                return bent
         for _ in range(HALVES):
-            if point.ended.objective - ahead.ended.objective >= FALL * t * promised:
-                return ahead
             t /= 2
             ahead = self._moved(point, least, t, steps)
+            if objective - ahead.ended.objective >= FALL * t * promised:
+                return ahead
         return None
 
     def _bent(self, least: Least, whole: Point) -> Least:
