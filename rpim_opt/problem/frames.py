@@ -149,23 +149,34 @@ def relocated(problem: Source) -> Source | None:
     if len(problem.arms) > 1:
         return _each_relocated(problem)
     p = problem.parameters
+    nominal = p.nominal.copy()
+    for k, place in _located(problem):
+        free = p.identified[k]
+        if _misplaced(p, k, place):
+            nominal[k[free]] = place[free]
+    return _moved(problem, nominal)
+
+
+def _located(problem: Source) -> list[tuple[np.ndarray, Array]]:
+    """Return where base and reflectors are in the table and where the data put them, (6,) each; none if they do not."""
+    p = problem.parameters
     base = _frame_of(p, "base_")
     if not p.identified[base].all():
-        return None
+        return []
     try:
         data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
         at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
         found, places, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
     except InputError:
+        return []
+    return [(base, found), *((k, places[marker]) for marker, k in at.items())]
+
+
+def _moved(problem: Source, nominal: Array) -> Source | None:
+    """Return the problem with other nominal values (P,); None if they are the same."""
+    if (nominal == problem.parameters.nominal).all():
         return None
-    nominal = p.nominal.copy()
-    for k, place in [(base, found), *((k, places[marker]) for marker, k in at.items())]:
-        free = p.identified[k]
-        if _misplaced(p, k, place):
-            nominal[k[free]] = place[free]
-    if (nominal == p.nominal).all():
-        return None
-    return problem.with_parameters(replace(p, nominal=nominal))
+    return problem.with_parameters(replace(problem.parameters, nominal=nominal))
 
 
 def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
@@ -198,9 +209,7 @@ def _each_relocated(problem: Source) -> Source | None:
         base = _frame_of(own, "base_")
         if _misplaced(own, base, place):
             nominal[p.places_of(name)[base]] = place
-    if (nominal == p.nominal).all():
-        return None
-    return problem.with_parameters(replace(p, nominal=nominal))
+    return _moved(problem, nominal)
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:
