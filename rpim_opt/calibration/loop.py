@@ -194,12 +194,9 @@ class Loop:
 
     def _solved(self, program: Program, state: State) -> Array:
         """Return the minimum (n,) of a convex program, damped as the state says."""
-        damping = None
-        if state.damping > 0:
-            damping = Damping(state.z, np.sqrt(state.damping) * state.size)
         weight = state.choice.weight
         with phase("solve"):
-            estimate = program.solve(weight, damping=damping, **self.solver)
+            estimate = program.solve(weight, damping=_term(state), **self.solver)
         return program.inside(estimate.z, state.z, weight)
 
     def _bent(self, state: State, straight: Array) -> Array:
@@ -218,14 +215,26 @@ class Loop:
         bend = (ahead - (model.b - model.A @ state.z) + BEND_STEP * along) / BEND_STEP**2
         if not np.isfinite(bend).all() or np.linalg.norm(bend) <= BENT * np.linalg.norm(along):
             return straight
-        try:
-            curved = self._solved(state.program.on(model.with_values(model.b + bend)), state)
-        except NoSolutionFound:
+        curved = self._curved(state, straight, bend)
+        if curved is None:
             return straight
         turn = np.linalg.norm(state.size * (curved - straight))
         if 2 * turn > MOST_BEND * np.linalg.norm(state.size * step):
             return straight
         return curved
+
+    def _curved(self, state: State, straight: Array, bend: Array) -> Array | None:
+        """Return the minimum (n,) where b moves by (m,), from that where it does not."""
+        program, model = state.program, state.program.model
+        by = None
+        if self.solver.get("solver") is None:
+            by = program.moved(bend, state.choice.weight, _term(state))
+        if by is not None:
+            return straight + by
+        try:
+            return self._solved(program.on(model.with_values(model.b + bend)), state)
+        except NoSolutionFound:
+            return None
 
     def _stalled(self, state: State) -> bool:
         """Whether many passes together have changed the objective by no more than one may for nothing."""
@@ -295,6 +304,13 @@ class Loop:
             choice=state.choice.after(length / (1 + float(np.linalg.norm(z)))),
             outcome="rest" if resting else "",
         )
+
+
+def _term(state: State) -> Damping | None:
+    """Return the term that shortens a step."""
+    if state.damping == 0:
+        return None
+    return Damping(state.z, np.sqrt(state.damping) * state.size)
 
 
 def _merit(program: Program, z: Array, weight: float) -> float:

@@ -14,7 +14,12 @@ from rpim_opt.problem.linear import RANK_TOLERANCE
 
 FAR_APART = 1e-8
 """Ratio of pivots below which a matrix may not have full rank."""
-_gels: Any = get_lapack_funcs("gels", dtype=float)
+SQUARED = 1e-6
+"""The same where the matrix is squared first, which costs half of the digits: some of the solution's are left."""
+_gels: Any
+_potrf: Any
+_potrs: Any
+_gels, _potrf, _potrs = get_lapack_funcs(("gels", "potrf", "potrs"), dtype=float)
 Bounds = tuple[Array, Array]
 """Lower and upper (n,)."""
 
@@ -28,6 +33,19 @@ def minimum(objective: Objective, weight: float, damping: Damping | None) -> Arr
         return z
     A, b = objective.stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
     return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
+
+
+def moved(objective: Objective, weight: float, damping: Damping | None, pull: Array) -> Array | None:
+    """Return by how far the minimum moves (n,) where A'b moves by ``pull`` (n,); None where that is not certain.
+
+    By normal equations, which say so where they are far from singular.
+    """
+    A, _ = objective.stacked(weight, damping)
+    factor, failed = _potrf(A.T @ A)
+    pivots = factor.diagonal()
+    if failed or pivots.min(initial=1.0) <= SQUARED * pivots.max(initial=0.0):
+        return None
+    return np.asarray(_potrs(factor, pull)[0], dtype=float)
 
 
 def _least_squares(A: Array, b: Array) -> Array:

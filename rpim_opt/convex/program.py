@@ -15,7 +15,7 @@ from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.by_rows import Met, by_rows
-from rpim_opt.convex.closed import minimum, minimum_between, path_between, shares, values
+from rpim_opt.convex.closed import minimum, minimum_between, moved, path_between, shares, values
 from rpim_opt.convex.conflict import advice, conflict
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.gap import duality_gap
@@ -255,6 +255,33 @@ class Program(Objective):
         if other.objective < estimate.objective - PROVEN * max(1.0, abs(estimate.objective)):
             return other
         return estimate
+
+    def moved(self, by: Array, weight: float, damping: Damping | None = None) -> Array | None:
+        """Return by how far the minimum (n,) of `solve` moves where b moves by (m,), much quicker than solving again.
+
+        None where no formula says it, or not exactly.
+
+        Parameters
+        ----------
+        by
+            (m,) what is added to b.
+        weight, damping
+            As `solve` has them.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> by = np.linspace(-1, 1, 120)
+        >>> there = program.on(program.model.with_values(program.model.b + by))
+        >>> bool(np.allclose(program.moved(by, 1.0), there.solve(1.0).z - program.solve(1.0).z, atol=1e-9))
+        True
+        """
+        if not self.closed_form or self.squared is not self.model:
+            return None
+        return moved(self, weight, damping, self.model.A.T @ by)
 
     @one_blas_thread
     def path(self, weights: Sequence[float] | Array, near: Array | None = None, rough: bool = False) -> list[Estimate]:

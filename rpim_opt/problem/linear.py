@@ -56,6 +56,9 @@ class LinearModel(Brief):
     0.0
     >>> model.scaled(np.repeat([1.0, 0.0], [15, 12])).rank  # without the last four configurations
     15
+    >>> which, count = model.members  # three coordinates of every configuration
+    >>> len(count), count[which[:4]].tolist()
+    (9, [3, 3, 3, 3])
     """
 
     A: Array
