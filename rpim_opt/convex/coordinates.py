@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.products import product
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.problem.linear import LinearModel
@@ -63,7 +64,7 @@ def coordinates(model: LinearModel, penalty: Quadratic | None, order: np.ndarray
     """Return the coordinates in which data and penalty are both diagonal; ``order`` (m,) sorts equations by groups."""
     form = ridge(model, penalty)
     B = np.hstack([form.B, form.free])
-    rows = model.A @ B
+    rows = product(model.A, B)
     left = model.b - model.A @ form.offset
     if (np.diff(order) != 1).any():  # most tables are sorted, and a copy costs as much as the product
         rows, left = rows[order], left[order]

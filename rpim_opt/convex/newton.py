@@ -12,8 +12,8 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
+from rpim_opt.convex.products import weighed_squares
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.convex.squares import weighed_squares
 from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Kinked, Whitened
 
 MOST, SOON = 100, 30
@@ -30,7 +30,7 @@ SOME = 61
 """Of every so many rows one tells the second derivative that most may have; a prime, which meets all of a reading."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
-SLOW = 0.1
+SLOW = 0.3
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12
 """Changes of slope below this part of what lengths allow tell nothing."""

@@ -13,8 +13,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.left_out import Rows, by_size, solved, taken
+from rpim_opt.convex.products import TOGETHER, weighed_squares
 from rpim_opt.convex.program import Estimate, Program
-from rpim_opt.convex.squares import TOGETHER, weighed_squares
 
 SMALL = 1e-5
 """Residuals below this part of the median are at a loss's kink, if it has one."""

@@ -74,8 +74,10 @@ class Trusted:
 
 def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> LinearModel:
     """Return some of a model's equations (m,), multiplied by the root of a factor."""
-    root = np.sqrt(factor)
-    return replace(model, A=root * model.A[keep], b=root * model.b[keep], group=model.group[keep])
+    A, b = np.compress(keep, model.A.T, axis=1).T, model.b[keep]  # the columns stand together, as LAPACK asks
+    if factor != 1:
+        A, b = np.sqrt(factor) * A, np.sqrt(factor) * b
+    return replace(model, A=A, b=b, group=model.group[keep])
 
 
 def trusted(

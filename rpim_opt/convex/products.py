@@ -1,4 +1,4 @@
-"""Sums of squares over many rows, in blocks that a processor's cache holds and on all cores."""
+"""Products of many rows, in blocks that a processor's cache holds and on all cores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def weighed_squares(rows: Array, weight: Array) -> Array:
     """Return rows' diag(weight) rows, (p, p), of rows (m, p) and weights (m,) of any sign.
 
     >>> import numpy as np
-    >>> from rpim_opt.convex.squares import weighed_squares
+    >>> from rpim_opt.convex.products import weighed_squares
     >>> weighed_squares(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([1.0, -1.0]))
     array([[ -8., -10.],
            [-10., -12.]])
@@ -33,3 +33,21 @@ def weighed_squares(rows: Array, weight: Array) -> Array:
     if most == 0:
         return -total
     return total
+
+
+def product(rows: Array, B: Array) -> Array:
+    """Return rows B (m, q) of rows (m, p) and B (p, q).
+
+    >>> import numpy as np
+    >>> from rpim_opt.convex.products import product
+    >>> product(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[1.0], [-1.0]])).tolist()
+    [[-1.0], [-1.0]]
+    """
+    found = np.empty((len(rows), B.shape[1]))
+
+    def multiplied(start: int) -> None:
+        part = slice(start, start + TOGETHER)
+        np.matmul(rows[part], B, out=found[part])
+
+    on_all_cores(multiplied, range(0, len(rows), TOGETHER))
+    return found
