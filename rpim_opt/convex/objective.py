@@ -22,7 +22,7 @@ from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.separated import Separated
 from rpim_opt.convex.split import Split
 from rpim_opt.convex.structure import Quadratic
-from rpim_opt.convex.trust import Trusted, outlying
+from rpim_opt.convex.trust import Trusted, kept_equations, outlying
 from rpim_opt.problem.linear import LinearModel
 
 
@@ -420,11 +420,15 @@ class Objective(Brief):
         """
         if self.loss_form is not None:
             return None
+        return self._trusting(z)[0]
+
+    def _trusting(self, z: Array) -> tuple[Trusted, np.ndarray]:
+        """Return what the loss trusts at z (n,), and which equations (m,) those are."""
         which, count = self.model.members
-        norms = self.norms(z)
+        r = self.model.A @ z - self.model.b
+        norms = configuration_norms(r, which)
         keep = (norms <= outlying(norms, count))[which]
-        residual = self.model.A @ z - self.model.b
-        return self._posed.trusted(norms, count, residual[keep])
+        return self._posed.trusted(norms, count, r[keep]), keep
 
     def trusted(self, z: Array) -> LinearModel:
         """Return the squared-loss model that a robust fit amounts to: what it trusts at z (n,), weighed as it does.
@@ -440,7 +444,7 @@ class Objective(Brief):
         >>> program.model.equations, program.trusted(z).equations, round(program.trust(z).factor, 3)
         (150, 132, 1.0)
         """
-        trust = self.trust(z)
-        if trust is None:
+        if self.loss_form is not None:
             return self.squared
-        return trust(self.model, z)[0]
+        trust, keep = self._trusting(z)
+        return kept_equations(self.model, keep, trust.factor)

@@ -8,10 +8,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, robot_alone
 from rpim_opt.convex.select_linear import Rule, Squared, influence, linear_rule
 from rpim_opt.convex.selection import Score, Selection, weight_grid, with_rows
+
+TOGETHER = 250_000
+"""Frequencies of residuals that are in memory together, of many weights."""
 
 
 def reml(program: Program) -> Selection:
@@ -212,14 +216,22 @@ def ncp(program: Program) -> Selection:
 
     def of(squared: Squared) -> Score:
         Q, s2, target = influence(squared)
+        projected = Q.T @ target
+        # transforms are linear: those of the columns say those of every residual
+        spectra = np.fft.rfft(np.vstack([Q.T, target]), axis=1)[:, 1:]
+        count = spectra.shape[1]
+        columns = np.hstack([spectra.real, spectra.imag])
+        line = np.arange(1, count + 1) / count
+
+        def farthest(weights: Array) -> Array:
+            left = columns[-1] - (s2 / (s2 + weights[:, None]) * projected) @ columns[:-1]
+            power = left[:, :count] ** 2 + left[:, count:] ** 2
+            cumulative = np.cumsum(power, axis=1)
+            return np.max(np.abs(cumulative / cumulative[:, -1:] - line), axis=1)
 
         def score(weights: Array) -> Array:
-            fit = (s2 / (s2 + weights[:, None])) * (Q.T @ target)
-            residual = target - fit @ Q.T
-            power = np.abs(np.fft.rfft(residual, axis=1)[:, 1:]) ** 2
-            cumulative = np.cumsum(power, axis=1) / np.sum(power, axis=1, keepdims=True)
-            line = np.arange(1, power.shape[1] + 1) / power.shape[1]
-            return np.max(np.abs(cumulative - line), axis=1)
+            few = max(1, TOGETHER // count)
+            return np.concatenate(on_all_cores(farthest, [weights[k : k + few] for k in range(0, len(weights), few)]))
 
         return score
 
