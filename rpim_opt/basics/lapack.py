@@ -5,9 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
-
-from scipy.linalg import cython_lapack
+from importlib import import_module
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.room import room
@@ -45,7 +43,7 @@ def qr_in_place(columns: Array, together: int) -> None:
 @lru_cache
 def _function(name: str, arguments: int) -> Callable[..., None]:
     """Return a function of the LAPACK that SciPy brings, which is called without Python's lock."""
-    capsule: Any = cython_lapack.__pyx_capi__[name]
+    capsule = vars(import_module("scipy.linalg.cython_lapack"))["__pyx_capi__"][name]
     named = ctypes.pythonapi.PyCapsule_GetName
     named.restype, named.argtypes = ctypes.c_char_p, [ctypes.py_object]
     address = ctypes.pythonapi.PyCapsule_GetPointer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
@@ -29,7 +31,7 @@ def weighed_squares(rows: Array, weight: Array) -> Array:
         some = np.sqrt(np.abs(by)) * some  # a product with itself costs half
         return some.T @ some
 
-    total = sum(on_all_cores(squares, range(0, max(len(rows), 1), TOGETHER)))
+    total = reduce(np.add, on_all_cores(squares, range(0, max(len(rows), 1), TOGETHER)))
     if most == 0:
         return -total
     return total

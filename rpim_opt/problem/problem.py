@@ -609,7 +609,8 @@ class CalibrationProblem(Tabled):
         """L^-1 of the covariances L L' of whole configurations."""
         scatter = self.scatter or Scatter()
         stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        return [(stack, np.linalg.inv(_cholesky(stack.covariance(scatter)))) for stack in stacks]
+        factors = [_cholesky(stack.covariance(scatter)) for stack in stacks]
+        return [(stack, np.asarray(np.linalg.inv(L), dtype=float)) for stack, L in zip(stacks, factors, strict=True)]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.
