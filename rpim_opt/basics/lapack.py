@@ -1,4 +1,4 @@
-"""LAPACK's functions without Python's lock: SciPy holds it during some of them, and other threads would wait."""
+"""LAPACK's QR without Python's lock: SciPy holds it meanwhile, and other threads would wait."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ def qr_in_place(columns: Array, together: int) -> None:
     size = [ctypes.byref(ctypes.c_int(number)) for number in (m, n, together, max(m, 1), together)]
     array = [each.ctypes.data for each in (columns, factors, work)]
     wrong = ctypes.byref(ctypes.c_int())  # only an argument could be
-    _function("dgeqrt", 9)(*size[:3], array[0], size[3], array[1], size[4], array[2], wrong)
+    _geqrt()(*size[:3], array[0], size[3], array[1], size[4], array[2], wrong)
 
 
 @lru_cache
-def _function(name: str, arguments: int) -> Callable[..., None]:
-    """Return a function of the LAPACK that SciPy brings, which is called without Python's lock."""
-    capsule = vars(import_module("scipy.linalg.cython_lapack"))["__pyx_capi__"][name]
+def _geqrt() -> Callable[..., None]:
+    """Return the function of the LAPACK that SciPy brings, which is called without Python's lock."""
+    capsule = vars(import_module("scipy.linalg.cython_lapack"))["__pyx_capi__"]["dgeqrt"]
     named = ctypes.pythonapi.PyCapsule_GetName
     named.restype, named.argtypes = ctypes.c_char_p, [ctypes.py_object]
     address = ctypes.pythonapi.PyCapsule_GetPointer
     address.restype, address.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)
+    prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 9)
     return prototype(address(capsule, named(capsule)))

@@ -124,11 +124,6 @@ def _require_convex(where: str, expression: Any) -> None:
         raise InputError(where, found, accepted)
 
 
-def configuration_norms(r: Array, which: np.ndarray) -> Array:
-    """Return the norm of every configuration's part of a residual (m,), ``which`` (m,) the place of each equation's."""
-    return np.sqrt(np.bincount(which, r**2))
-
-
 def norms(r: Any, group: np.ndarray) -> Any:
     """Return the norms of a residual (m,) by group in CVXPY, in the order of the groups' numbers."""
     _, which, count = np.unique(group, return_inverse=True, return_counts=True)

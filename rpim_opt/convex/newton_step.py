@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
@@ -126,8 +125,8 @@ class NewtonStep:
         kept = values > DROPPED * np.max(values, initial=0.0)
         root[kept] = 1 / np.sqrt(values[kept])
         norms = np.zeros(len(loss.extra))
-        for some, left in zip(self.parts, self._left(A, vectors * root, r, loss), strict=True):
-            norms[some.configurations] = left
+        for some in self.parts:
+            norms[some.configurations] = self._left(some, A, vectors * root, r, loss)
         return norms
 
     def _bent(self, A: Array, loss: Curved) -> Array:
@@ -140,15 +139,14 @@ class NewtonStep:
             bent += weighed_squares(along, loss.extra[some.configurations])
         return bent
 
-    def _left(self, A: Array, B: Array, r: Array, loss: Curved) -> Iterator[Array]:
-        """Yield the norms (G,) of left-out residuals of the parts, whose second derivative's inverse is B B'."""
-        for some in self.parts:
-            first = range(0, len(some.configurations), TOGETHER)
-            blocks = [Rows(*(each[k : k + TOGETHER] for each in some)) for k in first]
-            yield np.concatenate(on_all_cores(lambda block: self._left_of(block, A, B, r, loss), blocks))
+    def _left(self, some: Rows, A: Array, B: Array, r: Array, loss: Curved) -> Array:
+        """Return the norms (G,) of left-out residuals of some configurations; B B' is the inverse of the Hessian."""
+        first = range(0, len(some.configurations), TOGETHER)
+        blocks = [Rows(*(each[k : k + TOGETHER] for each in some)) for k in first]
+        return np.concatenate(on_all_cores(lambda block: self._left_of(block, A, B, r, loss), blocks))
 
     def _left_of(self, some: Rows, A: Array, B: Array, r: Array, loss: Curved) -> Array:
-        """Return the norms (G,) of left-out residuals of some configurations."""
+        """Return the same of so many that a processor's cache holds them."""
         places = some.places
         k = places.shape[1]
         u, across = loss.u[places.T], loss.rows[places.T]
@@ -195,7 +193,7 @@ class NewtonStep:
         """Return what the loss gets: residuals, or the configurations' norms."""
         if self.program.formulation.loss_over == "equation":
             return r
-        return np.sqrt(np.bincount(self.which, r**2))
+        return self.program.model.norms(r)
 
     def _slopes(self, v: Array) -> Array | None:
         loss = self.program.separated

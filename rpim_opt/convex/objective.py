@@ -12,7 +12,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief
 from rpim_opt.convex import feasible
-from rpim_opt.convex.asked import configuration_norms
 from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.faces import Faces
 from rpim_opt.convex.formulation import Formulation
@@ -340,7 +339,7 @@ class Objective(Brief):
 
     def norms(self, z: Array) -> Array:
         """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
-        return configuration_norms(self.model.A @ z - self.model.b, self.model.members[0])
+        return self.model.norms(self.model.A @ z - self.model.b)
 
     def violation(self, z: Array) -> float:
         """Return by how much z (n,) misses the constraints, in units of the scales; of ``largest`` relative to it.
@@ -426,7 +425,7 @@ class Objective(Brief):
         """Return what the loss trusts at z (n,), and which equations (m,) those are."""
         which, count = self.model.members
         r = self.model.A @ z - self.model.b
-        norms = configuration_norms(r, which)
+        norms = self.model.norms(r)
         keep = (norms <= outlying(norms, count))[which]
         return self._posed.trusted(norms, count, r[keep]), keep
 

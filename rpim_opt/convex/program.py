@@ -15,7 +15,7 @@ from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.by_rows import Met, by_rows
-from rpim_opt.convex.closed import minimum, minimum_between, moved, path_between, shares, values
+from rpim_opt.convex.closed import Bounds, minimum, minimum_between, moved, path_between, shares, values
 from rpim_opt.convex.conflict import advice, conflict
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.gap import duality_gap
@@ -307,18 +307,21 @@ class Program(Objective):
         [10.07, 3.56, 0.33]
         """
         checked = np.array([self._weight(weight) for weight in weights])
-        box = self.box
         if self.closed_form:
             Z = self.ridge.minima(checked)
             rows = zip(Z, checked, *values(self, Z), strict=True)
             return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
         if self.faces is not None:
             return self._path_on_faces(checked, near)
-        if not self.quadratic or box is None:
-            found = {weight: self._one(weight, rough) for weight in sorted(set(checked.tolist()), reverse=True)}
-            return [found[weight] for weight in checked.tolist()]
-        Z, multipliers = path_between(self, box, checked)
-        rows = zip(Z, checked, *values(self, Z), multipliers, strict=True)
+        if self.quadratic and self.box is not None:
+            return self._path_in_box(self.box, checked)
+        found = {weight: self._one(weight, rough) for weight in sorted(set(checked.tolist()), reverse=True)}
+        return [found[weight] for weight in checked.tolist()]
+
+    def _path_in_box(self, box: Bounds, weights: Array) -> list[Estimate]:
+        """Return the solutions of a quadratic program in a box at many weights."""
+        Z, multipliers = path_between(self, box, weights)
+        rows = zip(Z, weights, *values(self, Z), multipliers, strict=True)
         return [
             Estimate(z, float(w), float(loss), float(penalty), shares(self, box, z, held))
             for z, w, loss, penalty, held in rows

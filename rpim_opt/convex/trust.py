@@ -64,7 +64,7 @@ class Trusted:
     def keeps(self, model: LinearModel, z: Array) -> np.ndarray:
         """Return which equations (m,) are trusted at z (n,)."""
         which, count = model.members
-        norms = np.sqrt(np.bincount(which, (model.A @ z - model.b) ** 2))
+        norms = model.norms(model.A @ z - model.b)
         return (norms <= limits(self.noise, self.configurations, count))[which]
 
     def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:

@@ -59,6 +59,8 @@ class LinearModel(Brief):
     >>> which, count = model.members  # three coordinates of every configuration
     >>> len(count), count[which[:4]].tolist()
     (9, [3, 3, 3, 3])
+    >>> model.norms(np.ones(27)).round(2)[:3]
+    array([1.73, 1.73, 1.73])
     """
 
     A: Array
@@ -97,6 +99,10 @@ class LinearModel(Brief):
         """(m,) the place of every equation's configuration in the order of their numbers; (N,) how many each has."""
         _, which, count = np.unique(self.group, return_inverse=True, return_counts=True)
         return which, count
+
+    def norms(self, r: Array) -> Array:
+        """Return the norm (N,) of every configuration's part of a residual (m,), in the order of their numbers."""
+        return np.sqrt(np.bincount(self.members[0], r**2))
 
     @property
     def rank(self) -> int:

@@ -609,8 +609,7 @@ class CalibrationProblem(Tabled):
         """L^-1 of the covariances L L' of whole configurations."""
         scatter = self.scatter or Scatter()
         stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        factors = [_cholesky(stack.covariance(scatter)) for stack in stacks]
-        return [(stack, np.asarray(np.linalg.inv(L), dtype=float)) for stack, L in zip(stacks, factors, strict=True)]
+        return [(stack, _whitening(stack.covariance(scatter))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.
@@ -776,8 +775,7 @@ class CalibrationProblem(Tabled):
         """L^-1 with a row's covariance = L L', for every block."""
         if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
             raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
-        factors = [_cholesky(covariance) for covariance in self.covariances()]
-        return [np.asarray(np.linalg.inv(L), dtype=float) for L in factors]
+        return [_whitening(covariance) for covariance in self.covariances()]
 
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].
@@ -913,9 +911,10 @@ def error_dimensions(block: Block) -> list[str]:
     return dimensions
 
 
-def _cholesky(covariance: Array) -> Array:
+def _whitening(covariance: Array) -> Array:
+    """Return L^-1 of covariances L L'."""
     try:
-        return np.asarray(np.linalg.cholesky(covariance), dtype=float)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=float)
     except np.linalg.LinAlgError:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 

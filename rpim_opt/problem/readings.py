@@ -217,25 +217,28 @@ def _all(robot: Robot, points: Points) -> list[Reading]:
 
 def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
-    chain: list[Reading] = []
-    current = points
-    best = stated
-    for _ in range(MISTAKES[points.seen]):
-        each, size = _best(robot, current, _all(robot, current))
-        if each is None or not size < FURTHER * best:
-            break
-        chain.append(each)
-        current = each.change(current)
-        best = size
-        if best < BETTER * stated and best < WRONG:
-            return _compared(robot, chain, points, stated, best)
-    if stated > WRONG and not points.seen:
+    chain, best = _chained(robot, points, stated)
+    if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
         pair = _pair(robot, points)
         if pair is not None and pair[1] < min(best, BETTER * stated):
             chain, best = pair
-    if not chain or not best < BETTER * stated:
+    if not best < BETTER * stated:
         return None
     return _compared(robot, chain, points, stated, best)
+
+
+def _chained(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:
+    """Return mistakes, each the best behind those before it, and what is left; no more once little is."""
+    chain: list[Reading] = []
+    best = stated
+    while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
+        each, size = _best(robot, points, _all(robot, points))
+        if each is None or not size < FURTHER * best:
+            break
+        chain.append(each)
+        points = each.change(points)
+        best = size
+    return chain, best
 
 
 def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex import newton_step
 from rpim_opt.convex.left_out import Folds, _folds, solved, solved_again, without_say
 from rpim_opt.convex.newton_step import NewtonStep
 from rpim_opt.convex.select_held_out import _left_out_error, held_out_error
@@ -89,6 +90,15 @@ def test_a_step_of_squares_is_exact_where_the_face_stays() -> None:
         slow = solved_again(program, np.array([weight]), ALONE)[0]
         assert sum(same) > 10
         assert quick[same] == pytest.approx(slow[same], rel=1e-6)
+
+
+def test_steps_are_those_of_all_together_where_they_are_taken_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = ro.convex.pose(ro.robust, MODEL)
+    estimate = program.solve(1.0)
+    together = NewtonStep(program).norms(estimate)
+    monkeypatch.setattr(newton_step, "TOGETHER", 4)
+    assert len(together) > 4
+    assert NewtonStep(program).norms(estimate) == pytest.approx(together, rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex import select_scores
 from rpim_opt.convex.select import SELECTORS, disagreement
 from rpim_opt.convex.select_curve import _points, menger
 from rpim_opt.convex.select_held_out import AHEAD, _end_of_fall, _held_out, held_out_error
@@ -80,6 +81,13 @@ SCORES: dict[str, Any] = {
     "ncp": periodogram,
     "leave_one_out": left_out,
 }
+
+
+def test_white_residuals_are_scored_alike_where_weights_are_taken_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = ro.convex.pose(ro.tikhonov, NOISY)
+    together = SELECTORS["ncp"](program).score
+    monkeypatch.setattr(select_scores, "TOGETHER", 7 * len(NOISY.b) // 2)
+    assert SELECTORS["ncp"](program).score == pytest.approx(together, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", SCORES)
