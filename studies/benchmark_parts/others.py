@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -20,31 +21,37 @@ from rpim_opt.problem.problem import CalibrationProblem
 
 COMMANDS = {
     "python alone": "pass",
-    "import scipy.optimize": "import scipy.optimize",
-    "import cvxpy": "import cvxpy",
     "rpim-opt --version": "--version",
     "rpim-opt --help": "--help",
+    "import cvxpy": "import cvxpy",
+    "import scipy.optimize": "import scipy.optimize",
     "rpim-opt calibrate paper_arm": "calibrate paper_arm",
 }
-"""Processes, the first three of them floors."""
+"""Processes; those that are compared follow each other."""
 
 
-def processes(runs: int) -> dict[str, float]:
-    """Return the seconds of whole processes, the least of some runs."""
+def processes(runs: int) -> dict[str, list[float]]:
+    """Return the seconds of whole processes, each as often, in turn: a machine's speed changes within seconds.
+
+    As from an installation by pip, which compiles what it installs: modules are compiled before, to a folder of their
+    own, since a checkout where Python writes no bytecode would compile all of them at every start.
+    """
     script = "import sys; from rpim_opt.cli import main; sys.argv[0] = 'rpim-opt'; main()"
-    found = {}
-    for name, what in COMMANDS.items():
-        command = [sys.executable, "-P", "-c", what]
-        if name.startswith("rpim-opt"):
-            command = [sys.executable, "-P", "-c", script, *what.split()]
-        found[name] = min(
-            _seconds(lambda c=command: subprocess.run(c, capture_output=True, check=True)) for _ in range(runs)
-        )
-    return found
+    found: dict[str, list[float]] = {name: [] for name in COMMANDS}
+    with tempfile.TemporaryDirectory() as folder:
+        kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+        kept["PYTHONPYCACHEPREFIX"] = folder
+        for _ in range(runs + 1):
+            for name, what in COMMANDS.items():
+                command = [sys.executable, "-P", "-c", what]
+                if name.startswith("rpim-opt"):
+                    command = [sys.executable, "-P", "-c", script, *what.split()]
+                found[name].append(_seconds(lambda c=command: _run(c, kept)))
+    return {name: seconds[1:] for name, seconds in found.items()}
 
 
-def _run(command: list[str]) -> None:
-    subprocess.run(command, capture_output=True, check=True)
+def _run(command: list[str], variables: dict[str, str]) -> None:
+    subprocess.run(command, capture_output=True, check=True, env=variables)
 
 
 def bootstrap(problem: CalibrationProblem, count: int) -> dict[str, float]:
