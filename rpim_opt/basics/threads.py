@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
@@ -43,8 +43,29 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     workers = min(cores(), len(waiting))
     if workers < 2 or getattr(_worker, "busy", False):
         return [function(item) for item in waiting]
-    with beside(workers) as counted, ThreadPoolExecutor(workers, initializer=_begin) as threads:
-        return list(threads.map(counted(function), waiting))
+    turns = iter(range(len(waiting)))  # each taken by one thread
+    answers: dict[int, Answer] = {}
+
+    def work() -> None:
+        for k in turns:
+            answers[k] = function(waiting[k])
+
+    with beside(workers) as counted:
+        done = [_threads(workers, os.getpid()).submit(counted(work)) for _ in range(workers)]
+        try:
+            for each in done:
+                each.result()
+        finally:  # after an error or Ctrl-C, too, nothing goes on
+            for _ in turns:
+                pass
+            wait(done)
+    return [answers[k] for k in range(len(waiting))]
+
+
+@lru_cache(maxsize=1)
+def _threads(workers: int, process: int) -> ThreadPoolExecutor:
+    """Return threads that stay: to start them takes as long as a block. A process has its own, a fork none of them."""
+    return ThreadPoolExecutor(workers, initializer=_begin)
 
 
 def _begin() -> None:

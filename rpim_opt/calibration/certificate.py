@@ -64,7 +64,7 @@ def certified(
     floor
         Below what an objective is as good as zero.
     """
-    program = pose(formulation, model).beginning(z)  # where bounds are looked for first proves nothing
+    program = pose(formulation, model).beginning(z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
     gradient = _gradient(program, slope, z, weight)

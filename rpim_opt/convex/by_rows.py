@@ -29,13 +29,13 @@ class Near(NamedTuple):
     """A minimum of a program like the one that is asked for.
 
     z (n,), what a neighbour may begin with, the loss's slope (m,), equations in the order of their configurations, and
-    the loss.
+    the loss; of a point that is only thought to be near, z.
     """
 
     z: Array
-    kinked: Kinked
-    slope: Array
-    loss: float
+    kinked: Kinked = Kinked([], 1.0)
+    slope: Array = np.empty(0)
+    loss: float = np.nan
 
 
 class Met:
@@ -50,7 +50,7 @@ class Met:
     def __init__(self, whole: Met | None = None) -> None:
         self._at: dict[float, Near] = {}
         self._own: dict[float, Near] = {}  # those that are not of some of the data
-        self.in_box: Array | None = None  # (n,), of a quadratic program
+        self.begin: Array | None = None  # (n,) where a box, or the first minimum, is looked for
         self._whole = whole
 
     def nearest(self, weight: float) -> Near | None:
@@ -72,7 +72,7 @@ class Met:
             return found
         nearest = self.nearest(weight)
         if nearest is None:
-            return []
+            return [] if self.begin is None else [Near(self.begin)]
         last = self._at[next(reversed(self._at))]
         if last is nearest:
             return [nearest]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,11 @@ class Coordinates:
     def inverse(self) -> Array:
         """(p, n) of the coordinates by z - offset."""
         return np.asarray(np.linalg.pinv(self.B), dtype=float)
+
+    @cached_property
+    def last(self) -> dict[str, Any]:
+        """What the last search for a minimum in these coordinates leaves to the next."""
+        return {}
 
     @cached_property
     def lengths(self) -> Array:

@@ -26,10 +26,10 @@ SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
 DEAR = 200_000
 """Entries of the rows from which a second derivative is dear."""
-SOME = 61
-"""Of every so many rows one tells the second derivative that most may have; a prime, which meets all of a reading."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
+TELLING = 300
+"""Rows a coordinate that tell a second derivative to about a tenth, 2 / sqrt(300), as the first one of a descent."""
 SLOW = 0.3
 """Part of the gap that a step with an old second derivative may leave."""
 ROUND = 1e-12
@@ -41,13 +41,17 @@ _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
 
 
 class Point(NamedTuple):
-    """Where the method is: z (n,), coordinates a (p,), residual (m,), the kinks' state, and the smoothed loss there."""
+    """Where the method is: z (n,), coordinates a (p,), residual (m,), the kinks' state, and the smoothed loss there.
+
+    With the loss's slope by the coordinates (p,), where a descent has been.
+    """
 
     z: Array
     a: Array
     r: Array
     kinked: Kinked
     smooth: Smoothed
+    along: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +91,13 @@ class Newton(Whitened):
         they are: none of them may be zero at the minimum.
         """
         if self._dear:
-            return self._by_secants(self._placed(z, kinked))
+            return self._by_secants(self._begin(z, kinked))
         if self._away is None:
             return self._with_kinks(z, kinked)
         begun = Kinked([], 1.0)
         if kinked is not None:
             begun = begun._replace(curved=kinked.curved)
-        ended = self._away._by_secants(self._away._placed(z, begun), hasty=True)
+        ended = self._away._by_secants(self._away._begin(z, begun), hasty=True)
         if ended.good or ended.close:
             return ended
         return self._with_kinks(ended.z, kinked)
@@ -145,34 +149,37 @@ class Newton(Whitened):
         """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
 
         Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
-        it is computed anew.
+        it is computed anew, first from some of the rows, then from all.
         """
         bent = self._known(point)
-        slope = self._slope(point)
+        every = self._stride
+        point, slope = self._with_slope(point)
         ended = self._judged(point, slope, 0)
         best = Best(ended)
         for steps in range(1, MOST):
             if best.will_do(ENOUGH, hasty):
                 break
-            fresh = bent is None
+            exact = False
             if bent is None:
-                bent = self._hessian(point)
+                bent = self._hessian(point, every)
+                exact = every == 1
+                every = 1
             if self._close(slope, bent, ended):
-                return self._with(ended._replace(close=True), bent)
+                return self._with(ended._replace(close=True), bent, point)
             ahead = self._stepped(point, slope, bent)
-            if fresh and ahead is point:
+            if exact and ahead is point:
                 break
-            slope_ahead = self._slope(ahead)
+            ahead, slope_ahead = self._with_slope(ahead)
             gap = ended.gap
             ended = self._judged(ahead, slope_ahead, steps)
             best.meets(ended)
-            if fresh or ended.gap <= SLOW * gap:
+            if exact or ended.gap <= SLOW * gap:
                 bent = self._updated(bent, point, ahead, slope_ahead - slope)
             else:
                 bent = None
             point = ahead
             slope = slope_ahead
-        return self._with(best.ended, bent)
+        return self._with(best.ended, bent, point)
 
     def _known(self, point: Point) -> Array | None:
         """Return a neighbour's second derivative of the loss (p, p), by the coordinates."""
@@ -180,8 +187,17 @@ class Newton(Whitened):
             return None
         return self.at.B.T @ point.kinked.curved @ self.at.B
 
-    def _with(self, ended: Ended, bent: Array | None) -> Ended:
+    def _begin(self, z: Array, kinked: Kinked | None) -> Point:
+        """Return the point at z (n,): the last one where the last descent, of another weight, ended there."""
+        loss, last = self.at.last.get("point", (None, None))
+        if last is None or last.z is not z or loss is not self.loss or kinked is None:
+            return self._placed(z, kinked)
+        return last._replace(kinked=kinked)
+
+    def _with(self, ended: Ended, bent: Array | None, point: Point) -> Ended:
         """Return where the method ended, with the loss's second derivative (p, p) for the next one."""
+        if point.z is ended.z:
+            self.at.last["point"] = (self.loss, point)
         if bent is None:
             return ended
         curved = self.at.inverse.T @ bent @ self.at.inverse
@@ -252,6 +268,13 @@ class Newton(Whitened):
         """Return the slope of the smoothed objective by the coordinates in their units, (p,)."""
         return self.slope(point.a, point.smooth.slope)
 
+    def _with_slope(self, point: Point) -> tuple[Point, Array]:
+        """Return the point, which then knows its loss's slope, and what `_slope` says there."""
+        along = point.along
+        if along is None:
+            along = self.at.rows.T.dot(point.smooth.slope)
+        return point._replace(along=along), self.unit * (along + 2 * self.pull * point.a)
+
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
         gap, by_z = self.bound(point.z, point.a, slope)
         smooth = point.smooth
@@ -300,33 +323,37 @@ class Newton(Whitened):
         """Units (p, p) of second derivatives by the coordinates, and what penalties add to them (p,)."""
         return np.multiply.outer(self.unit, self.unit), 2 * self.pull * self.unit**2 + FLAT
 
-    def _hessian(self, point: Point) -> Array:
-        """Return the second derivative (p, p) of the smoothed loss by the coordinates."""
+    @property
+    def _stride(self) -> int:
+        """Of every so many groups one is enough to tell the second derivative roughly."""
+        count, p = self.at.rows.shape
+        return max(1, count // (TELLING * p))
+
+    def _hessian(self, point: Point, every: int = 1) -> Array:
+        """Return the second derivative (p, p) of the smoothed loss by the coordinates, from one of so many groups."""
         curvatures = self.loss.curvature(point.r, point.smooth, point.kinked.sharpness)
         across = curvatures[0].across
         for more in curvatures[1:]:
             across = across + more.across
-        H = self._across(across)
+        H = self._across(across, every)
         for curvature in curvatures:
             if len(curvature.along):
-                H += self._along(curvature)
+                H += self._along(curvature, every)
         return H
 
-    def _across(self, across: Array) -> Array:
+    def _across(self, across: Array, every: int) -> Array:
         """Return what curvatures of the equations add."""
         rows = self.at.rows
-        if rows.size >= DEAR:  # most of them may have the same
-            usual = float(np.median(across[::SOME]))
-            other = np.flatnonzero(across != usual)
-            if 2 * len(other) <= len(rows):
-                return usual * self.at.gram + weighed_squares(rows[other], across[other] - usual)
-        return weighed_squares(rows, across)
+        if every == 1:
+            return weighed_squares(rows, across, self.at.gram if rows.size >= DEAR else None)
+        some = self.loss.picked(every)
+        return every * weighed_squares(rows[some], across[some], self.at.gram / every)
 
-    def _along(self, curvature: Curvature) -> Array:
+    def _along(self, curvature: Curvature, every: int) -> Array:
         """Return what the curvatures along the groups' directions add."""
         _, along, u = curvature
-        bent = along.nonzero()[0]
-        return weighed_squares(self.loss.projected(self.at.rows, u, bent), along[bent])
+        bent = every * along[::every].nonzero()[0]
+        return every * weighed_squares(self.loss.projected(self.at.rows, u, bent), along[bent])
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""

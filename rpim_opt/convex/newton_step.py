@@ -12,6 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.left_out import Rows, by_size, solved, taken
+from rpim_opt.convex.newton import DEAR
 from rpim_opt.convex.products import TOGETHER, weighed_squares
 from rpim_opt.convex.program import Estimate, Program
 
@@ -131,7 +132,11 @@ class NewtonStep:
 
     def _bent(self, A: Array, loss: Curved) -> Array:
         """Return the second derivative (p, p) of the loss along columns (m, p)."""
-        bent = weighed_squares(A, np.maximum(loss.rows, 0.0))
+        gram = None
+        if A is self.program.model.A and A.size >= DEAR:
+            triangle = self.program.model.triangle[:, :-1]
+            gram = triangle.T @ triangle
+        bent = weighed_squares(A, np.maximum(loss.rows, 0.0), gram)
         if not loss.extra.any():
             return bent
         for some in self.parts:

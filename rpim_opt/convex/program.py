@@ -194,8 +194,8 @@ class Program(Objective):
         elif self.closed_form:
             estimate = self._at(minimum(self, weight, damping), weight)
         elif self.quadratic and box is not None:
-            z, multipliers = minimum_between(self, box, weight, damping, near=self._met.in_box)
-            self._met.in_box = z
+            z, multipliers = minimum_between(self, box, weight, damping, near=self._met.begin)
+            self._met.begin = z
             estimate = self._at(z, weight, shares(self, box, z, multipliers))
         elif weight > 0 and self.faces is not None:
             estimate = self._on_faces(weight, damping)
@@ -204,7 +204,7 @@ class Program(Objective):
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum in a box is looked for from z (n,) on.
+        """Return the same program, whose next minimum in a box, or first one of rows, is looked for from z (n,) on.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -214,7 +214,7 @@ class Program(Objective):
         >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
         True
         """
-        self._met.in_box = z
+        self._met.begin = z
         return self
 
     def proven(self, weight: float) -> Estimate:

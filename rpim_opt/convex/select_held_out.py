@@ -75,7 +75,7 @@ def _of_squares(squared: Squared) -> Score:
 def _by_steps(program: Program) -> Predicted:
     """Return what predicts every configuration by one Newton step."""
     step = NewtonStep(program)
-    return lambda weights: np.array([step.norms(estimate) for estimate in program.path(weights)])
+    return lambda weights: np.array([step.norms(estimate) for estimate in program.path(weights, rough=True)])
 
 
 def _how_exact(program: Program, weight: float) -> str:

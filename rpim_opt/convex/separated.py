@@ -137,6 +137,12 @@ class Separated:
         rises = np.all(np.asarray(self.at_zero) >= 0)
         return bool(rises and all(np.all(of.c == 0) for _, of in self.rows.kinks))
 
+    def picked(self, every: int) -> np.ndarray:
+        """Return the places (k,) of the equations of one of every so many groups."""
+        if every == 1 or self.starts is None:
+            return np.arange(0, self.count, every)
+        return np.flatnonzero(self.which % every == 0)
+
     def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
         """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
         count, each = len(self._sizes), self._alike

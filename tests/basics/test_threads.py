@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 
 import pytest
+import scipy.linalg  # noqa: F401 - its BLAS, and NumPy's, are counted
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from rpim_opt.basics import threads
@@ -58,6 +61,45 @@ def test_an_error_in_a_thread_is_the_callers(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(threads, "cores", lambda: 2)
     with pytest.raises(ZeroDivisionError):
         threads.on_all_cores(lambda k: 1 // k, range(3))
+
+
+def test_after_an_error_nothing_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "cores", lambda: 2)
+    met: list[int] = []
+
+    def work(k: int) -> None:
+        if k == 0:
+            raise ZeroDivisionError
+        time.sleep(0.01)
+        met.append(k)
+
+    with pytest.raises(ZeroDivisionError):
+        threads.on_all_cores(work, range(50))
+    there = len(met)
+    assert there < 25
+    time.sleep(0.05)
+    assert len(met) == there
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The parent's are not there."""
+    monkeypatch.setattr(threads, "cores", lambda: 2)
+    assert threads.on_all_cores(lambda k: 2 * k, range(4)) == [0, 2, 4, 6]
+    child = os.fork()
+    if not child:
+        os._exit(threads.on_all_cores(lambda k: 2 * k, range(4)) != [0, 2, 4, 6])
+    for _ in range(1000):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            break
+        time.sleep(0.01)
+    else:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        pytest.fail("the child waits for threads that it does not have")
+    assert os.waitstatus_to_exitcode(status) == 0
 
 
 def test_phases_of_threads_count_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -354,6 +354,15 @@ class Counted:
         return called
 
 
+@pytest.mark.parametrize(("name", "over"), [*SMOOTH, ("norms", "configuration"), ("quantile", "equation")])
+def test_a_first_minimum_is_looked_for_where_it_is_said_to_be(name: str, over: str) -> None:
+    there = ro.convex.pose(stated(name, over), MODEL).solve(0.5)
+    near, far = (ro.convex.pose(stated(name, over), MODEL).beginning(z).solve(0.5) for z in (there.z, there.z + 100.0))
+    for found in (near, far):
+        assert found.objective == pytest.approx(there.objective, rel=1e-9)
+    assert near.iterations < far.iterations
+
+
 def test_a_program_without_some_configurations_is_that_of_the_others() -> None:
     """Whatever unknowns it is solved in."""
     out = MODEL.group % 4 == 1

@@ -65,6 +65,23 @@ def test_slope_and_second_derivative_are_those_of_the_smoothed_objective(name: s
 
 
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_of_groups_that_say_the_same_some_tell_the_second_derivative(name: str, over: str) -> None:
+    """Every configuration, or equation, three times: one of three is all that there is to know."""
+    each = 3 if over == "configuration" else 1
+    A, b = (
+        np.repeat(M.reshape(-1, each, *M.shape[1:]), 3, axis=0).reshape(-1, *M.shape[1:]) for M in (MODEL.A, MODEL.b)
+    )
+    thrice = replace(MODEL, A=A, b=b, group=np.arange(len(b)) // each)
+    program = ro.convex.pose(stated(name, over), thrice)
+    assert program.separated is not None
+    method = Newton(program.separated, program.coordinates, 0.7)
+    point = method._placed(Z, None)
+    whole = method._hessian(point)
+    assert method._hessian(point, 3) == pytest.approx(whole, rel=1e-10, abs=1e-10 * np.max(np.abs(whole)))
+    assert method._hessian(point, 2) != pytest.approx(whole, rel=1e-3)
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
 @pytest.mark.parametrize("weight", [0.0, 0.7, 40.0])
 def test_an_update_explains_how_the_slope_has_changed(name: str, over: str, weight: float) -> None:
     method, _ = made(name, over, weight)
@@ -86,6 +103,23 @@ def test_an_update_explains_how_the_slope_has_changed(name: str, over: str, weig
         assert updated @ other == pytest.approx(bent @ other, rel=1e-9, abs=1e-9)
     assert method._updated(bent, before, before, 0 * change) is bent
     assert method._updated(bent, before, after, -change - 1e3 * method.unit * step) is bent
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_another_weight_begins_where_the_last_ended(name: str, over: str) -> None:
+    """Of the same rows, nothing is computed again; and what is said there is what is true there."""
+    first, _ = made(name, over)
+    ended = first._by_secants(first._placed(Z, None))
+    begun = replace(first, weight=0.2)._begin(ended.z, ended.kinked)
+    again = first._placed(ended.z, ended.kinked)
+    assert begun.along is not None
+    assert begun.r == pytest.approx(again.r, rel=1e-9, abs=1e-9)
+    of_loss = again.smooth.slope
+    assert begun.along == pytest.approx(first.at.rows.T @ of_loss, abs=1e-8 * np.abs(of_loss).sum())
+    assert begun.kinked.curved is ended.kinked.curved
+    for other in (replace(first, loss=replace(first.loss)), replace(first, at=replace(first.at))):
+        assert other._begin(ended.z, ended.kinked).along is None
+    assert first._begin(ended.z.copy(), ended.kinked).along is None
 
 
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
