@@ -6,6 +6,7 @@ C's library learns to keep such memory, but where it is told to give it back, as
 from __future__ import annotations
 
 import threading
+from math import prod
 
 import numpy as np
 
@@ -23,7 +24,7 @@ def room(purpose: str, *shape: int) -> Array:
     >>> room("example", 2, 3).shape
     (2, 3)
     """
-    size = int(np.prod(shape))
+    size = prod(shape)
     if size > LARGEST:
         return np.empty(shape)
     kept = vars(_own).setdefault("kept", {})

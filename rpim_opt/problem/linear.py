@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -143,7 +143,13 @@ def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
     stacked[above : above + len(b), -1] = b
     stacked[above + len(b) :] = 0.0
     qr_in_place(stacked, together)
-    return np.triu(stacked[:n])
+    return np.where(_upper(n), stacked[:n], 0.0)
+
+
+@lru_cache(maxsize=16)
+def _upper(n: int) -> np.ndarray:
+    """Return which places (n, n) a triangle has."""
+    return np.triu(np.ones((n, n), dtype=bool))
 
 
 def triangle_of(A: Array, b: Array) -> Array:

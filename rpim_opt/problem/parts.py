@@ -305,8 +305,10 @@ def _on_part(
 def _require_sessions(parameters: Parameters, number: int, data: Dataset) -> None:
     """Raise for a session that the parameters lack while they have others: its rows would be taken for unshifted."""
     known = {frame_of(name) for name in parameters.names if of_session(name)}
+    if not known:
+        return
     strange = [name for name in data.sessions if session_prefix(name) not in known]
-    if known and strange:
+    if strange:
         accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
         raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
 

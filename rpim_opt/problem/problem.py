@@ -870,7 +870,7 @@ class CalibrationProblem(Tabled):
 
     def _stacked(self, block: Block) -> Array:
         robot = self.arms[block.robot]
-        joints = (block.q @ robot.joint_map.T).reshape(len(block.y), -1)
+        joints = (block.q.reshape(-1, block.q.shape[-1]) @ robot.joint_map.T).reshape(len(block.y), -1)
         return np.hstack([joints, *columns(robot, block, slice(None)), self._of_sessions(block), block.y])
 
     @cached_property
