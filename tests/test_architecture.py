@@ -152,10 +152,10 @@ UNUSED = {
     "calibrate --help": {"numpy", "scipy", "casadi", "cvxpy"},
     "robots": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.sparse"},
     # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
-    SMALL: {"cvxpy", "clarabel", "scipy.stats"},
-    f"{SMALL} --variant bounded": {"cvxpy", "clarabel", "scipy.stats"},
-    f"{SMALL} --select learned": {"cvxpy", "clarabel", "scipy.stats"},
-    "inspect paper_arm": {"cvxpy", "clarabel", "scipy.stats"},
+    SMALL: {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
+    f"{SMALL} --variant bounded": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
+    f"{SMALL} --select learned": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
+    "inspect paper_arm": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
 }
 """What a command may not import: tables, plots and workers besides these, always."""
 

@@ -109,8 +109,10 @@ class Comparison:
         used = np.isin(self.names, self.own)
         evidence = restricted(self.columns, used)
         first = [self._start(evidence)]
-        if self.result.learned is None and few(self.problem):
+        if self.result.learned is None:
             first = evidence.starts()
+            if not few(self.problem):
+                first = first[:1]
         return Judged((), self.own, evidence, evidence.mode(first, EXACT)[0])
 
     @cached_property

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag, get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import optimize
+from rpim_opt.basics.descent import descent
 from rpim_opt.convex.tails import added
 from rpim_opt.problem.scatter import Scatter, Stack
 
@@ -24,8 +24,8 @@ BASE_SD = 1.0
 APART = 1.0
 """That of the ratio of two sizes of the geometry: lengths, angles and joint offsets are made by different means, but
 few data do not tell each size alone."""
-FARTHEST = 7.0
-"""Logarithms of sizes stay within so much of their centres."""
+FARTHEST, LONGEST = 7.0, 3.0
+"""Logarithms of sizes stay within so much of their centres, and change by no more in a step."""
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 """Local variances are a fixed point when their logarithms change by no more, and on the way to an optimum; rounds that
 they may take."""
@@ -334,15 +334,81 @@ class Evidence:
         total = np.zeros(len(self.noise))
         if not self.noise:
             return total
-        for part in whitened:
+        for part, shares in zip(whitened, self._shares, strict=True):
             N, k = part.stack.index.shape
             back = part.inverse.transpose(0, 2, 1)
             u = (back @ (part.y - part.X @ z).reshape(N, k, 1))[:, :, 0]
             WX = part.X.reshape(N, k, -1)
             Q = np.eye(k) - WX @ (part.X @ C).reshape(N, k, -1).transpose(0, 2, 1)
             Q = back @ Q @ part.inverse
-            total += [_trace(part.stack, kind, Q, u) for kind in self.noise]
+            total += [float(np.sum(Q * K) - np.sum((K @ u[:, :, None])[:, :, 0] * u)) for K in shares]
         return 2 * variance * total
+
+    @cached_property
+    def _shares(self) -> list[Array]:
+        """What a unit of every noise adds to the covariances of each stack (s, N, k, k)."""
+        return [np.array([_share(stack, kind) for kind in self.noise]) for stack in self.data.stacks]
+
+    def curvature(self, point: Point) -> Array:
+        """Return the second derivatives (s, s) of the value by the logarithms of the sizes, at a point of `at`.
+
+        With P = R^-1 - R^-1 X C X'R^-1, u = R^-1 (y - X z), R_a = dR / da and e^2 = z^2 + diag C::
+
+            dz      = C (z / v) dln v  -  C X'R^-1 R_a u da
+            dC      = C diag(dln v / v) C  +  C X'R^-1 R_a R^-1 X C da
+            dln v_j = (2 nu size^2 dln size + de_j^2) / ((nu + 1) v_j)    heavy ones;    2 dln size    others
+
+        A size's slope is the sum of 2 nu (size^2 / v - 1) over its heavy deviations and of 2 (1 - e^2 / v) over
+        others, and by noises a and b the value has the derivatives of variance components (Gilmour, Thompson and
+        Cullis 1995) and what local variances add::
+
+            2 u'R_a P R_b u - tr(P R_a P R_b) + tr(P R_ab) - u'R_ab u - sum (de^2 / da at constant v) (dln v / db) / v
+        """
+        b = self.believed
+        s, tails = len(b.names), b.tails
+        z, C, v, size2 = point.z, point.C, point.v, self._size2(point.logs)
+        own = np.where(b.replaced, 0.0, 1 / v)
+        heavy = np.flatnonzero(b.heavy & ~b.replaced)
+        of_size = np.where((b.group[:, None] == np.arange(len(point.logs))) & ~b.replaced[:, None], 2.0, 0.0)
+        by_noise, among = self._by_noises(point)
+        direct = np.column_stack([np.zeros((len(z), s)), by_noise])
+        follows = C * (C + 2 * np.outer(z, z)) * own
+        moved = of_size.copy()
+        moved[heavy] = 0.0
+        if len(heavy):
+            wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ moved
+            system = np.diag((tails + 1) * v[heavy]) - follows[np.ix_(heavy, heavy)]
+            moved[heavy] = np.linalg.solve(system, wanted)
+        slopes = 2 * ((z**2 + C.diagonal())[:, None] * of_size - direct - follows @ moved) / v[:, None]
+        slopes[heavy] = 2 * tails * (size2 / v)[heavy, None] * (of_size - moved)[heavy]
+        prior = 2 * self.root.T @ self.root
+        slope = (point.gradient - prior @ (point.logs - self.centre))[s:]  # what the data say
+        found = np.zeros_like(prior)
+        found[:s] = of_size[:, :s].T @ slopes / 2
+        found[s:, :s] = found[:s, s:].T
+        found[s:, s:] = among + 2 * np.diag(slope) - by_noise.T @ (own[:, None] * moved[:, s:])
+        return found + prior
+
+    def _by_noises(self, point: Point) -> tuple[Array, Array]:
+        """Return de^2 / da (p, s) at constant v, and 2 u'R_a P R_b u - tr(P R_a P R_b) (s, s), by noises a and b."""
+        z, C = point.z, point.C
+        p, s = len(z), len(self.noise)
+        S, f, among = np.zeros((s, p, p)), np.zeros((s, p)), np.zeros((s, s))
+        if not s:
+            return np.zeros((p, 0)), among
+        twice = 2 * np.exp(2 * point.logs[len(self.believed.names) :])
+        for part, shares in zip(self._informed(point.logs).parts, self._shares, strict=True):
+            N, k = part.stack.index.shape
+            X = part.X.reshape(N, k, p)
+            W = part.inverse @ (twice[:, None, None, None] * shares) @ part.inverse.transpose(0, 2, 1)
+            Wu = (W @ (part.y - part.X @ z).reshape(N, k, 1)).reshape(s, N * k)
+            S += part.X.T @ (W @ X).reshape(s, N * k, p)
+            f += Wu @ part.X
+            within = np.eye(k) - 2 * X @ (part.X @ C).reshape(N, k, p).transpose(0, 2, 1)
+            among += 2 * Wu @ Wu.T - W.reshape(s, -1) @ (within @ W).reshape(s, -1).T
+        CS = C @ S
+        among -= 2 * f @ C @ f.T + CS.reshape(s, -1) @ CS.transpose(0, 2, 1).reshape(s, -1).T
+        return np.einsum("aij,ji->ia", CS, C) - 2 * z[:, None] * (C @ f.T), among
 
     def mode(self, starts: Sequence[Array], tolerance: float = 1e-8) -> list[Point]:
         """Return the optima that are reached from some logarithms of sizes (s,) each, the best first.
@@ -363,36 +429,33 @@ class Evidence:
         """Return the optimum that is reached from some sizes (s,); None where the way leads into one that is known."""
         last: Point | None = None
 
-        def objective(logs: Array) -> tuple[float, Array]:
+        def ask(logs: Array) -> Point:
             nonlocal last
             last = self.at(logs, last, ROUGHLY)
-            return last.value, last.gradient
+            return last
 
-        def known(intermediate_result: Any) -> bool:
-            x, value = intermediate_result.x, intermediate_result.fun
-            return any(value >= point.value and np.abs(x - point.logs).max() <= BASIN for point in found)
-
-        def watch(intermediate_result: Any) -> None:
-            if known(intermediate_result):
-                raise StopIteration
-
-        bounds = list(zip(self.centre - FARTHEST, self.centre + FARTHEST, strict=True))
-        options = {"maxiter": 80, "ftol": tolerance, "gtol": 1e-4}
-        best = optimize.minimize(
-            objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=watch
-        )
-        if known(best):
-            return None
-        return self.at(best.x, last)
+        box = self.centre - FARTHEST, self.centre + FARTHEST
+        logs = start
+        for point in descent(ask, self.curvature, start, box, LONGEST, tolerance):
+            logs = point.logs
+            if any(point.value >= known.value and np.abs(logs - known.logs).max() <= BASIN for known in found):
+                return None
+        return self.at(logs, last)
 
     def starts(self) -> list[Array]:
-        """Return where optima are looked for: what is expected, all of it noise, and large deviations."""
-        sizes = len(self.believed.names)
-        noisy = np.arange(len(self.centre)) >= sizes
+        """Return where optima are looked for: all of it noise, what is expected, and large deviations.
+
+        The first one leads to the best optimum most often, where only one is climbed from.
+        """
+        noisy = 3.0 * (np.arange(len(self.centre)) >= len(self.believed.names))
         geometry = np.zeros(len(self.centre))
         geometry[self.believed.geometry] = 2.0
-        away = [3.0 * noisy, geometry]
-        return [self.centre, *(self.centre + step for step in away if step.any())]
+        found = [self.centre]
+        if noisy.any():
+            found.insert(0, self.centre + noisy)
+        if geometry.any():
+            found.append(self.centre + geometry)
+        return found
 
 
 _potrf: Any = get_lapack_funcs("potrf", dtype=float)
@@ -456,20 +519,15 @@ def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.
     return H[np.ix_(kept, kept)] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
 
 
-def _trace(stack: Stack, kind: str, Q: Array, u: Array) -> float:
-    """Return tr(Q K) - u'K u for one part K of the covariance."""
+def _share(stack: Stack, kind: str) -> Array:
+    """Return what a unit of a noise adds to the covariances (N, k, k)."""
     if kind == "joint":
-        T = stack.joint
-        return float(np.sum(T * (Q @ T)) - np.sum((T.transpose(0, 2, 1) @ u[:, :, None]) ** 2))
-    V = None
+        return stack.joint @ stack.joint.transpose(0, 2, 1)
     if kind == "instrument":
-        V = stack.instrument
-    if kind == "position":
-        V = stack.unit
-    if V is not None:
-        return float(np.sum(Q * V) - np.einsum("nk,nkl,nl->", u, V, u))
+        return stack.instrument
+    if kind == "position" and stack.unit is not None:
+        return stack.unit
     mask = stack.length
     if kind == "orientation":
         mask = stack.angle
-    diagonal = np.diagonal(Q, axis1=1, axis2=2)
-    return float(np.sum(diagonal * mask) - np.sum(u**2 * mask))
+    return mask[:, :, None] * np.eye(mask.shape[1])
