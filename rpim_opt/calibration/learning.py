@@ -21,6 +21,7 @@ from rpim_opt.convex.stated import Stated
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.frames import settled
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.scatter import Scatter, Stack
 from rpim_opt.problem.source import Source
 
 MOST = 1000
@@ -32,8 +33,6 @@ ASKED = 6.0
 of another kind shows once in twenty times at most."""
 LOOKS = 4
 """How often blunders are looked for again without those that were found: they hide behind each other."""
-STEP = 0.05
-"""Of logarithms of sizes, for second derivatives."""
 FLATTEST = 0.05
 """Least second derivative of -2 ln L that is believed."""
 
@@ -217,30 +216,29 @@ def _curvature(evidence: Evidence, point: Point) -> tuple[Array, Array, Array]:
     Their covariance (s, s), twice the inverse of -2 ln L's second derivatives; the slopes (p, s) of the deviations; and
     those (s,) of the logarithm of the variance of what is read, on average over the measured lengths.
     """
-    H = []
-    slopes = []
-    growth = []
-    for step in STEP * np.eye(len(point.logs)):
-        ahead = evidence.at(point.logs + step, point)
-        behind = evidence.at(point.logs - step, point)
-        H.append((ahead.gradient - behind.gradient) / (2 * STEP))
-        slopes.append((ahead.z - behind.z) / (2 * STEP))
-        growth.append(np.log(_variance(evidence, ahead) / _variance(evidence, behind)) / (2 * STEP))
-    curvature, U = np.linalg.eigh((np.array(H) + np.array(H).T) / 2)
+    slopes = evidence.slopes(point)
+    curvature, U = np.linalg.eigh((slopes.curvature + slopes.curvature.T) / 2)
     covariance = U @ np.diag(2 / np.maximum(curvature, FLATTEST)) @ U.T
-    return covariance, np.array(slopes).T, np.array(growth)
+    X = np.vstack([evidence.data.X[stack.index[_read(stack)]] for stack in evidence.data.stacks])
+    scatter = evidence.scatter(point.logs)
+    noise = _noise(evidence, scatter)
+    # tr(X C X' + R): C by its inverse, and R is a sum of squares of the noises
+    rises = slopes.falls(point.C @ (X.T @ X) @ point.C)
+    for i, kind in enumerate(evidence.noise, len(rises) - len(evidence.noise)):
+        rises[i] += 2 * (noise - _noise(evidence, replace(scatter, **{kind: 0.0})))
+    return covariance, slopes.z, rises / (float(np.sum((X @ point.C) * X)) + noise)
 
 
-def _variance(evidence: Evidence, point: Point) -> float:
-    """Return tr(X C X' + R) over the lengths (else angles, else pixels): of a new reading, summed."""
-    total = 0.0
-    for stack in evidence.data.stacks:
-        kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
-        which = next(kind for kind in kinds if kind.any())
-        X = evidence.data.X[stack.index[which]]
-        R = stack.covariance(evidence.scatter(point.logs))
-        total += float(np.sum((X @ point.C) * X) + np.sum(np.einsum("nkk->nk", R)[which]))
-    return total
+def _read(stack: Stack) -> np.ndarray:
+    """Return which equations (N, k) are of lengths (else angles, else pixels)."""
+    kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
+    return next(kind for kind in kinds if kind.any())
+
+
+def _noise(evidence: Evidence, scatter: Scatter) -> float:
+    """Return the variance of what is read, summed over those equations."""
+    stacks = evidence.data.stacks
+    return sum(float(np.sum(np.einsum("nkk->nk", stack.covariance(scatter))[_read(stack)])) for stack in stacks)
 
 
 def _drift(fit: Fit, covariance: Array, slopes: Array) -> Array:

@@ -58,16 +58,19 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
     columns = learning.evidence(whole, x)
     names = whole.parameters.free.names
     own = set(fit.problem.parameters.free.names)
-    before = dict(zip(size_names(fit.evidence), fit.point.logs, strict=True))
+    before = [_named(fit.evidence, fit.point)]
+    if fit.several:
+        before += [_named(fit.evidence, other) for other in fit.others]
     sizes: dict[frozenset[str], dict[str, float]] = {}
 
     def tried(candidate: tuple[str, ...]) -> tuple[float, tuple[str, ...], Point]:
         used = own.union(*(families[family] for family in candidate))
         evidence = restricted(columns, np.array([name in used for name in names]))
         conditions = frozenset(candidate).intersection(CONDITIONS)
-        point = evidence.mode(_starts(evidence, sizes.get(conditions, before), fit.several), COMPARED)[0]
+        first = [sizes.get(conditions, before[0]), *before[1:]]
+        point = evidence.mode([start for one in first for start in _starts(evidence, one)], COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
-            sizes[conditions] = dict(zip(size_names(evidence), point.logs, strict=True))
+            sizes[conditions] = _named(evidence, point)
         return point.value + GAIN * _questions(candidate), candidate, point
 
     trials = sorted(compared(fit.problem, families, tried), key=itemgetter(0))
@@ -122,8 +125,12 @@ def size_names(evidence: Evidence) -> tuple[str, ...]:
     return (*evidence.believed.names, *evidence.noise)
 
 
-def _starts(evidence: Evidence, sizes: Mapping[str, float], several: bool) -> list[Array]:
-    """Return where the optimum of a model with families is looked for: at known sizes, and as always.
+def _named(evidence: Evidence, point: Point) -> dict[str, float]:
+    return dict(zip(size_names(evidence), point.logs.tolist(), strict=True))
+
+
+def _starts(evidence: Evidence, sizes: Mapping[str, float]) -> list[Array]:
+    """Return where the optimum of a model with families is looked for.
 
     Parameters
     ----------
@@ -131,8 +138,6 @@ def _starts(evidence: Evidence, sizes: Mapping[str, float], several: bool) -> li
         Of the model.
     sizes
         Logarithms of sizes by name, of a model that was looked at before.
-    several
-        Whether there are other optima.
     """
     names = size_names(evidence)
     logs = np.array([sizes.get(name, centre) for name, centre in zip(names, evidence.centre, strict=True)])
@@ -142,8 +147,6 @@ def _starts(evidence: Evidence, sizes: Mapping[str, float], several: bool) -> li
         large = logs.copy()
         large[new] += LARGE
         starts.append(large)
-    if several:
-        starts += evidence.starts()
     return starts
 
 

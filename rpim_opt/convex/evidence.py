@@ -132,6 +132,32 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
+class Slopes:
+    """How a point changes with the logarithms of its s sizes, q of them of noise.
+
+    Parameters
+    ----------
+    curvature
+        (s, s) second derivatives of the value.
+    z
+        (p, s) of the deviations' means.
+    own, noise
+        (p, s) and (q, p, p): the deviations' information C^-1 falls by diag(own), and by the latter for noise.
+    """
+
+    curvature: Array
+    z: Array
+    own: Array
+    noise: Array
+
+    def falls(self, M: Array) -> Array:
+        """Return by what tr(M C^-1) falls (s,), for a symmetric M (p, p)."""
+        found = M.diagonal() @ self.own
+        found[len(found) - len(self.noise) :] += np.einsum("aij,ij->a", self.noise, M)
+        return np.asarray(found, dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
 class _Whitened:
     """One stack at some noise: L^-1 X, L^-1 y, L^-1 with L L' the covariance, and its log determinant."""
 
@@ -349,8 +375,8 @@ class Evidence:
         """What a unit of every noise adds to the covariances of each stack (s, N, k, k)."""
         return [np.array([_share(stack, kind) for kind in self.noise]) for stack in self.data.stacks]
 
-    def curvature(self, point: Point) -> Array:
-        """Return the second derivatives (s, s) of the value by the logarithms of the sizes, at a point of `at`.
+    def slopes(self, point: Point) -> Slopes:
+        """Return how a point of `at` changes with the logarithms of its sizes.
 
         With P = R^-1 - R^-1 X C X'R^-1, u = R^-1 (y - X z), R_a = dR / da and e^2 = z^2 + diag C::
 
@@ -367,13 +393,17 @@ class Evidence:
         b = self.believed
         s, tails = len(b.names), b.tails
         z, C, v, size2 = point.z, point.C, point.v, self._size2(point.logs)
-        own = np.where(b.replaced, 0.0, 1 / v)
-        heavy = np.flatnonzero(b.heavy & ~b.replaced)
-        of_size = np.where((b.group[:, None] == np.arange(len(point.logs))) & ~b.replaced[:, None], 2.0, 0.0)
-        by_noise, among = self._by_noises(point)
+        S, f, among = self._by_noises(point)
+        CS = C @ S
+        z_by_noise = -C @ f.T
+        among += 2 * f @ z_by_noise - np.einsum("aij,bji->ab", CS, CS)
+        by_noise = np.einsum("aij,ji->ia", CS, C) + 2 * z[:, None] * z_by_noise  # of e^2, at constant v
         direct = np.column_stack([np.zeros((len(z), s)), by_noise])
+        own = np.where(b.replaced, 0.0, 1 / v)
+        of_size = np.where((b.group[:, None] == np.arange(len(point.logs))) & ~b.replaced[:, None], 2.0, 0.0)
         follows = C * (C + 2 * np.outer(z, z)) * own
-        moved = of_size.copy()
+        heavy = np.flatnonzero(b.heavy & ~b.replaced)
+        moved = of_size.copy()  # of ln v
         moved[heavy] = 0.0
         if len(heavy):
             wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ moved
@@ -387,15 +417,21 @@ class Evidence:
         found[:s] = of_size[:, :s].T @ slopes / 2
         found[s:, :s] = found[:s, s:].T
         found[s:, s:] = among + 2 * np.diag(slope) - by_noise.T @ (own[:, None] * moved[:, s:])
-        return found + prior
+        precision = own[:, None] * moved
+        of_z = C @ (z[:, None] * precision)
+        of_z[:, s:] += z_by_noise
+        return Slopes(found + prior, of_z, precision, S)
 
-    def _by_noises(self, point: Point) -> tuple[Array, Array]:
-        """Return de^2 / da (p, s) at constant v, and 2 u'R_a P R_b u - tr(P R_a P R_b) (s, s), by noises a and b."""
+    def _by_noises(self, point: Point) -> tuple[Array, Array, Array]:
+        """Return X'R^-1 R_a R^-1 X (s, p, p), X'R^-1 R_a u (s, p), and what of noises a and b (s, s) leaves C alone.
+
+        The latter is 2 u'R_a R^-1 R_b u - tr(R^-1 R_a (R^-1 - 2 R^-1 X C X'R^-1) R_b).
+        """
         z, C = point.z, point.C
         p, s = len(z), len(self.noise)
         S, f, among = np.zeros((s, p, p)), np.zeros((s, p)), np.zeros((s, s))
         if not s:
-            return np.zeros((p, 0)), among
+            return S, f, among
         twice = 2 * np.exp(2 * point.logs[len(self.believed.names) :])
         for part, shares in zip(self._informed(point.logs).parts, self._shares, strict=True):
             N, k = part.stack.index.shape
@@ -406,9 +442,7 @@ class Evidence:
             f += Wu @ part.X
             within = np.eye(k) - 2 * X @ (part.X @ C).reshape(N, k, p).transpose(0, 2, 1)
             among += 2 * Wu @ Wu.T - W.reshape(s, -1) @ (within @ W).reshape(s, -1).T
-        CS = C @ S
-        among -= 2 * f @ C @ f.T + CS.reshape(s, -1) @ CS.transpose(0, 2, 1).reshape(s, -1).T
-        return np.einsum("aij,ji->ia", CS, C) - 2 * z[:, None] * (C @ f.T), among
+        return S, f, among
 
     def mode(self, starts: Sequence[Array], tolerance: float = 1e-8) -> list[Point]:
         """Return the optima that are reached from some logarithms of sizes (s,) each, the best first.
@@ -436,11 +470,14 @@ class Evidence:
 
         box = self.centre - FARTHEST, self.centre + FARTHEST
         logs = start
-        for point in descent(ask, self.curvature, start, box, LONGEST, tolerance):
+        for point in descent(ask, self._curvature, start, box, LONGEST, tolerance):
             logs = point.logs
             if any(point.value >= known.value and np.abs(logs - known.logs).max() <= BASIN for known in found):
                 return None
         return self.at(logs, last)
+
+    def _curvature(self, point: Point) -> Array:
+        return self.slopes(point).curvature
 
     def starts(self) -> list[Array]:
         """Return where optima are looked for: all of it noise, what is expected, and large deviations.

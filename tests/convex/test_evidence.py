@@ -114,7 +114,7 @@ def test_gradients_are_differences(seed: int, tails: float) -> None:
 
 @pytest.mark.parametrize("noise", [(), ("position",), (*NOISE, "instrument")])
 @pytest.mark.parametrize("seed", range(3))
-def test_curvatures_are_differences_of_gradients(seed: int, noise: tuple[str, ...]) -> None:
+def test_slopes_of_a_point_are_differences(seed: int, noise: tuple[str, ...]) -> None:
     """Heavy, light, free and stated deviations, two stacks, with a unit of positions of its own in one."""
     data = linearized(seed, 6, 6)
     more = linearized(seed + 10, 4, 6, k=3)
@@ -126,11 +126,16 @@ def test_curvatures_are_differences_of_gradients(seed: int, noise: tuple[str, ..
     stated = replace(plain, replaced=np.arange(6) == 2, rows=rows, values=values)
     evidence = Evidence(both, stated, noise)
     logs = evidence.centre + 0.4 * np.random.default_rng(seed).normal(size=len(evidence.centre))
-    steps = 1e-5 * np.eye(len(logs))
-    want = np.array([(evidence.at(logs + s).gradient - evidence.at(logs - s).gradient) / 2e-5 for s in steps])
-    found = evidence.curvature(evidence.at(logs))
-    assert np.abs(found - want).max() <= 1e-6 * np.abs(want).max()
-    assert np.allclose(found, found.T, rtol=1e-6, atol=1e-6 * np.abs(found).max())
+    sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(len(logs))]
+    found = evidence.slopes(evidence.at(logs))
+    curvature = np.array([after.gradient - before.gradient for after, before in sides]) / 2e-5
+    assert np.abs(found.curvature - curvature).max() <= 1e-6 * np.abs(curvature).max()
+    means = np.array([after.z - before.z for after, before in sides]).T / 2e-5
+    assert np.abs(found.z - means).max() <= 1e-6 * np.abs(means).max()
+    C = evidence.at(logs).C
+    M = C @ np.diag(np.arange(1.0, 7.0)) @ C
+    rises = [np.diag(after.C - before.C) @ np.arange(1.0, 7.0) / 2e-5 for after, before in sides]
+    assert np.allclose(found.falls(M), rises, rtol=1e-6, atol=1e-6 * np.abs(rises).max())
 
 
 @pytest.mark.parametrize("seed", range(4))
