@@ -39,6 +39,7 @@ def of_term(name: str) -> bool:
     return _TERM.fullmatch(own_name(name)) is not None
 
 
+@lru_cache(KNOWN)
 def term_of(name: str, dof: int) -> tuple[Term, int]:
     """Return the term of a parameter, and the joint (from 1) whose parameter it is.
 
