@@ -12,6 +12,10 @@ from rpim_opt.basics.late import spatial
 SHUFFLES = 300
 LEAST = 8
 """Configurations below which neighbours say nothing."""
+FEW = 500
+"""Up to so many points all distances are found sooner than SciPy's tree is loaded."""
+SURELY = 1 - 1e-9
+"""Of squared distances that differ by less rounding decides which is smaller: then the tree does, for all points."""
 
 
 class Alike(NamedTuple):
@@ -70,6 +74,12 @@ def alike(q: Array, errors: Array, kinds: np.ndarray) -> Alike | None:
 def _nearest(points: Array) -> np.ndarray:
     """Return the number (N,) of every point's nearest other one."""
     number = np.arange(len(points))
+    if len(points) <= FEW:
+        squares = np.sum((points[:, None] - points) ** 2, axis=2)
+        np.fill_diagonal(squares, np.inf)
+        nearest, next_one = np.partition(squares, 1)[:, :2].T
+        if np.all(nearest < SURELY * next_one):
+            return np.argmin(squares, axis=1)
     near = np.asarray(spatial.KDTree(points).query(points, k=2)[1])
     # of points at the same place either may come first
     return np.where(near[:, 0] == number, near[:, 1], near[:, 0])

@@ -8,9 +8,11 @@ from html import escape
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 import rpim_opt as ro
 from rpim_opt.basics.markup import html, tag
+from rpim_opt.calibration.alike import _nearest as nearest
 from rpim_opt.calibration.alike import alike
 from rpim_opt.calibration.lack_of_fit import LackOfFit, foreseen, judged, lack_of_fit
 from rpim_opt.calibration.left_over import FEWEST
@@ -213,6 +215,19 @@ def test_angles_alone_are_told_in_mrad():
     found = LackOfFit(20, 60, 30.0, "angle", left=1e-4, instrument=1e-4)
     assert "0.1 mrad" in str(found)
     assert "left_mrad" in found.content()
+
+
+@pytest.mark.parametrize("steps", [None, 3])
+def test_neighbours_are_those_of_a_tree_also_where_several_are_as_near(steps: int | None) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        points = rng.uniform(size=(rng.integers(8, 60), 3))
+        if steps is not None:
+            points = np.round(steps * points)
+        points[3] = points[5]  # twice the same place
+        near = KDTree(points).query(points, k=2)[1]
+        others = np.where(near[:, 0] == np.arange(len(points)), near[:, 1], near[:, 0])
+        assert (nearest(points) == others).all()
 
 
 def test_neighbours_that_share_an_effect_are_alike_and_others_are_not():
