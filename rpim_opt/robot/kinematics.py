@@ -30,33 +30,36 @@ CHUNK = 256
 """Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
 SHARE = 16 * CHUNK
 """Rows that one thread evaluates before it takes more: enough to be worth handing over."""
+ZERO, ONE = ca.SX(0), ca.SX(1)
+"""Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
 
 
 def rotation_x(angle: Symbol) -> ca.SX:
     """Rot(x, angle)."""
     c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0])
+    return _rows([ONE, ZERO, ZERO, ZERO], [ZERO, c, -s, ZERO], [ZERO, s, c, ZERO])
 
 
 def rotation_y(angle: Symbol) -> ca.SX:
     """Rot(y, angle)."""
     c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0])
+    return _rows([c, ZERO, s, ZERO], [ZERO, ONE, ZERO, ZERO], [-s, ZERO, c, ZERO])
 
 
 def rotation_z(angle: Symbol) -> ca.SX:
     """Rot(z, angle)."""
     c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0])
+    return _rows([c, -s, ZERO, ZERO], [s, c, ZERO, ZERO], [ZERO, ZERO, ONE, ZERO])
 
 
-def translation(x: Symbol = 0, y: Symbol = 0, z: Symbol = 0) -> ca.SX:
+def translation(x: Symbol = ZERO, y: Symbol = ZERO, z: Symbol = ZERO) -> ca.SX:
     """Trans(x, y, z)."""
-    return _rows([1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z])
+    return _rows([ONE, ZERO, ZERO, x], [ZERO, ONE, ZERO, y], [ZERO, ZERO, ONE, z])
 
 
 def _rows(*rows: Sequence[Symbol]) -> ca.SX:
-    return ca.vertcat(*(ca.horzcat(*row) for row in rows), ca.horzcat(0, 0, 0, 1))
+    columns = zip(*rows, (ZERO, ZERO, ZERO, ONE), strict=True)  # CasADi counts columns first
+    return ca.reshape(ca.vertcat(*itertools.chain.from_iterable(columns)), 4, 4)
 
 
 def product(factors: Sequence[ca.SX]) -> ca.SX:
