@@ -32,13 +32,14 @@ CORE = [
     "convex/active_set.py", "convex/asked.py", "convex/atoms.py", "convex/by_rows.py", "convex/closed.py",
     "convex/conic.py", "convex/constraints.py", "convex/coordinates.py", "convex/evidence.py", "convex/faces.py",
     "convex/feasible.py", "convex/gap.py", "convex/groups.py", "convex/interior.py", "convex/kinks.py",
-    "convex/left_out.py", "convex/line_search.py", "convex/majorize.py", "convex/newton.py", "convex/newton_step.py",
-    "convex/objective.py", "convex/posterior.py", "convex/program.py", "convex/quadratic.py", "convex/rows.py",
-    "convex/select_curve.py", "convex/select_linear.py", "convex/select_scores.py", "convex/separated.py",
-    "convex/structure.py", "convex/tree.py", "convex/trust.py", "problem/linear.py", "problem/misfit.py",
-    "problem/moments.py", "problem/rotations.py", "problem/frames.py", "problem/loads.py", "robot/mdh.py",
-    "robot/kinematics.py", "robot/chain.py", "robot/deflection.py", "robot/gravity.py", "robot/parameters.py",
-    "calibration/intervals.py", "calibration/uncertainty.py", "calibration/spread.py", "calibration/loop.py",
+    "convex/left_out.py", "convex/line_search.py", "convex/majorize.py", "convex/met.py", "convex/newton.py",
+    "convex/newton_step.py", "convex/objective.py", "convex/posterior.py", "convex/program.py", "convex/quadratic.py",
+    "convex/rows.py", "convex/select_curve.py", "convex/select_linear.py", "convex/select_scores.py",
+    "convex/separated.py", "convex/structure.py", "convex/tree.py", "convex/trust.py", "problem/linear.py",
+    "problem/misfit.py", "problem/moments.py", "problem/rotations.py", "problem/frames.py", "problem/loads.py",
+    "robot/mdh.py", "robot/kinematics.py", "robot/chain.py", "robot/deflection.py", "robot/gravity.py",
+    "robot/parameters.py", "calibration/intervals.py", "calibration/uncertainty.py", "calibration/spread.py",
+    "calibration/loop.py",
 ]  # fmt: skip
 SECONDS = 40.0
 """Of tests (as long as they took once) that are run for a mutant."""

@@ -530,7 +530,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
     for solver in ("interior", "by_solver"):
         monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
-    monkeypatch.setattr("rpim_opt.convex.program.by_rows", lambda *_: None)
+    monkeypatch.setattr("rpim_opt.convex.by_rows.by_rows", lambda *_: None)
     assert run(monkeypatch, "calibrate", str(made), "--formulation", "minimax", "--json") == 3
     said = capsys.readouterr()
     assert said.out == ""

@@ -10,7 +10,6 @@ from typing import Any
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.calibration.group_weights import grouped
 from rpim_opt.calibration.learning import learn, with_families
 from rpim_opt.calibration.loop import require_finite
 from rpim_opt.calibration.outcome import Iteration
@@ -129,6 +128,8 @@ def calibrate(
     }
     kinds = _noise(noise, model)
     if isinstance(weight, Mapping):
+        from rpim_opt.calibration.group_weights import grouped
+
         return grouped(problem, formulation, weight, prior=prior, start=start, **how)
     given = {**how, "prior": prior, "model": model, "noise": noise, "progress": None}
     asked = partial(calibrate, formulation=formulation, weight=weight, **given)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rpim_opt.calibration.expected import improvement
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.views import camera_blocks
 
@@ -39,6 +38,8 @@ def camera_remarks(result: Calibration) -> list[str]:
 
 
 def _positions(result: Calibration) -> list[str]:
+    from rpim_opt.calibration.expected import improvement  # which no other measurement asks for
+
     found = improvement(result)
     if found is None:
         return ["How well the flange's positions are known this result cannot tell."]

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
@@ -97,6 +96,8 @@ def minimum_between(
         A point (n,) near the minimum: that of a neighbouring weight or linearization. Of weight zero none is taken:
         what the data do not see would stay where it is.
     """
+    from rpim_opt.convex.active_set import minimum_in_box  # a program without a box has no use of it
+
     lower, upper = bounds
     start = near if weight > 0 else None
     if start is None or free is not None:

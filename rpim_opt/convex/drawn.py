@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,11 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
-from rpim_opt.convex.sentence import Sentence, Sum, sentence
 from rpim_opt.problem.predicting import within_box, within_ranges
 from rpim_opt.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from rpim_opt.convex.sentence import Sentence, Sum
 
 WORKSPACE, BOX = "workspace", ("x", "y", "z")
 """The place that every robot has, all its joint ranges; and what a box is given by."""
@@ -200,7 +202,7 @@ class Drawn:
         made: list[Sum] = []
         for name in known:
             instead = tuple(name if i in own else other for i, other in enumerate(found.names))
-            made.append(Sum(instead, found.factors, found.constant, found.nominal))
+            made.append(replace(found, names=instead))
         if not made:
             raise self._wrong(f"'{patterns[0]}'", "identified parameters: " + choices(patterns[0], p.names))
         return made
@@ -304,6 +306,8 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Drawn:
     |theta4| <= 1 mrad: 2.88 a mrad
     move at most 2 mm: home: 131.04 a mm
     """
+    from rpim_opt.convex.sentence import sentence  # a drawing says something of few robots
+
     if where is not None and not isinstance(where, Mapping):
         raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")
     demanded = sentence(text)

@@ -12,9 +12,10 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
+from rpim_opt.convex.met import Kinked
 from rpim_opt.convex.products import weighed_squares
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
-from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Whitened
 
 MOST, SOON = 100, 30
 """Steps of Newton's, after which another method is asked, and after which a neighbour's kinks are too sharp."""

@@ -13,7 +13,6 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.patterns import fits
 from rpim_opt.convex import statement
 from rpim_opt.convex.believed import penalized
-from rpim_opt.convex.fleet import Fleet
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posterior import Result, posterior
 from rpim_opt.convex.stated import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths
@@ -239,6 +238,8 @@ class Prior:
         >>> bool(stated.centre.any()), bool(stated.heavy.any()), len(stated.rows)
         (True, True, 0)
         """
+        from rpim_opt.convex.fleet import Fleet
+
         centre, width = Fleet.of(results).tables()
         return cls(centre=centre, scale=width, doubted=True)
 

@@ -14,13 +14,12 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.atoms import OPTIMAL, cp
-from rpim_opt.convex.by_rows import Met, by_rows
 from rpim_opt.convex.closed import Bounds, minimum, minimum_between, moved, path_between, shares, values
-from rpim_opt.convex.conflict import advice, conflict
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.gap import duality_gap
 from rpim_opt.convex.interior import Found, interior
 from rpim_opt.convex.kinked import minimum_on_faces
+from rpim_opt.convex.met import Met
 from rpim_opt.convex.objective import Damping, Objective
 from rpim_opt.convex.posed import Unposed, posed
 from rpim_opt.convex.written import by_solver, parametrized
@@ -349,6 +348,8 @@ class Program(Objective):
 
     def _by_rows(self, weight: float, damping: Damping | None, rough: bool = False) -> Estimate | None:
         """Return the minimum of a loss that is a sum or the largest over rows, from the last one."""
+        from rpim_opt.convex.by_rows import by_rows
+
         ended = by_rows(self, weight, damping, self._met.near(weight), rough)
         if ended is None:
             return None
@@ -403,6 +404,8 @@ class Program(Objective):
         """Return a solver's point as an estimate, or say why there is none."""
         if found.z is not None:
             return replace(self._at(found.z, weight, found.duals, found.iterations), status=found.status)
+        from rpim_opt.convex.conflict import advice, conflict  # of programs without a solution
+
         status, contradiction = found.status, None
         if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
             contradiction = conflict(self._posed, self.model)

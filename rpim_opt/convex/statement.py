@@ -11,7 +11,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display, split_unit
-from rpim_opt.convex.combination import combination
 from rpim_opt.robot.parameters import Parameters
 
 FAR = 100.0
@@ -159,6 +158,8 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
 
 def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
     """Return the statement that a combination of parameters has a value; arguments as for `Prior.known`."""
+    from rpim_opt.convex.combination import combination  # texts are read where there are any
+
     said = combination(text)
     if said.sd is not None:
         if value is not None or sd is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.coordinates import Coordinates
+from rpim_opt.convex.met import Kinked
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
 ACCEPTED = 1e-10
@@ -28,18 +29,6 @@ FAR = 100.0
 """No minimum is this many times farther than the point where the gap is taken, in what no penalty holds."""
 UNSEEN = RANK_TOLERANCE**2
 """Coordinates whose square sees less than this part of the longest one's stay where the penalty has them."""
-
-
-class Kinked(NamedTuple):
-    """What a neighbour may begin with.
-
-    About which multipliers (m,) each the kinks are smoothed, and how sharply; of a smooth loss its second derivative by
-    z (n, n) at a point nearby, where that was dear.
-    """
-
-    multipliers: list[Array]
-    sharpness: float
-    curved: Array | None = None
 
 
 class Ended(NamedTuple):

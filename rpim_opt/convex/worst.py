@@ -11,7 +11,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.epigraph import Epigraph, Least
 from rpim_opt.convex.largest import Largest
-from rpim_opt.convex.whitened import ACCEPTED, FLAT, PROMISED, SOUGHT, Best, Ended, Kinked, Whitened
+from rpim_opt.convex.met import Kinked
+from rpim_opt.convex.whitened import ACCEPTED, FLAT, PROMISED, SOUGHT, Best, Ended, Whitened
 
 MOST, CHANGES = 40, 1000
 """Quadratic programs, and changes of the set in each, after which another method is asked."""

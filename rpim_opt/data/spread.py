@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, with_unit
 from rpim_opt.data.columns import Numbers
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.tracker import LaserTracker
+
+if TYPE_CHECKING:
+    from rpim_opt.data.tracker import LaserTracker
 
 TRACKER = {
     "range": ("length", "ratio"),
@@ -44,6 +46,8 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
 
 
 def _tracker(stated: Any, kind: Measurement) -> LaserTracker:
+    from rpim_opt.data.tracker import LaserTracker
+
     if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
         raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
     given = quantities(stated, TRACKER, "table noise.tracker")

@@ -11,7 +11,6 @@ from rpim_opt.basics.inputs import inside
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.plain import read_mdh
-from rpim_opt.robot.urdf import read_urdf
 
 READY = Path(__file__).resolve().parent / "ready"
 
@@ -54,5 +53,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
     """Return the robot of a file, with base and tool where a URDF states them."""
     if file.suffix in (".urdf", XACRO):
+        from rpim_opt.robot.urdf import read_urdf
+
         return read_urdf(file, urdf_base, urdf_tip)
     return Described(read_mdh(file), np.zeros(6), np.zeros(6))

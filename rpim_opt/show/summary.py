@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import table
-from rpim_opt.calibration.acceptance import Acceptance, accept
 from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks
@@ -18,8 +17,11 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import known_distance, known_parallel, known_square
-from rpim_opt.store.content import figures, sets
+from rpim_opt.store.figures import figures, sets
 from rpim_opt.store.stated_record import FIELDS
+
+if TYPE_CHECKING:
+    from rpim_opt.calibration.acceptance import Acceptance
 
 KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 
@@ -80,6 +82,8 @@ def acceptance(result: Calibration) -> Acceptance | None:
     """Return the verdict of what a result's record requires; None where nothing is required."""
     if result.record.requirement is None:
         return None
+    from rpim_opt.calibration.acceptance import accept
+
     return accept(result)
 
 

@@ -15,9 +15,8 @@ from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.outcome import Kept
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.held_out import HeldOut
-from rpim_opt.data.record import Record
 from rpim_opt.store.definition import defined, definition, forms
+from rpim_opt.store.figures import figures, sets
 from rpim_opt.store.learned_parts import learned_part, scatter_part
 from rpim_opt.store.parts import data_part, finite, parameters_part, robots_part, selection_part
 from rpim_opt.store.record_part import record_part
@@ -81,40 +80,6 @@ def derived(result: Calibration) -> dict[str, Any]:
         "nominal": {name: statistics(result.nominal_errors(part)) for name, part in data.items()},
         "rows": {name: _rows(result, part) for name, part in data.items()},
     }
-
-
-def figures(result: Calibration) -> dict[str, Any]:
-    """Return what a reader looks for first: errors [mm], the weight and where it came from, the parameters."""
-    validation = result.record.validation
-    return {
-        "identification": statistics(result.errors()),
-        "validation": None if validation is None else statistics(result.errors(validation)),
-        "held_out": _held_out(result.record.held_out),
-        "weight": result.weight,
-        "selector": result.selector,
-        "corner": None if result.selection is None else bool(result.selection.interior),
-        "formulation": result.formulation.name,
-        "converged": result.converged,
-        "message": result.message,
-        "iterations": len(result.history),
-        "flagged": result.doubted,
-        "parameters": result.parameter_rows(),
-    }
-
-
-def _held_out(held: HeldOut | None) -> dict[str, Any] | None:
-    """Return what rows showed that were kept apart before they were used, and how many were used till then."""
-    if held is None:
-        return None
-    return {"nominal": statistics(held.nominal), "identified": statistics(held.error), "used": held.used}
-
-
-def sets(identification: Dataset, record: Record) -> dict[str, Dataset]:
-    """Return the measurements by name: those of the identification, and those that were kept apart."""
-    data = {"identification": identification}
-    if record.validation is not None:
-        data["validation"] = record.validation
-    return data
 
 
 def _rows(result: Calibration, data: Dataset) -> list[dict[str, Any]]:

@@ -18,8 +18,6 @@ from rpim_opt.convex.stated import JOINT_OFFSET as FACTOR
 from rpim_opt.data.models import Measurement
 from rpim_opt.robot.overlay import JOINT_OFFSET, is_joint_offset
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.prior_file import is_prior, prior_of
-from rpim_opt.store.result_file import load_result
 
 
 class PriorTable(Table):
@@ -130,6 +128,9 @@ def _named(key: str, path: Path, make: Any) -> Prior:
 
 def _earlier(table: PriorTable, file: Path, measurements: Sequence[Measurement]) -> Prior:
     """Return the prior that a file holds, or the posterior of a result."""
+    from rpim_opt.store.prior_file import is_prior, prior_of  # most folders name no earlier result
+    from rpim_opt.store.result_file import load_result
+
     if file.is_dir():
         file = file / "result.json"
     stored = read_json(file)
@@ -139,4 +140,6 @@ def _earlier(table: PriorTable, file: Path, measurements: Sequence[Measurement])
 
 
 def _fleet(files: Sequence[str], path: Path, measurements: Sequence[Measurement]) -> Prior:
+    from rpim_opt.store.result_file import load_result
+
     return Prior.from_fleet({name: load_result(path.parent / name, measurements) for name in files})

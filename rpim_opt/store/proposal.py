@@ -6,7 +6,6 @@ import re
 
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import CAMERAS
-from rpim_opt.problem.observability import near_parallel
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
@@ -24,5 +23,7 @@ def proposed(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
     if kinds & {"position", *turning}:  # distances do not tell where the robot stands
         identified.append(_BASE)
     identified.append(_PLACES if kinds & turning else _POINTS)  # nothing else sees how a reflector is turned
+    from rpim_opt.problem.observability import near_parallel
+
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in identified)
     return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

@@ -32,8 +32,9 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.open_model import Model
 from rpim_opt.store.agreement import agreement
-from rpim_opt.store.content import content, derived, digest, sets
+from rpim_opt.store.content import content, derived, digest
 from rpim_opt.store.definition import formulation_of, quadratic_of
+from rpim_opt.store.figures import sets
 from rpim_opt.store.learned_parts import learned_of, scatter_of
 from rpim_opt.store.parts import data_of, parameters_of, robots_of, selection_of
 from rpim_opt.store.record_part import record_of

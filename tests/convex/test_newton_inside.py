@@ -10,9 +10,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex import by_rows
-from rpim_opt.convex.by_rows import Kinked, Met, Near
+from rpim_opt.convex import met as minima
 from rpim_opt.convex.interior import _whitened
+from rpim_opt.convex.met import Kinked, Met, Near
 from rpim_opt.convex.newton import Newton, Point
 from rpim_opt.convex.objective import Damping
 from tests.convex.test_newton import CASES, MODEL, SMOOTH, stated
@@ -226,12 +226,12 @@ def test_a_minimum_begins_at_that_of_the_nearest_weight() -> None:
     assert {asked: each.z[0] for asked, each in found.items() if each} == {0.0: 0, 1e-4: 1, 0.04: 2, 20.0: 3, 3e5: 4}
     assert [each.z[0] for each in met.near(20.0)] == [3, 4]
     assert [each.z[0] for each in met.near(1e4)] == [4]
-    for k in range(by_rows.MOST):
+    for k in range(minima.MOST):
         met.keep(1e6 + k, near(k))
     kept = met.nearest(1e4)
     assert kept is not None
     assert kept.z[0] == 0  # that at 1e6: those before it are gone
-    assert len(met._at) == by_rows.MOST
+    assert len(met._at) == minima.MOST
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.7])
