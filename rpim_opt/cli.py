@@ -3,6 +3,9 @@
 Annotations are values here: typer reads each of them twice, and as texts they would be compiled as often.
 """
 
+import atexit
+import gc
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,6 +48,12 @@ app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pre
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
+SPARED = {"OPENBLAS_NUM_THREADS": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
+"""What libraries do as they are loaded, and no command uses: threads beside ours, a search for others' plugins."""
+YOUNG = 200_000
+"""Objects after which Python looks for garbage: loading makes half as many, and a calibration leaves a thousand."""
+LONG = ("study", "compare")
+"""Commands that run others' programs, and for long: they and Python are left as they are."""
 ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 
@@ -294,12 +303,12 @@ def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFoun
 
 def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
+    if out is None:
+        return []
     from rpim_opt.basics.inputs import inside
     from rpim_opt.basics.writing import refused
     from rpim_opt.store.result_file import save_result
 
-    if out is None:
-        return []
     file = inside(out, "result.json", "the file", out)
     with refused(file):
         save_result(result, file)
@@ -771,6 +780,11 @@ def _written_or_shown(out: Path | None, text: str) -> str:
 
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
+    if not set(LONG).intersection(sys.argv[1:2]):
+        for name, value in SPARED.items():
+            os.environ.setdefault(name, value)
+        gc.set_threshold(YOUNG)
+    atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with arriving():
         _run()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -146,16 +147,33 @@ def test_heavy_libraries_wait_until_they_are_used(code: str) -> None:
 
 
 SMALL = "calibrate paper_arm"
+ELSEWHERE = {
+    "rpim_opt.calibration.acceptance",
+    "rpim_opt.calibration.expected",
+    "rpim_opt.calibration.group_weights",
+    "rpim_opt.convex.by_rows",
+    "rpim_opt.convex.conflict",
+    "rpim_opt.convex.fleet",
+    "rpim_opt.convex.sentence",
+    "rpim_opt.data.tracker",
+    "rpim_opt.problem.observability",
+    "rpim_opt.robot.urdf",
+    "rpim_opt.store.prior_file",
+    "rpim_opt.store.schema",
+}
+"""What a plain calibration has no use of, each with modules of its own: a limit, cameras, a drawing's words, a file."""
+HEAVY = {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.spatial"}
+"""Libraries that a calibration without cones does not use."""
 UNUSED = {
     "--version": {"numpy", "scipy", "casadi", "cvxpy"},
     "--help": {"numpy", "scipy", "casadi", "cvxpy"},
     "calibrate --help": {"numpy", "scipy", "casadi", "cvxpy"},
     "robots": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.sparse"},
     # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
-    SMALL: {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
-    f"{SMALL} --variant bounded": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
-    f"{SMALL} --select learned": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
-    "inspect paper_arm": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize"},
+    SMALL: {*HEAVY, "rpim_opt.convex.active_set", *ELSEWHERE},
+    f"{SMALL} --variant bounded": {*HEAVY, *ELSEWHERE},
+    f"{SMALL} --select learned": {*HEAVY, *ELSEWHERE},
+    "inspect paper_arm": HEAVY,
 }
 """What a command may not import: tables, plots and workers besides these, always."""
 
@@ -169,6 +187,23 @@ def test_a_command_imports_what_it_uses(command: str) -> None:
         f"loaded = {unused} & set(sys.modules)\nassert not loaded, loaded"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("stated", "threads"), [(None, 1), ("2", 2)])
+def test_a_command_loads_linear_algebra_with_one_thread_unless_told(stated: str | None, threads: int) -> None:
+    script = (
+        "import sys\nfrom rpim_opt.cli import main\n"
+        "sys.argv = ['rpim-opt', 'robots']\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
+        "from threadpoolctl import threadpool_info\n"
+        "found = {each['num_threads'] for each in threadpool_info() if each['internal_api'] == 'openblas'}\n"
+        f"assert found <= {{1, {threads}}}, found\n"
+        f"import os\nassert os.environ['OPENBLAS_NUM_THREADS'] == '{threads}'"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+    if stated is not None:
+        environment["OPENBLAS_NUM_THREADS"] = stated
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

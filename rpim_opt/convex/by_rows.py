@@ -12,8 +12,9 @@ from rpim_opt.convex.coordinates import Coordinates, coordinates
 from rpim_opt.convex.interior import Found
 from rpim_opt.convex.largest import Largest
 from rpim_opt.convex.met import Near
-from rpim_opt.convex.newton import DEAR, Newton
+from rpim_opt.convex.newton import Newton
 from rpim_opt.convex.objective import Damping, Objective
+from rpim_opt.convex.products import DEAR
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.whitened import Ended
 from rpim_opt.convex.worst import Worst

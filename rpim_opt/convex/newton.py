@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.active_set import minimum_in_box
 from rpim_opt.convex.line_search import searched
 from rpim_opt.convex.met import Kinked
-from rpim_opt.convex.products import weighed_squares
+from rpim_opt.convex.products import DEAR, weighed_squares
 from rpim_opt.convex.separated import Curvature, Separated, Smoothed
 from rpim_opt.convex.whitened import FLAT, PROMISED, Best, Ended, Whitened
 
@@ -25,8 +25,6 @@ SHARPER, SHARPEST = 5.0, 1e9
 """By what factor kinks are sharpened, and how sharp they become at most, relative to the first."""
 SETTLED = 0.3
 """Multipliers take a step when the smoothed objective may fall by no more than this part of what the kinks miss."""
-DEAR = 200_000
-"""Entries of the rows from which a second derivative is dear."""
 ENOUGH = 5e-11
 """Duality gap, relative to the objective, that ends steps with such ones."""
 TELLING = 300

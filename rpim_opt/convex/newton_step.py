@@ -12,8 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.left_out import Rows, by_size, solved, taken
-from rpim_opt.convex.newton import DEAR
-from rpim_opt.convex.products import TOGETHER, weighed_squares
+from rpim_opt.convex.products import DEAR, TOGETHER, weighed_squares
 from rpim_opt.convex.program import Estimate, Program
 
 SMALL = 1e-5

@@ -13,6 +13,8 @@ TOGETHER = 8192
 """Rows that are worked on together."""
 
 
+DEAR = 200_000
+"""Entries of the rows from which products with themselves are dear."""
 SOME = 61
 """Of every so many rows one tells the weight that most may have; a prime, which meets all of a reading."""
 
