@@ -9,7 +9,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 
-TOGETHER = 8192
+TOGETHER = 4096
 """Rows that are worked on together."""
 
 

@@ -35,7 +35,7 @@ def _squared(program: Program, weight: float) -> Squared:
     penalty = penalty_of(program)
     if program.quadratic:
         return Squared(program.squared, penalty, program.ridge)
-    model = program.trusted(program.solve(weight).z)
+    model = program.trusted(program.path([weight], rough=True)[0].z)
     return Squared(model, penalty, ridge(model, penalty))
 
 

@@ -76,7 +76,8 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
     """Return some of a model's equations (m,), multiplied by the root of a factor."""
     A, b = np.compress(keep, model.A.T, axis=1).T, model.b[keep]  # the columns stand together, as LAPACK asks
     if factor != 1:
-        A, b = np.sqrt(factor) * A, np.sqrt(factor) * b
+        A *= np.sqrt(factor)
+        b *= np.sqrt(factor)
     return replace(model, A=A, b=b, group=model.group[keep])
 
 
