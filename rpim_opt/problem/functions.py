@@ -25,6 +25,8 @@ transform = Measurement(
 )
 """The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
 
+MANY = 4096
+"""Functions that are kept: of some hundred reflectors each has its own."""
 _READY = frozenset({*READY.values(), transform})
 
 
@@ -87,7 +89,7 @@ class Kept:
         }
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=MANY)
 def _restored(text: str) -> ca.Function:
     """Return a function that was sent, the same one every time: what was prepared for many rows of it is not lost."""
     return ca.Function.deserialize(text)
@@ -117,13 +119,13 @@ def asked(structure: Structure, measurement: Measurement) -> Functions:
         return _built(answer.serialize())
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=MANY)
 def _ready(structure: Structure, measurement: Measurement) -> Functions:
     with SYMBOLS:
         return _derived(_expressions(structure, measurement))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=MANY)
 def _built(answer: str) -> Functions:
     function = ca.Function.deserialize(answer)
     symbols = function.sx_in()
@@ -142,8 +144,31 @@ def _derived(of: Row) -> Functions:
     }
 
 
+class _Entries(dict[str, Symbol]):
+    """Entries of a vector by name, taken when they are first asked for: a row sees few parameters of many."""
+
+    def __init__(self, vector: ca.SX, places: Mapping[str, int]) -> None:
+        super().__init__()
+        self._vector, self._places = vector, places
+
+    def __missing__(self, name: str) -> Symbol:
+        self[name] = self._vector[self._places[name]] if name in self._places else ca.SX(0)
+        return self[name]
+
+
+@lru_cache(maxsize=16)
+def _places(names: tuple[str, ...], identified: bytes, absent: bytes) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the places of nominal values that are not zero, and of identified parameters among those."""
+    free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
+    present = np.flatnonzero(~np.frombuffer(absent, dtype=bool))
+    return {names[i]: int(i) for i in present}, {names[i]: k for k, i in enumerate(free)}
+
+
 class _Parameters(NamedTuple):
-    """The parameters of a row by name: where they start, and the deviations of those that are identified."""
+    """The parameters of a row by name: where they start, and the deviations of those that are identified.
+
+    Zero where there is none of a name.
+    """
 
     x: ca.SX
     nominal: ca.SX
@@ -152,20 +177,13 @@ class _Parameters(NamedTuple):
 
     @classmethod
     def of(cls, names: tuple[str, ...], identified: bytes, absent: bytes) -> _Parameters:
-        free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
-        zero = np.frombuffer(absent, dtype=bool)
+        present, free = _places(names, identified, absent)
         x = ca.SX.sym("x", len(free))
         nominal = ca.SX.sym("nominal", len(names))
-        start = {name: nominal[i] for i, name in enumerate(names)}
-        start.update({names[i]: ca.SX(0) for i in np.flatnonzero(zero)})
-        deviation = dict.fromkeys(names, ca.SX(0))
-        deviation.update({names[i]: x[k] for k, i in enumerate(free)})
-        return cls(x, nominal, start, deviation)
+        return cls(x, nominal, _Entries(nominal, present), _Entries(x, free))
 
     def value(self, name: str) -> Symbol:
-        """Return a parameter, zero where there is none of this name."""
-        if name not in self.start:
-            return ca.SX(0)
+        """Return a parameter."""
         return self.start[name] + self.deviation[name]
 
     def place(self, prefix: str) -> list[ca.SX]:
@@ -175,8 +193,8 @@ class _Parameters(NamedTuple):
 
     def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> list[ca.SX]:
         """Return the factors of one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
-        start = [ca.dot(chosen, ca.vertcat(*(self.start.get(p + c, 0) for p in prefixes))) for c in FRAME]
-        moved = [ca.dot(chosen, ca.vertcat(*(self.deviation.get(p + c, 0) for p in prefixes))) for c in FRAME]
+        start = [ca.dot(chosen, ca.vertcat(*(self.start[p + c] for p in prefixes))) for c in FRAME]
+        moved = [ca.dot(chosen, ca.vertcat(*(self.deviation[p + c] for p in prefixes))) for c in FRAME]
         return placed(start, moved)
 
 

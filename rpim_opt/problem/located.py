@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -27,6 +28,8 @@ ENOUGH = 2000
 """Rows of a measurement from which frames are placed, where there are more."""
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
+MOST_PLACING = 30
+"""Markers that place the base, where there are more: the others follow from the base."""
 MOST_TURNING = 4
 """Markers whose orientations place the base, where more turn: those of the others follow from the base."""
 
@@ -67,12 +70,14 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
     """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
     from rpim_opt.problem.certified import certified_hand_eye  # CVXPY waits until a base is located
 
-    turning = _turning(seen)
-    sigma = np.concatenate([_deviations(block) for block in seen])
+    placing = _most(seen, MOST_PLACING)
+    turning = _most([b for b in seen if b.measurement.name == "pose" and b.markers[0] in placing], MOST_TURNING)
+    asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
+    sigma = np.concatenate([_deviations(block) for block, _ in asked])
     start = certified_hand_eye(
-        np.concatenate(flanges),
-        np.concatenate([_measured(block, block.markers[0] in turning) for block in seen]),
-        marker=[block.markers[0] for block in seen for _ in block.row],
+        np.concatenate([flange for _, flange in asked]),
+        np.concatenate([_measured(block, block.markers[0] in turning) for block, _ in asked]),
+        marker=[block.markers[0] for block, _ in asked for _ in block.row],
         sigma=(sigma[:, 0], sigma[:, 1]),
         expected=places,
         spread=TOOL_ERROR,
@@ -80,24 +85,47 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
     if start.uncertainty > FREE:
         raise InputError("the data", start.reason, "turns about two axes")
     base = start.bases[""]
-    found = {marker: place.copy() for marker, place in places.items()}
+    found = _seen_from(base, seen, flanges, places)
+    for marker, tool in start.tools.items():
+        found[marker][:3] = tool[:3, 3]
     for block, flange in zip(seen, flanges, strict=True):
-        tool = start.tools[block.markers[0]]
         if block.measurement.name == "pose":
+            tool = np.eye(4)
             turned = (base @ flange)[:, :3, :3].transpose(0, 2, 1) @ transforms(block.y)[:, :3, :3]
             tool[:3, :3] = proper(turned.sum(axis=0))
+            tool[:3, 3] = found[block.markers[0]][:3]
             found[block.markers[0]] = frame_numbers(tool)
-        else:
-            found[block.markers[0]][:3] = tool[:3, 3]
     verdict = "certified" if start.certified else "not certified"
     return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
 
 
-def _turning(seen: Sequence[Block]) -> set[str]:
-    """Return the markers whose orientations count: of those with the most, for each makes the relaxation larger."""
-    poses = [block for block in seen if block.measurement.name == "pose"]
-    poses.sort(key=lambda block: -len(block.row))
-    return {block.markers[0] for block in poses[:MOST_TURNING]}
+def _seen_from(
+    base: Array, seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the reflectors (6,) by marker where their positions are least off, seen from a base (4, 4) that is known.
+
+    They are expected where they are stated, up to `TOOL_ERROR`.
+    """
+    certain = dict.fromkeys(places, TOOL_ERROR**-2)
+    total = {marker: place[:3] * TOOL_ERROR**-2 for marker, place in places.items()}
+    for block, flange in zip(seen, flanges, strict=True):
+        T = base @ flange
+        there = np.einsum("nji,nj->ni", T[:, :3, :3], block.y[:, :3] - T[:, :3, 3])
+        precision = _deviations(block)[:, 0] ** -2
+        certain[block.markers[0]] += precision.sum()
+        total[block.markers[0]] = total[block.markers[0]] + precision @ there
+    found = {marker: place.copy() for marker, place in places.items()}
+    for marker, place in found.items():
+        place[:3] = total[marker] / certain[marker]
+    return found
+
+
+def _most(blocks: Sequence[Block], count: int) -> set[str]:
+    """Return so many markers of those with the most rows, for each makes the relaxation larger."""
+    rows: Counter[str] = Counter()
+    for block in blocks:
+        rows[block.markers[0]] += len(block.row)
+    return {marker for marker, _ in rows.most_common(count)}
 
 
 def _measured(block: Block, turning: bool) -> Array:

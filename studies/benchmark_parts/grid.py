@@ -23,6 +23,8 @@ SEPARABLE = ("least_squares", "tikhonov", "bounded", "robust", "sum_of_norms")
 """Whose loss is a sum over configurations: at 20,000 the others keep a program of 60,000 equations."""
 PATIENCE = {40: 30, 1_000: 60, 20_000: 240}
 """Seconds that a cell gets, by configurations."""
+TIMES, ENOUGH = 6, 6.0
+"""How often a cell is timed at most, and the seconds after which it was often enough."""
 BLUNDERS = 0.05
 """Part of the configurations that are off by some millimetres."""
 
@@ -67,32 +69,33 @@ def arm(count: int, blunders: float = BLUNDERS) -> CalibrationProblem:
 
 
 def cell(formulation: str, rule: str, count: int) -> dict[str, Any]:
-    """Return the seconds of a calibration, those of Tikhonov with the same rule, and how it ended."""
+    """Return the seconds of a calibration, those of Tikhonov with the same rule, and how it ended.
+
+    The least of some runs of either, in turn: a machine's speed changes within seconds.
+    """
     problem = arm(count)
     weight = RULES[rule]
-    beside = timed(lambda: ro.calibrate(problem, ro.tikhonov, weight))
-    try:
-        with limited(PATIENCE[count]):
-            seconds, result = timed(lambda: ro.calibrate(problem, FORMULATIONS[formulation], weight))
-    except ro.InputError as error:
-        return {"seconds": None, "tikhonov": beside[0], "ended": f"does not apply: {error}"}
-    except (ro.NoSolutionFound, TimeoutError) as error:
-        return {"seconds": float(PATIENCE[count]), "tikhonov": beside[0], "ended": f"{type(error).__name__}"}
-    return {"seconds": seconds, "tikhonov": beside[0], "ended": "converged" if result.converged else "not converged"}
+    beside, seconds, ended = [], [], ""
+    begin = time.perf_counter()
+    while not seconds or (len(seconds) < TIMES and time.perf_counter() - begin < ENOUGH):
+        beside.append(timed(lambda: ro.calibrate(problem, ro.tikhonov, weight))[0])
+        try:
+            with limited(PATIENCE[count]):
+                each, result = timed(lambda: ro.calibrate(problem, FORMULATIONS[formulation], weight))
+        except ro.InputError as error:
+            return {"seconds": None, "tikhonov": min(beside), "ended": f"does not apply: {error}"}
+        except (ro.NoSolutionFound, TimeoutError) as error:
+            return {"seconds": float(PATIENCE[count]), "tikhonov": min(beside), "ended": f"{type(error).__name__}"}
+        seconds.append(each)
+        ended = "converged" if result.converged else "not converged"
+    return {"seconds": min(seconds), "tikhonov": min(beside), "ended": ended}
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the seconds of the best of three runs where they are short, and what the last returned."""
+    """Return the seconds of work, and what it returned."""
     start = time.perf_counter()
     found = work()
-    best = time.perf_counter() - start
-    for _ in range(2):
-        if best > 3:
-            break
-        start = time.perf_counter()
-        found = work()
-        best = min(best, time.perf_counter() - start)
-    return best, found
+    return time.perf_counter() - start, found
 
 
 @contextmanager

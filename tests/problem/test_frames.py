@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
+from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.problem import located
+from rpim_opt.problem.located import locate
 from rpim_opt.problem.placing import hand_eye, register, tool_from_distances
+from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ARM, simulated
 
 
@@ -131,3 +137,34 @@ def test_anchors_and_spheres_are_located_where_none_is_stated(tmp_path) -> None:
     p = ro.load(folder).problem.parameters
     found = [p.nominal[p.names.index(f"sphere_{c}")] for c in "xyzr"]
     assert np.abs(np.array(found) - [0.7, 0.15, 0.3, 0.3]).max() < 0.05
+
+
+@pytest.mark.parametrize("kind", ["position", "pose"])
+def test_of_many_markers_some_place_the_base_and_the_others_follow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nearly where all of them would put it; and every marker where it is."""
+    rng = np.random.default_rng(3)
+    markers, each, place = 12, 6, [0.4, -0.3, 0.2, 0.1, -0.2, 0.5]
+    tools = {f"M{k}": np.array([*rng.uniform(-0.1, 0.1, 3), *rng.uniform(-0.5, 0.5, 3)]) for k in range(markers)}
+    q = rng.uniform(-2, 2, (markers * each, ARM.dof))
+    table: dict[str, Any] = {"marker": each * list(tools)} | {f"q{j + 1}_rad": q[:, j] for j in range(ARM.dof)}
+    held = np.array([numeric_frame(tools[name]) for name in table["marker"]])
+    T = numeric_frame(place) @ ro.robot.forward_kinematics(ARM, q) @ held
+    y = T[:, :3, 3] + 5e-5 * rng.normal(size=(len(q), 3))
+    table |= {f"{axis}_m": y[:, i] for i, axis in enumerate("xyz")}
+    noise, known = {"position_mm": 0.05}, 3
+    if kind == "pose":
+        noise, known = noise | {"orientation_mrad": 0.1}, 6
+        xyzw = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+        table |= {f"q{axis}": xyzw[:, i] for i, axis in enumerate("xyzw")}
+    data = ro.read_data(table, ARM, noise, MEASUREMENTS[kind])
+    off = np.array([1e-3, -1e-3, 5e-4, 0, 0, 0])
+    stated = {name: tool + off for name, tool in tools.items()}
+    whole = locate(ARM, data, stated)
+    monkeypatch.setattr(located, "MOST_PLACING", 5)
+    some = locate(ARM, data, stated)
+    for found in (whole, some):
+        assert found.how.startswith("certified")
+        assert found.base == pytest.approx(place, abs=2e-4)
+        for name, tool in tools.items():
+            assert found.tools[name][:known] == pytest.approx(tool[:known], abs=2e-4)
+    assert not np.array_equal(some.base, whole.base)
