@@ -16,6 +16,8 @@ SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
 GRID, STRIDE = 60, 4
 """Weights among which a corner is sought where each takes solving, and every which of them where the path is smooth."""
+TELLING = 500
+"""Norms that tell their median well enough."""
 MET = 1e-3
 """Part of the median residual below which one counts as zero."""
 GOLDEN = (1 + 5**0.5) / 2
@@ -91,7 +93,8 @@ def _about_corners(program: Program, weights: Array, kinks: bool) -> tuple[Array
 def _meets(program: Program, estimate: Estimate) -> bool:
     """Whether an estimate meets a configuration exactly."""
     norms = program.norms(estimate.z)
-    return bool(np.min(norms) <= MET * np.median(norms))
+    usual = np.median(norms[:: max(1, len(norms) // TELLING)])
+    return bool(np.min(norms) <= MET * usual)
 
 
 def _peaks(score: Array) -> np.ndarray:
@@ -229,7 +232,7 @@ class _Curve:
 
     def point(self, t: float) -> Array:
         if t not in self.seen:
-            self.seen[t] = _points(self.program.path([np.exp(t)]))[0]
+            self.seen[t] = _points(self.program.path([np.exp(t)], rough=True))[0]
         return self.seen[t]
 
     def curvature(self, a: float, b: float, c: float) -> float:
