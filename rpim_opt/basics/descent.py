@@ -82,6 +82,8 @@ def descent(
     x = np.clip(start, *box)
     point, radius = ask(x), longest
     yield point
+    if not len(x):
+        return
     H = curvature(point)
     for _ in range(MOST):
         step = _step(x, point.gradient, H, box, radius)

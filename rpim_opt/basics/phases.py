@@ -63,12 +63,14 @@ def beside(workers: int) -> Iterator[Callable[[Callable[..., Any]], Callable[...
     clocks: list[Clock] = []
 
     def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        if running is None or running.busy:
+        if running is None:
             return function
+        inside = running.busy
 
         def timed(*arguments: Any) -> Any:
             with clock() as own:
-                clocks.append(own)
+                if not inside:
+                    clocks.append(own)
                 return function(*arguments)
 
         return timed

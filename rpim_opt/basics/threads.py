@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
@@ -45,27 +45,43 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
         return [function(item) for item in waiting]
     turns = iter(range(len(waiting)))  # each taken by one thread
     answers: dict[int, Answer] = {}
+    errors: dict[int, Exception] = {}
 
     def work() -> None:
         for k in turns:
-            answers[k] = function(waiting[k])
+            try:
+                answers[k] = function(waiting[k])
+            except Exception as error:
+                errors[k] = error
+                _spend(turns)
 
     with beside(workers) as counted:
-        done = [_threads(workers, os.getpid()).submit(counted(work)) for _ in range(workers)]
+        share = counted(work)
+        others: list[Future[None]] = []
+        _worker.busy = True
         try:
-            for each in done:
-                each.result()
-        finally:  # after an error or Ctrl-C, too, nothing goes on
-            for _ in turns:
-                pass
-            wait(done)
+            for _ in range(workers - 1):
+                others.append(_threads(cores(), os.getpid()).submit(share))
+            share()  # here, too: where all others are busy, and wait for what this thread holds, it ends all the same
+        finally:
+            _worker.busy = False
+            _spend(turns)
+            wait([other for other in others if not other.cancel()])
+    if errors:  # turns are taken in order: the first error is always the same
+        raise errors[min(errors)]
     return [answers[k] for k in range(len(waiting))]
 
 
+def _spend(turns: Iterator[int]) -> None:
+    """Leave nothing to do: after an error, or Ctrl-C, nobody goes on."""
+    for _ in turns:
+        pass
+
+
 @lru_cache(maxsize=1)
-def _threads(workers: int, process: int) -> ThreadPoolExecutor:
+def _threads(count: int, process: int) -> ThreadPoolExecutor:
     """Return threads that stay: to start them takes as long as a block. A process has its own, a fork none of them."""
-    return ThreadPoolExecutor(workers, initializer=_begin)
+    return ThreadPoolExecutor(count, initializer=_begin)
 
 
 def _begin() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.blunders import clustered
 from rpim_opt.calibration.families import SESSIONS, WARMTH, members
+from rpim_opt.calibration.learned import Learned
 from rpim_opt.calibration.learning import sampled
 from rpim_opt.calibration.models import compared, extended, restricted, size_names
 from rpim_opt.calibration.outcome import Outcome
@@ -108,11 +109,12 @@ class Comparison:
         """The model that the result has."""
         used = np.isin(self.names, self.own)
         evidence = restricted(self.columns, used)
-        first = [self._start(evidence)]
-        if self.result.learned is None:
+        if self.result.learned is not None:
+            first = [_learned_by(self.result.learned, evidence)]
+        elif few(self.problem):
             first = evidence.starts()
-            if not few(self.problem):
-                first = first[:1]
+        else:
+            first = evidence.starts()[:1]
         return Judged((), self.own, evidence, evidence.mode(first, EXACT)[0])
 
     @cached_property
@@ -168,16 +170,14 @@ class Comparison:
         known = dict(zip(size_names(plain.evidence), plain.point.logs, strict=True))
         return np.array([known.get(name, c) for name, c in zip(size_names(evidence), evidence.centre, strict=True)])
 
-    def _start(self, evidence: Evidence) -> Array:
-        """Return the sizes that a result learned, as far as it did."""
-        learned = self.result.learned
-        logs = evidence.centre.copy()
-        if learned is None:
-            return logs
-        for i, name in enumerate(size_names(evidence)):
-            if name in learned.noise and name in CENTRES:
-                logs[i] = np.log(learned.noise[name].value)
-        return logs
+
+def _learned_by(learned: Learned, evidence: Evidence) -> Array:
+    """Return the sizes that a result learned, as far as it did."""
+    logs = evidence.centre.copy()
+    for i, name in enumerate(size_names(evidence)):
+        if name in learned.noise and name in CENTRES:
+            logs[i] = np.log(learned.noise[name].value)
+    return logs
 
 
 def _trusted(result: Outcome) -> CalibrationProblem:

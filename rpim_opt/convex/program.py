@@ -356,7 +356,8 @@ class Program(Objective):
         found, near = ended
         self._met.keep(weight, near)
         loss, penalty = near.loss + self.model.offset, self._posed.penalty_of(near.z)
-        return Estimate(near.z, weight, loss, penalty, found.duals, iterations=found.iterations)
+        z = near.z.copy()  # whoever writes on it does not write on what the next one begins with
+        return Estimate(z, weight, loss, penalty, found.duals, iterations=found.iterations)
 
     def _on_faces(self, weight: float, damping: Damping | None, start: Array | None = None) -> Estimate:
         """Return the minimum of a penalty with kinks, or where it is not certain the interior point's, if lower."""

@@ -25,8 +25,8 @@ transform = Measurement(
 )
 """The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
 
-MANY = 4096
-"""Functions that are kept: of some hundred reflectors each has its own."""
+MANY = 1024
+"""Functions that are kept, some hundred kB each: of some hundred reflectors each has its own."""
 _READY = frozenset({*READY.values(), transform})
 
 
@@ -89,7 +89,7 @@ class Kept:
         }
 
 
-@lru_cache(maxsize=MANY)
+@lru_cache(maxsize=256)
 def _restored(text: str) -> ca.Function:
     """Return a function that was sent, the same one every time: what was prepared for many rows of it is not lost."""
     return ca.Function.deserialize(text)
@@ -125,7 +125,7 @@ def _ready(structure: Structure, measurement: Measurement) -> Functions:
         return _derived(_expressions(structure, measurement))
 
 
-@lru_cache(maxsize=MANY)
+@lru_cache(maxsize=256)
 def _built(answer: str) -> Functions:
     function = ca.Function.deserialize(answer)
     symbols = function.sx_in()
@@ -144,47 +144,54 @@ def _derived(of: Row) -> Functions:
     }
 
 
-class _Entries(dict[str, Symbol]):
-    """Entries of a vector by name, taken when they are first asked for: a row sees few parameters of many."""
+class _Entries:
+    """Entries of a vector by name, zero where a place is None; a row sees few of many, which are taken as asked for."""
 
-    def __init__(self, vector: ca.SX, places: Mapping[str, int]) -> None:
-        super().__init__()
+    def __init__(self, vector: ca.SX, places: Mapping[str, int | None]) -> None:
         self._vector, self._places = vector, places
 
-    def __missing__(self, name: str) -> Symbol:
-        self[name] = self._vector[self._places[name]] if name in self._places else ca.SX(0)
+    def __getitem__(self, name: str) -> Symbol:
+        place = self._places[name]
+        if place is None:
+            return ca.SX(0)
+        return self._vector[place]
+
+    def get(self, name: str) -> Symbol:
+        """Return an entry, zero where there is none of this name."""
+        if name not in self._places:
+            return ca.SX(0)
         return self[name]
 
 
 @lru_cache(maxsize=16)
-def _places(names: tuple[str, ...], identified: bytes, absent: bytes) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the places of nominal values that are not zero, and of identified parameters among those."""
+def _places(
+    names: tuple[str, ...], identified: bytes, absent: bytes
+) -> tuple[dict[str, int | None], dict[str, int | None]]:
+    """Return the places of nominal values, None where they are zero, and of deviations, None where they are none."""
+    start: dict[str, int | None] = {name: i for i, name in enumerate(names)}
+    start.update((names[i], None) for i in np.flatnonzero(np.frombuffer(absent, dtype=bool)))
     free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
-    present = np.flatnonzero(~np.frombuffer(absent, dtype=bool))
-    return {names[i]: int(i) for i in present}, {names[i]: k for k, i in enumerate(free)}
+    return start, dict.fromkeys(names) | {names[i]: k for k, i in enumerate(free)}
 
 
 class _Parameters(NamedTuple):
-    """The parameters of a row by name: where they start, and the deviations of those that are identified.
-
-    Zero where there is none of a name.
-    """
+    """The parameters of a row by name: where they start, and the deviations of those that are identified."""
 
     x: ca.SX
     nominal: ca.SX
-    start: Mapping[str, Symbol]
-    deviation: Mapping[str, Symbol]
+    start: _Entries
+    deviation: _Entries
 
     @classmethod
     def of(cls, names: tuple[str, ...], identified: bytes, absent: bytes) -> _Parameters:
-        present, free = _places(names, identified, absent)
-        x = ca.SX.sym("x", len(free))
+        start, deviation = _places(names, identified, absent)
+        x = ca.SX.sym("x", sum(place is not None for place in deviation.values()))
         nominal = ca.SX.sym("nominal", len(names))
-        return cls(x, nominal, _Entries(nominal, present), _Entries(x, free))
+        return cls(x, nominal, _Entries(nominal, start), _Entries(x, deviation))
 
     def value(self, name: str) -> Symbol:
-        """Return a parameter."""
-        return self.start[name] + self.deviation[name]
+        """Return a parameter, zero where there is none of this name."""
+        return self.start.get(name) + self.deviation.get(name)
 
     def place(self, prefix: str) -> list[ca.SX]:
         """Return the factors of the frame whose six parameters begin with a prefix."""
@@ -193,8 +200,10 @@ class _Parameters(NamedTuple):
 
     def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> list[ca.SX]:
         """Return the factors of one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
-        start = [ca.dot(chosen, ca.vertcat(*(self.start[p + c] for p in prefixes))) for c in FRAME]
-        moved = [ca.dot(chosen, ca.vertcat(*(self.deviation[p + c] for p in prefixes))) for c in FRAME]
+        start, moved = (
+            [ca.dot(chosen, ca.vertcat(*(of.get(p + c) for p in prefixes))) for c in FRAME]
+            for of in (self.start, self.deviation)
+        )
         return placed(start, moved)
 
 

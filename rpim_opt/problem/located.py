@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from rpim_opt.problem.placing import (
 )
 from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers
 from rpim_opt.robot.mdh import Robot
+
+if TYPE_CHECKING:
+    from rpim_opt.problem.verdict import CertifiedStart
 
 ENOUGH = 2000
 """Rows of a measurement from which frames are placed, where there are more."""
@@ -45,8 +48,9 @@ class Located(NamedTuple):
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
 
-    All of them together by `certified_hand_eye`. Where the rotations are not determined by that, closed forms say what
-    they can: poses by `hand_eye`; of positions, distances correct the reflectors and registration places the base.
+    All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where the
+    rotations are not determined by that, closed forms say what they can: poses by `hand_eye`; of positions, distances
+    correct the reflectors and registration places the base.
 
     Raises
     ------
@@ -68,22 +72,13 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
 
 def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
     """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
-    from rpim_opt.problem.certified import certified_hand_eye  # CVXPY waits until a base is located
-
-    placing = _most(seen, MOST_PLACING)
-    turning = _most([b for b in seen if b.measurement.name == "pose" and b.markers[0] in placing], MOST_TURNING)
-    asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
-    sigma = np.concatenate([_deviations(block) for block, _ in asked])
-    start = certified_hand_eye(
-        np.concatenate([flange for _, flange in asked]),
-        np.concatenate([_measured(block, block.markers[0] in turning) for block, _ in asked]),
-        marker=[block.markers[0] for block, _ in asked for _ in block.row],
-        sigma=(sigma[:, 0], sigma[:, 1]),
-        expected=places,
-        spread=TOOL_ERROR,
-    )
-    if start.uncertainty > FREE:
-        raise InputError("the data", start.reason, "turns about two axes")
+    turning = _most([block for block in seen if block.measurement.name == "pose"], MOST_TURNING)
+    try:
+        start = _started(seen, flanges, places, turning | _most(seen, MOST_PLACING), turning)
+    except InputError:  # where every configuration shows other markers, it takes all of them
+        if len(places) <= MOST_PLACING:
+            raise
+        start = _started(seen, flanges, places, set(places), turning)
     base = start.bases[""]
     found = _seen_from(base, seen, flanges, places)
     for marker, tool in start.tools.items():
@@ -97,6 +92,27 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
             found[block.markers[0]] = frame_numbers(tool)
     verdict = "certified" if start.certified else "not certified"
     return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+
+
+def _started(
+    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
+) -> CertifiedStart:
+    """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
+    from rpim_opt.problem.certified import certified_hand_eye  # CVXPY waits until a base is located
+
+    asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
+    sigma = np.concatenate([_deviations(block) for block, _ in asked])
+    start = certified_hand_eye(
+        np.concatenate([flange for _, flange in asked]),
+        np.concatenate([_measured(block, block.markers[0] in turning) for block, _ in asked]),
+        marker=[block.markers[0] for block, _ in asked for _ in block.row],
+        sigma=(sigma[:, 0], sigma[:, 1]),
+        expected=places,
+        spread=TOOL_ERROR,
+    )
+    if start.uncertainty > FREE:
+        raise InputError("the data", start.reason, "turns about two axes")
+    return start
 
 
 def _seen_from(

@@ -363,6 +363,19 @@ def test_a_first_minimum_is_looked_for_where_it_is_said_to_be(name: str, over: s
     assert near.iterations < far.iterations
 
 
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_who_writes_on_an_estimate_writes_on_nothing_else(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(newton, "DEAR", 0)
+    program = ro.convex.pose(stated(name, over), MODEL)
+    first = program.solve(0.5)
+    objective = first.objective
+    first.z[:] *= 1e3
+    again = program.solve(0.5)
+    assert program.objective(again.z, 0.5) == pytest.approx(objective, rel=1e-9)
+
+
 def test_a_program_without_some_configurations_is_that_of_the_others() -> None:
     """Whatever unknowns it is solved in."""
     out = MODEL.group % 4 == 1
