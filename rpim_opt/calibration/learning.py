@@ -85,6 +85,22 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
 def _found(problem: Source, prior: Prior, model: str, start: Array | None, noise: tuple[str, ...]) -> Found:
     every = sampled(problem)
     learning, whole, doubt = _believed(every, prior, noise, _begin(every, start))
+    fit, trials, blunders = _without_blunders(every, learning, whole, model)
+    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
+    if not problem.keeps_rows or len(every.data) < len(problem.labels):
+        blunders = beyond(laid, fit.x)
+    if blunders:
+        laid = laid.without(blunders)
+    worst = tuple(LeftOut(*item) for item in sorted(blunders.items(), key=lambda item: -item[1]))
+    stated = set(every.parameters.free.names)
+    added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
+    return Found(laid, _learned(fit, added, trials, worst, doubt), learning.inside(fit.problem, fit.point), fit.x)
+
+
+def _without_blunders(
+    every: CalibrationProblem, learning: Learning, whole: Fit, model: str
+) -> tuple[Fit, tuple[Trial, ...], dict[str, float]]:
+    """Return the fit without the rows that no model makes believable, the models compared, and those rows."""
     blunders = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = _explained(learning, whole, blunders, model)
     for _ in range(LOOKS):  # what families explain, and the worst blunders, stood before the smaller ones
@@ -101,15 +117,7 @@ def _found(problem: Source, prior: Prior, model: str, start: Array | None, noise
         if left.keys() != blunders.keys():
             blunders = left
             fit, trials = _explained(learning, whole, blunders, model)
-    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
-    if not problem.keeps_rows or len(every.data) < len(problem.labels):
-        blunders = beyond(laid, fit.x)
-    if blunders:
-        laid = laid.without(blunders)
-    worst = tuple(LeftOut(*item) for item in sorted(blunders.items(), key=lambda item: -item[1]))
-    stated = set(every.parameters.free.names)
-    added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
-    return Found(laid, _learned(fit, added, trials, worst, doubt), learning.inside(fit.problem, fit.point), fit.x)
+    return fit, trials, blunders
 
 
 def _believed(

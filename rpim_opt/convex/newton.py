@@ -274,7 +274,7 @@ class Newton(Whitened):
         along = point.along
         if along is None:
             along = self.at.rows.T.dot(point.smooth.slope)
-        return point._replace(along=along), self.unit * (along + 2 * self.pull * point.a)
+        return point._replace(along=along), self.penalized(point.a, along)
 
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
         gap, by_z = self.bound(point.z, point.a, slope)

@@ -101,12 +101,12 @@ class Statement:
         missing = [name for name in self.names if name not in here]
         if missing and (not self.whole or len(missing) == len(self.names)):
             raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
-        have = [parameters.dimensions[here[name]] for name in self.names if name in here]
-        said = [d for name, d in zip(self.names, self.dimensions, strict=True) if name in here]
-        for name, dimension, other in zip([n for n in self.names if n in here], have, said, strict=True):
-            if other not in (dimension, ""):
-                raise InputError(self.where, f"a unit of {other} for '{name}'", f"one of {dimension}")
-        if "" in said and len(set(have)) > 1:
+        stated = [each for each in zip(self.names, self.dimensions, strict=True) if each[0] in here]
+        have = [parameters.dimensions[here[name]] for name, _ in stated]
+        for (name, said), dimension in zip(stated, have, strict=True):
+            if said not in (dimension, ""):
+                raise InputError(self.where, f"a unit of {said} for '{name}'", f"one of {dimension}")
+        if len(set(have)) > 1 and any(said == "" for _, said in stated):
             raise InputError(self.where, f"a sum of {' and '.join(sorted(set(have)))}", "parameters of one dimension")
         return here
 

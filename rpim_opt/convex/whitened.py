@@ -161,7 +161,11 @@ class Whitened:
 
     def slope(self, a: Array, of_loss: Array) -> Array:
         """Return the objective's slope by the coordinates in their units, (p,), from the loss's (m,)."""
-        return self.unit * (self.at.rows.T.dot(of_loss) + 2 * self.pull * a)
+        return self.penalized(a, self.at.rows.T.dot(of_loss))
+
+    def penalized(self, a: Array, along: Array) -> Array:
+        """Return the same from the loss's by the coordinates (p,)."""
+        return self.unit * (along + 2 * self.pull * a)
 
     def bound(self, z: Array, a: Array, slope: Array) -> tuple[float, Array | None]:
         """Return by how much a minorant of that slope (p,) may fall at most, and its slope by z (n,) in a box."""

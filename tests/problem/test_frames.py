@@ -168,3 +168,45 @@ def test_of_many_markers_some_place_the_base_and_the_others_follow(kind: str, mo
         for name, tool in tools.items():
             assert found.tools[name][:known] == pytest.approx(tool[:known], abs=2e-4)
     assert not np.array_equal(some.base, whole.base)
+
+
+def once_each(markers: int, each: int) -> tuple[ro.Dataset, dict[str, np.ndarray]]:
+    """Markers that are seen once each, so many in a configuration, and where they are stated."""
+    rng = np.random.default_rng(4)
+    tools = {f"M{k}": np.array([*rng.uniform(-0.1, 0.1, 3), 0, 0, 0]) for k in range(markers)}
+    q = np.repeat(rng.uniform(-2, 2, (markers // each, ARM.dof)), each, axis=0)
+    held = np.array([numeric_frame(tool) for tool in tools.values()])
+    y = (numeric_frame([0.4, -0.3, 0.2, 0.1, -0.2, 0.5]) @ ro.robot.forward_kinematics(ARM, q) @ held)[:, :3, 3]
+    table: dict[str, Any] = {"marker": list(tools)} | {f"q{j + 1}_rad": q[:, j] for j in range(ARM.dof)}
+    table |= {f"{axis}_m": y[:, i] for i, axis in enumerate("xyz")}
+    return ro.read_data(table, ARM, {"position_mm": 0.05}), tools
+
+
+def test_where_some_markers_do_not_tell_the_base_all_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of one configuration leave a turn about the line between them."""
+    data, tools = once_each(24, 3)
+    whole = locate(ARM, data, tools)
+    assert "closed forms" not in whole.how
+    monkeypatch.setattr(located, "MOST_PLACING", 2)
+    asked = []
+    started = located._started
+    monkeypatch.setattr(located, "_started", lambda *given: asked.append(len(given[3])) or started(*given))
+    some = locate(ARM, data, tools)
+    assert asked == [2, 24]
+    assert np.array_equal(some.base, whole.base)
+
+
+def test_markers_that_turn_place_the_base_however_few_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    some = np.arange(5)
+    blocks = [ro.load("markers").problem.data.blocks[0], ro.load("pose").problem.data.blocks[0].take(some, some)]
+    monkeypatch.setattr(located, "MOST_PLACING", 1)
+    asked: list[set[str]] = []
+
+    def refused(*given: Any) -> None:
+        asked.append(given[3])
+        raise ro.InputError("the data", "asked", "nothing")
+
+    monkeypatch.setattr(located, "_started", refused)
+    with pytest.raises(ro.InputError, match="asked"):
+        located._certified(blocks, [np.zeros((25, 4, 4)), np.zeros((5, 4, 4))], {"A": np.zeros(6), "": np.zeros(6)})
+    assert asked == [{"A", ""}, {"A", ""}]
