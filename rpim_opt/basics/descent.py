@@ -112,7 +112,7 @@ def _step(x: Array, gradient: Array, H: Array, box: tuple[Array, Array], radius:
     metric = _positive(H)
     while free.any():
         onward = np.zeros(len(x))
-        onward[free] = np.linalg.solve(metric[np.ix_(free, free)], -(gradient + metric @ step)[free])
+        onward[free] = np.linalg.solve(metric[free][:, free], -(gradient + metric @ step)[free])
         room = np.where(onward > 0, high, low) - step
         beyond = np.abs(onward) > np.abs(room)
         if not beyond.any():

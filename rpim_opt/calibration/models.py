@@ -58,17 +58,14 @@ def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, 
     columns = learning.evidence(whole, x)
     names = whole.parameters.free.names
     own = set(fit.problem.parameters.free.names)
-    before = [_named(fit.evidence, fit.point)]
-    if fit.several:
-        before += [_named(fit.evidence, other) for other in fit.others]
+    before = _named(fit.evidence, fit.point)
     sizes: dict[frozenset[str], dict[str, float]] = {}
 
     def tried(candidate: tuple[str, ...]) -> tuple[float, tuple[str, ...], Point]:
         used = own.union(*(families[family] for family in candidate))
         evidence = restricted(columns, np.array([name in used for name in names]))
         conditions = frozenset(candidate).intersection(CONDITIONS)
-        first = [sizes.get(conditions, before[0]), *before[1:]]
-        point = evidence.mode([start for one in first for start in _starts(evidence, one)], COMPARED)[0]
+        point = evidence.mode(_starts(evidence, sizes.get(conditions, before)), COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
             sizes[conditions] = _named(evidence, point)
         return point.value + GAIN * _questions(candidate), candidate, point

@@ -147,26 +147,25 @@ class Learning:
         rounds
             How often the evidence is asked.
         """
-        fit = self._once(problem, x, before, several=before is None, steps=STEPS)
+        fit = self._once(problem, x, [] if before is None else [before], STEPS)
         for k in range(1, rounds):
-            several = before is None and fit.several
-            again = self._once(problem, fit.x, fit.point.logs, several, STEPS * 2**k)
+            known = [fit.point.logs]
+            if k == 1 and fit.several:
+                known += [other.logs for other in fit.others]
+            again = self._once(problem, fit.x, known, STEPS * 2**k)
             moved = _moved(again.x, fit.x, again.laid)
             resized = np.abs(again.point.logs - fit.point.logs).max()
-            before = fit.point.logs  # other sides were tried twice
             fit = replace(again, others=again.others or fit.others)
             if resized <= SAME_SIZE and moved <= SAME_PLACE:
                 break
         return fit
 
-    def _once(self, problem: CalibrationProblem, x: Array, before: Array | None, several: bool, steps: int) -> Fit:
-        """Return sizes at one linearization, and the deviations that they lead to."""
+    def _once(self, problem: CalibrationProblem, x: Array, known: Sequence[Array], steps: int) -> Fit:
+        """Return sizes at one linearization, from known ones (s,) on if any, and the deviations that they lead to."""
         evidence = self.evidence(problem, x)
-        starts = [] if before is None else [before]
-        if several and few(problem):
-            starts += evidence.starts()
+        starts = known or evidence.starts()[: None if few(problem) else 1]
         with phase("selection"):
-            point, *others = evidence.mode(starts or evidence.starts()[:1])
+            point, *others = evidence.mode(starts)
         laid = self.laid(problem, evidence, point, x)
         stated = self.stated(problem)
         mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)

@@ -159,13 +159,29 @@ class Slopes:
 
 @dataclass(frozen=True, eq=False)
 class _Whitened:
-    """One stack at some noise: L^-1 X, L^-1 y, L^-1 with L L' the covariance, and its log determinant."""
+    """One stack of N configurations at some noise, L L' its covariances (N, k, k).
 
-    stack: Stack
-    inverse: Array
+    Parameters
+    ----------
+    X, y
+        (N k, p) and (N k,): L^-1 times the equations.
+    noise
+        (s, N, k, k): L^-1 dR L^-T by the logarithm of every noise that is to be found.
+    logdet
+        Of the covariances.
+    """
+
     X: Array
     y: Array
+    noise: Array
     logdet: float
+
+    def noises(self, z: Array, C: Array) -> tuple[Array, Array]:
+        """Return L^-1 dR L^-T L^-1 (y - X z) (s, N k), and the diagonal blocks of L^-1 X C X'L^-T (N, k, k)."""
+        s, N, k, _ = self.noise.shape
+        moved = self.noise @ (self.y - self.X @ z).reshape(N, k, 1)
+        blocks = (self.X @ C).reshape(N, k, -1) @ self.X.reshape(N, k, -1).transpose(0, 2, 1)
+        return moved.reshape(s, N * k), blocks
 
 
 class _Informed(NamedTuple):
@@ -248,15 +264,14 @@ class Evidence:
         off = self.root @ (logs - self.centre)
         gradient = 2 * off @ self.root
         gradient[: len(b.names)] += self._by_size(e2, size2, v)
-        gradient[len(b.names) :] += self._by_noise(logs, whitened, z, C)
+        gradient[len(b.names) :] += self._by_noise(whitened, z, C)
         return Point(value + float(off @ off), gradient, z, C, v, logs)
 
     def tails(self, point: Point) -> Array:
         """Return by what deviations move (p, h) beside `Point.C`: D, with D D' what Student's tails add to it."""
         b = self.believed
-        heavy = np.flatnonzero(b.heavy & ~b.replaced)
-        size = np.sqrt(self._size2(point.logs)[heavy])
-        return added(point.z, point.C, point.v, heavy, size, b.tails)
+        size = np.sqrt(self._size2(point.logs)[self._heavy])
+        return added(point.z, point.C, point.v, self._heavy, size, b.tails)
 
     def _informed(self, logs: Array) -> _Informed:
         """Return what the data say at a noise; the last one is kept, as often only sizes of deviations change."""
@@ -280,12 +295,19 @@ class Evidence:
     def _whiten(self, scatter: Scatter) -> list[_Whitened]:
         p = self.data.X.shape[1]
         parts = []
-        for stack, X, y in self._stacked:
+        twice = 2 * np.array([getattr(scatter, kind) for kind in self.noise])[:, None, None, None] ** 2
+        for stack, X, y, shares in self._stacked:
             L = np.linalg.cholesky(stack.covariance(scatter))
             inverse = np.asarray(np.linalg.inv(L), dtype=float)
             logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-            parts.append(_Whitened(stack, inverse, (inverse @ X).reshape(-1, p), (inverse @ y).ravel(), logdet))
+            noise = inverse @ (twice * shares) @ inverse.transpose(0, 2, 1)
+            parts.append(_Whitened((inverse @ X).reshape(-1, p), (inverse @ y).ravel(), noise, logdet))
         return parts
+
+    @cached_property
+    def _heavy(self) -> np.ndarray:
+        """Which deviations have local variances."""
+        return np.flatnonzero(self.believed.heavy & ~self.believed.replaced)
 
     @cached_property
     def _light(self) -> np.ndarray:
@@ -293,8 +315,14 @@ class Evidence:
         return np.flatnonzero(~self.believed.heavy | self.believed.replaced)
 
     @cached_property
-    def _stacked(self) -> list[tuple[Stack, Array, Array]]:
-        return [(stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None]) for stack in self.data.stacks]
+    def _stacked(self) -> list[tuple[Stack, Array, Array, Array]]:
+        """The stacks, their equations (N, k, p) and (N, k, 1), and what a unit of every noise adds (s, N, k, k)."""
+        found = []
+        for stack in self.data.stacks:
+            N, k = stack.index.shape
+            shares = np.array([_share(stack, kind) for kind in self.noise]).reshape(-1, N, k, k)
+            found.append((stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None], shares))
+        return found
 
     def _size2(self, logs: Array) -> Array:
         """Return the square of every deviation's size (p,)."""
@@ -303,14 +331,14 @@ class Evidence:
 
     def _settled(self, H: Array, h: Array, size2: Array, v: Array, settled: float) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v, which determine each other."""
-        b = self.believed
-        heavy = np.flatnonzero(b.heavy & ~b.replaced)
-        v = np.where(b.heavy & ~b.replaced, v, size2)
-        own = np.where(b.replaced, 0.0, 1.0)
+        heavy = self._heavy
+        local = v[heavy]
+        v = size2.copy()
+        own = np.where(self.believed.replaced, 0.0, 1.0)
         if len(heavy):
             # the others' variances stay: their share of the information is taken out once
             S, g = _without(H, h, own / v, heavy, self._light)
-            v[heavy] = self._local(S, g, size2[heavy], v[heavy], settled)
+            v[heavy] = self._local(S, g, size2[heavy], local, settled)
         return *_posterior(H, h, own / v), v
 
     def _local(self, S: Array, g: Array, size2: Array, v: Array, settled: float) -> Array:
@@ -338,11 +366,8 @@ class Evidence:
 
     def _tails(self, e2: Array, size2: Array, v: Array) -> float:
         """Return what heavy tails add to -2 ln L."""
-        heavy = self.believed.heavy & ~self.believed.replaced
         nu = self.believed.tails
-        if not heavy.any():
-            return 0.0
-        e2, t2, v = e2[heavy], size2[heavy], v[heavy]
+        e2, t2, v = e2[self._heavy], size2[self._heavy], v[self._heavy]
         return float(np.sum((nu + 1) * np.log((nu * t2 + e2) / (nu + 1)) - nu * np.log(t2) + 1 - e2 / v))
 
     def _by_size(self, e2: Array, size2: Array, v: Array) -> Array:
@@ -354,26 +379,16 @@ class Evidence:
         sized = (b.group >= 0) & ~b.replaced
         return np.asarray(np.bincount(b.group[sized], slope[sized], minlength=len(b.names)), dtype=float)
 
-    def _by_noise(self, logs: Array, whitened: Sequence[_Whitened], z: Array, C: Array) -> Array:
+    def _by_noise(self, whitened: Sequence[_Whitened], z: Array, C: Array) -> Array:
         """Return the gradient by the logarithms of the noise: 2 s^2 [tr(Q K) - u'K u], Q = R^-1 - R^-1 X C X'R^-1."""
-        variance = np.exp(2 * logs[len(self.believed.names) :])
         total = np.zeros(len(self.noise))
         if not self.noise:
             return total
-        for part, shares in zip(whitened, self._shares, strict=True):
-            N, k = part.stack.index.shape
-            back = part.inverse.transpose(0, 2, 1)
-            u = (back @ (part.y - part.X @ z).reshape(N, k, 1))[:, :, 0]
-            WX = part.X.reshape(N, k, -1)
-            Q = np.eye(k) - WX @ (part.X @ C).reshape(N, k, -1).transpose(0, 2, 1)
-            Q = back @ Q @ part.inverse
-            total += [float(np.sum(Q * K) - np.sum((K @ u[:, :, None])[:, :, 0] * u)) for K in shares]
-        return 2 * variance * total
-
-    @cached_property
-    def _shares(self) -> list[Array]:
-        """What a unit of every noise adds to the covariances of each stack (s, N, k, k)."""
-        return [np.array([_share(stack, kind) for kind in self.noise]) for stack in self.data.stacks]
+        for part in whitened:
+            moved, blocks = part.noises(z, C)
+            k = blocks.shape[1]
+            total += part.noise.reshape(len(total), -1) @ (np.eye(k) - blocks).ravel() - moved @ (part.y - part.X @ z)
+        return total
 
     def slopes(self, point: Point) -> Slopes:
         """Return how a point of `at` changes with the logarithms of its sizes.
@@ -402,12 +417,12 @@ class Evidence:
         own = np.where(b.replaced, 0.0, 1 / v)
         of_size = np.where((b.group[:, None] == np.arange(len(point.logs))) & ~b.replaced[:, None], 2.0, 0.0)
         follows = C * (C + 2 * np.outer(z, z)) * own
-        heavy = np.flatnonzero(b.heavy & ~b.replaced)
+        heavy = self._heavy
         moved = of_size.copy()  # of ln v
         moved[heavy] = 0.0
         if len(heavy):
             wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ moved
-            system = np.diag((tails + 1) * v[heavy]) - follows[np.ix_(heavy, heavy)]
+            system = np.diag((tails + 1) * v[heavy]) - follows[heavy][:, heavy]
             moved[heavy] = np.linalg.solve(system, wanted)
         slopes = 2 * ((z**2 + C.diagonal())[:, None] * of_size - direct - follows @ moved) / v[:, None]
         slopes[heavy] = 2 * tails * (size2 / v)[heavy, None] * (of_size - moved)[heavy]
@@ -432,16 +447,13 @@ class Evidence:
         S, f, among = np.zeros((s, p, p)), np.zeros((s, p)), np.zeros((s, s))
         if not s:
             return S, f, among
-        twice = 2 * np.exp(2 * point.logs[len(self.believed.names) :])
-        for part, shares in zip(self._informed(point.logs).parts, self._shares, strict=True):
-            N, k = part.stack.index.shape
-            X = part.X.reshape(N, k, p)
-            W = part.inverse @ (twice[:, None, None, None] * shares) @ part.inverse.transpose(0, 2, 1)
-            Wu = (W @ (part.y - part.X @ z).reshape(N, k, 1)).reshape(s, N * k)
-            S += part.X.T @ (W @ X).reshape(s, N * k, p)
-            f += Wu @ part.X
-            within = np.eye(k) - 2 * X @ (part.X @ C).reshape(N, k, p).transpose(0, 2, 1)
-            among += 2 * Wu @ Wu.T - W.reshape(s, -1) @ (within @ W).reshape(s, -1).T
+        for part in self._informed(point.logs).parts:
+            moved, blocks = part.noises(z, C)
+            N, k, _ = blocks.shape
+            S += part.X.T @ (part.noise @ part.X.reshape(N, k, p)).reshape(s, N * k, p)
+            f += moved @ part.X
+            weighed = (np.eye(k) - 2 * blocks) @ part.noise
+            among += 2 * moved @ moved.T - part.noise.reshape(s, -1) @ weighed.reshape(s, -1).T
         return S, f, among
 
     def mode(self, starts: Sequence[Array], tolerance: float = 1e-8) -> list[Point]:
@@ -550,10 +562,10 @@ def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.
     """
     if not len(others):
         return H, h
-    factor, d = _factored(H[np.ix_(others, others)], precision[others])
-    right = np.column_stack([H[np.ix_(others, kept)], h[others]]) * d[:, None]
+    factor, d = _factored(H[others][:, others], precision[others])
+    right = np.column_stack([H[others][:, kept], h[others]]) * d[:, None]
     Y, _ = _trtrs(factor, right, lower=1)
-    return H[np.ix_(kept, kept)] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
+    return H[kept][:, kept] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
 
 
 def _share(stack: Stack, kind: str) -> Array:
