@@ -31,8 +31,8 @@ TELLING = 300
 """Rows a coordinate that tell a second derivative to about a tenth, 2 / sqrt(300), as the first one of a descent."""
 STRIDES = (1, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
 """Of every so many groups one is taken: odd primes, which meet all robots and reflectors that take turns."""
-SLOW = 0.3
-"""Part of the gap that a step with an old second derivative may leave."""
+SLOW = 0.05
+"""Part of what a step with an old second derivative promises that it may leave."""
 ROUND = 1e-12
 """Changes of slope below this part of what lengths allow tell nothing."""
 
@@ -160,24 +160,23 @@ class Newton(Whitened):
         for steps in range(1, MOST):
             if best.will_do(ENOUGH, hasty):
                 break
-            exact = False
+            anew = bent is None
             if bent is None:
                 bent = self._hessian(point, every)
-                exact = every == 1
-                every = 1
             if self._close(slope, bent, ended):
                 return self._with(ended._replace(close=True), bent, point)
             ahead = self._stepped(point, slope, bent)
+            exact = anew and every == 1
             if exact and ahead is point:
                 break
+            left = self._left(slope, bent, ended)
             ahead, slope_ahead = self._with_slope(ahead)
-            gap = ended.gap
             ended = self._judged(ahead, slope_ahead, steps)
             best.meets(ended)
-            if exact or ended.gap <= SLOW * gap:
-                bent = self._updated(bent, point, ahead, slope_ahead - slope)
-            else:
+            bent = self._updated(bent, point, ahead, slope_ahead - slope)
+            if not exact and not self._left(slope_ahead, bent, ended) <= SLOW * left:
                 bent = None
+                every = 1 if anew else self._stride
             point = ahead
             slope = slope_ahead
         return self._with(best.ended, bent, point)
@@ -212,6 +211,12 @@ class Newton(Whitened):
         if failed:
             return np.inf
         return 0.5 * float(slope @ _potrs(factor, slope)[0])
+
+    def _left(self, slope: Array, bent: Array, ended: Ended) -> float:
+        """Return about by how much the objective would fall: as promised, or in a box the gap."""
+        if self.box is not None:
+            return ended.gap
+        return self._promised(slope, bent)
 
     def _updated(self, bent: Array, before: Point, after: Point, change: Array) -> Array:
         """Return the loss's second derivative so that it explains by how much the objective's slope has changed."""
