@@ -72,6 +72,11 @@ class Choosing:
             return self
         return replace(self, weight=NEUTRAL, settled=True)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a selector is to be asked where the weight that the loop began with leads."""
+        return self.settled and not self.final and not self.answers
+
     def asked(self, program: Program) -> Choosing:
         """Return what the selector makes of a program, unless the weight is settled."""
         if self.settled or self.rule is None:

@@ -48,6 +48,8 @@ LONG = 10
 """Passes after which an objective that did not fall is taken to be the least; the certificate judges that."""
 FEW = 10
 """Passes that are too few to begin with a weight that no selector was asked for."""
+NEAR = 0.01
+"""Part of the solution that the first weight's next step may be when the selector is asked: it would not tell."""
 QUIET = 3
 """Passes in a row in which a program promises nothing beyond its accuracy: then it will not."""
 PENALTY = 10.0
@@ -144,7 +146,7 @@ class Loop:
         return replace(state, choice=choice, merit=merit, quiet=0, outcome="")
 
     def answered(self, state: State) -> State:
-        """Ask a selector that was not asked yet when the passes ran out."""
+        """Ask a selector that was not asked yet."""
         choice = state.choice
         if choice.final or choice.answers:
             return state
@@ -172,6 +174,8 @@ class Loop:
         quiet = state.quiet + 1 if nothing else 0
         if state.choice.settled and (promised <= best or quiet >= QUIET or self._stalled(state)):
             return replace(state, outcome="rest")
+        if state.choice.waiting and state.damping == 0 and length <= NEAR * (1 + float(np.linalg.norm(state.z))):
+            return self.answered(replace(state, quiet=0))
         return self._tried(replace(state, quiet=quiet), straight, promised, short, nothing)
 
     def _tried(self, state: State, straight: Array, promised: float, short: bool, nothing: bool) -> State:
