@@ -200,7 +200,10 @@ class Loop:
         """Return the minimum (n,) of a convex program, damped as the state says."""
         weight = state.choice.weight
         with phase("solve"):
-            estimate = program.solve(weight, damping=_term(state), **self.solver)
+            if state.choice.waiting and state.damping == 0 and not any(self.solver.values()):
+                estimate = program.path([weight], rough=True)[0]  # a rule is asked beside it
+            else:
+                estimate = program.solve(weight, damping=_term(state), **self.solver)
         return program.inside(estimate.z, state.z, weight)
 
     def _bent(self, state: State, straight: Array) -> Array:

@@ -213,6 +213,25 @@ def test_the_objective_follows_the_weight() -> None:
     assert loop().chosen(given).merit == -1.0
 
 
+@pytest.mark.parametrize(("away", "damping", "asks"), [(0.001, 0.0, True), (0.001, 1.0, False), (0.05, 0.0, False)])
+def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, damping: float, asks: bool) -> None:
+    """By the next step's share of the solution; a damped one tells nothing."""
+    program = state(formulation=ro.robust).program
+    z = ro.calibrate(PROBLEM, ro.robust, 1.0).z * (1 + away)
+    there = program.on(PROBLEM.linearize(PROBLEM.parameters.free.scale * z))
+    length = np.linalg.norm(there.solve(1.0).z - z) / (1 + np.linalg.norm(z))
+    assert (length < 0.01) == (away < 0.01)
+    choice = choosing(answering(5.0), True).begun(there)
+    before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, quiet=2)
+    before = replace(before, merit=_merit(there, z, 1.0))
+    after = loop(formulation=ro.robust).advanced(before)
+    assert after.choice.answers == ((5.0,) if asks else ())
+    if asks:
+        assert np.array_equal(after.z, z)
+        assert (after.choice.weight, after.outcome, after.quiet) == (5.0, "", 0)
+        assert after.merit == pytest.approx(there.objective(z, 5.0), rel=1e-12)
+
+
 def test_at_rest_a_weight_is_asked_for_once_more() -> None:
     def resting(*weights: float, outcome: str = "rest") -> State:
         choice = choosing(answering(2.0, *weights), True).asked(state().program).after(0.0)
