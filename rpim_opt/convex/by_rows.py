@@ -66,7 +66,7 @@ def _method(objective: Objective, weight: float, damping: Damping | None, rough:
         method = Worst(loss, at, weight, box, rough)
     else:
         method = Newton(loss, at, weight, box, rough)
-    if not at.rows.shape[1] or (box is not None and not method.whole):
+    if not at.B.shape[1] or (box is not None and not method.whole):
         return None
     return method
 
@@ -92,4 +92,4 @@ def _damped(objective: Objective, weight: float, damping: Damping) -> Coordinate
         L.append(np.sqrt(weight) * form.matrix)
         c.append(np.sqrt(weight) * form.c)
     both = Quadratic(np.vstack(L), np.concatenate(c))
-    return coordinates(objective.model, both, objective.order)
+    return coordinates(objective.model, both, objective.order, multiplied=objective.separated is None)

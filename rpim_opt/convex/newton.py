@@ -149,8 +149,8 @@ class Newton(Whitened):
     def _by_secants(self, point: Point, hasty: bool = False) -> Ended:
         """Return the minimum of a smooth loss with few second derivatives: with a neighbour's, and what slopes tell.
 
-        Broyden, Fletcher, Goldfarb and Shanno's update after every step; where the gap does not fall fast with that,
-        it is computed anew, first from some of the rows, then from all.
+        Broyden, Fletcher, Goldfarb and Shanno's update after every step; where what steps promise does not fall fast
+        with that, it is computed anew from some of the rows, and where that did not help, from all.
         """
         bent = self._known(point)
         every = self._stride
@@ -232,7 +232,7 @@ class Newton(Whitened):
     def _placed(self, z: Array, kinked: Kinked | None) -> Point:
         """Return the point at z (n,), or the one beside it that the coordinates can say."""
         z, a = self.placed(z)
-        r = self.at.rows @ a - self.at.b
+        r = self.at.by_row(a) - self.at.b
         kinked = kinked or self._begun(r)
         return Point(z, a, r, kinked, self.loss.smoothed(r, *kinked[:2]))
 
@@ -278,7 +278,7 @@ class Newton(Whitened):
         """Return the point, which then knows its loss's slope, and what `_slope` says there."""
         along = point.along
         if along is None:
-            along = self.at.rows.T.dot(point.smooth.slope)
+            along = self.at.along(point.smooth.slope)
         return point._replace(along=along), self.penalized(point.a, along)
 
     def _judged(self, point: Point, slope: Array, steps: int) -> Ended:
@@ -332,8 +332,8 @@ class Newton(Whitened):
     @property
     def _stride(self) -> int:
         """Of every so many groups one is enough to tell the second derivative roughly."""
-        count, p = self.at.rows.shape
-        return max((k for k in STRIDES if k * TELLING * p <= count), default=1)
+        count = len(self.at.rows)
+        return max((k for k in STRIDES if k * TELLING * len(self.unit) <= count), default=1)
 
     def _hessian(self, point: Point, every: int = 1) -> Array:
         """Return the second derivative (p, p) of the smoothed loss by the coordinates, from one of so many groups."""
@@ -345,25 +345,28 @@ class Newton(Whitened):
         for curvature in curvatures:
             if len(curvature.along):
                 H += self._along(curvature, every)
-        return H
+        return self.at.turned(H)
 
     def _across(self, across: Array, every: int) -> Array:
-        """Return what curvatures of the equations add."""
+        """Return what curvatures of the equations add, by what the rows are."""
         rows = self.at.rows
         if every == 1:
             return weighed_squares(rows, across, self.at.gram if rows.size >= DEAR else None)
-        some = self.loss.picked(every)
-        return every * weighed_squares(rows[some], across[some], self.at.gram / every)
+        if self.at.last.get("some", (0,))[0] != every:
+            some = self.loss.picked(every)
+            self.at.last["some"] = (every, some, rows[some])
+        _, some, picked = self.at.last["some"]
+        return every * weighed_squares(picked, across[some], self.at.gram / every)
 
     def _along(self, curvature: Curvature, every: int) -> Array:
-        """Return what the curvatures along the groups' directions add."""
+        """Return what the curvatures along the groups' directions add, by what the rows are."""
         _, along, u = curvature
         bent = every * along[::every].nonzero()[0]
         return every * weighed_squares(self.loss.projected(self.at.rows, u, bent), along[bent])
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""
-        ahead = self.at.rows.dot(step)  # of short vectors, calls are dear: `dot` is a shorter one than `@`
+        ahead = self.at.by_row(step)
         of_penalty = 2 * self.pull * step
 
         def at(t: float) -> Point:

@@ -272,7 +272,7 @@ class Objective(Brief):
     @cached_property
     def coordinates(self) -> Coordinates:
         """Coordinates of z in which the squares of data and penalty are diagonal, of a loss that is no square."""
-        return coordinates(self.model, self.penalty_form, self.order)
+        return coordinates(self.model, self.penalty_form, self.order, multiplied=self.separated is None)
 
     # --- values ------------------------------------------------------------------------------------------------
 

@@ -134,7 +134,7 @@ class Whitened:
 
     def of_squares(self) -> Array:
         """Return where the squares of the residuals and the penalty are least together, in the box (n,)."""
-        z = self.at.offset + self.at.B @ (self.unit**2 * (self.at.rows.T @ self.at.b))
+        z = self.at.offset + self.at.B @ (self.unit**2 * self.at.along(self.at.b))
         if self.box is None:
             return z
         return np.clip(z, *self.box)
@@ -157,11 +157,11 @@ class Whitened:
     def objective(self, z: Array) -> float:
         """Return the objective at z (n,), or at the point beside it."""
         a = self.placed(z)[1]
-        return self.loss.at(self.at.rows @ a - self.at.b) + float(self.pull @ a**2)
+        return self.loss.at(self.at.by_row(a) - self.at.b) + float(self.pull @ a**2)
 
     def slope(self, a: Array, of_loss: Array) -> Array:
         """Return the objective's slope by the coordinates in their units, (p,), from the loss's (m,)."""
-        return self.penalized(a, self.at.rows.T.dot(of_loss))
+        return self.penalized(a, self.at.along(of_loss))
 
     def penalized(self, a: Array, along: Array) -> Array:
         """Return the same from the loss's by the coordinates (p,)."""

@@ -318,6 +318,28 @@ def test_with_few_second_derivatives_the_minimum_is_the_same(
 
 
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_a_second_derivative_is_kept_while_what_steps_promise_falls(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it must fall to nothing, as far as is asked for, or not at all: the minima are the same."""
+    weights = np.geomspace(1e3, 1e-4, 8)
+    expected = ro.convex.pose(stated(name, over), MODEL).path(weights)
+    monkeypatch.setattr(newton, "DEAR", 0)
+    counts = []
+    for slow in (0.0, newton.SLOW, np.inf):
+        with monkeypatch.context() as patched:
+            patched.setattr(newton, "SLOW", slow)
+            counted = Counted(newton.Newton._hessian)
+            patched.setattr(newton.Newton, "_hessian", counted.method())
+            found = ro.convex.pose(stated(name, over), MODEL).path(weights)
+        counts.append(counted.count)
+        for one, other in zip(found, expected, strict=True):
+            assert one.objective == pytest.approx(other.objective, rel=1e-9)
+    assert counts[0] >= counts[1] >= counts[2] == 1
+    assert counts[0] > 1
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
 def test_points_for_a_rule_are_within_what_newton_promises(
     name: str, over: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,11 +10,14 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex import coordinates
 from rpim_opt.convex import met as minima
+from rpim_opt.convex.coordinates import Coordinates
 from rpim_opt.convex.interior import _whitened
 from rpim_opt.convex.met import Kinked, Met, Near
 from rpim_opt.convex.newton import Newton, Point
 from rpim_opt.convex.objective import Damping
+from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_newton import CASES, MODEL, SMOOTH, stated
 from tests.convex.test_separated import smoothed_value
 
@@ -208,6 +211,55 @@ def test_coordinates_without_some_rows_are_those_of_the_others() -> None:
     assert np.array_equal(less.rows[kept], at.rows[kept])
     assert less.lengths == pytest.approx(np.sum(less.rows**2, axis=0), rel=1e-9)
     assert at.rows[~kept].any()  # those that it came from stay
+
+
+def many(name: str, over: str, monkeypatch: pytest.MonkeyPatch, model: LinearModel = MODEL) -> Coordinates:
+    """The coordinates of so many equations that the product is dear."""
+    with monkeypatch.context() as patched:
+        patched.setattr(coordinates, "DEAR", 0)
+        return ro.convex.pose(stated(name, over), model).coordinates
+
+
+@pytest.mark.parametrize(("name", "over"), CASES)
+def test_rows_that_are_dear_to_multiply_are_turned_instead(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, program = made(name, over)
+    at, turned = method.at, many(name, over, monkeypatch)
+    assert at.turn is None
+    assert turned.turn is not None
+    assert np.array_equal(turned.rows, MODEL.A[program.order])
+    a, y = RNG.normal(size=len(at.lengths)), RNG.normal(size=len(at.b))
+    assert turned.by_row(a) == pytest.approx(at.by_row(a), abs=1e-9 * np.abs(at.rows).max())
+    assert turned.along(y) == pytest.approx(at.along(y), abs=1e-9 * np.abs(at.rows).max())
+    assert turned.lengths == pytest.approx(at.lengths, rel=1e-7, abs=1e-9 * at.lengths.max())
+    other = replace(method, at=turned)
+    one, two = (each._hessian(each._placed(Z, None)) for each in (method, other))
+    assert two == pytest.approx(one, rel=1e-7, abs=1e-9 * np.abs(one).max())
+    assert other.minimum(Z).objective == pytest.approx(method.minimum(Z).objective, rel=1e-9)
+    kept = np.arange(len(at.b)) % 3 != 1
+    assert turned.of(kept).lengths == pytest.approx(at.of(kept).lengths, rel=1e-7, abs=1e-9 * at.lengths.max())
+
+
+def test_what_data_do_not_see_adds_nothing_to_turned_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two columns that are the same, their difference: rounding would be taken for something seen."""
+    twice = replace(MODEL, A=np.where(np.arange(N) == 1, MODEL.A[:, [0]], MODEL.A))
+    at = many("huber", "equation", monkeypatch, twice)
+    assert at.turn is not None
+    unseen = np.flatnonzero(~at.turn.any(axis=0))
+    assert len(unseen) == N - twice.rank > 0
+    assert np.abs(twice.A @ at.B[:, unseen]).max() < 1e-9 * np.abs(twice.A).max()
+    assert (at.lengths[unseen] == 0).all()
+
+
+def test_rows_are_multiplied_where_turns_would_cost_digits_or_all_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = 1e-7 * RNG.normal(size=len(MODEL.b))
+    alike = replace(MODEL, A=np.where(np.arange(N) == 1, MODEL.A[:, [0]] + step[:, None], MODEL.A))
+    assert many("huber", "equation", monkeypatch, alike).turn is None
+    monkeypatch.setattr(coordinates, "DEAR", 0)
+    assert ro.convex.pose(ro.minimax, MODEL).coordinates.turn is None
 
 
 def test_a_minimum_begins_at_that_of_the_nearest_weight() -> None:
