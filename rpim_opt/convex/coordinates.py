@@ -89,7 +89,7 @@ class Coordinates:
 
     @cached_property
     def lengths(self) -> Array:
-        """(p,) squared lengths of the columns of rows."""
+        """(p,) squared lengths of the columns of A B."""
         return np.diag(self.turned(self.gram)).copy()
 
 

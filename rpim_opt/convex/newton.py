@@ -352,17 +352,25 @@ class Newton(Whitened):
         rows = self.at.rows
         if every == 1:
             return weighed_squares(rows, across, self.at.gram if rows.size >= DEAR else None)
-        if self.at.last.get("some", (0,))[0] != every:
-            some = self.loss.picked(every)
-            self.at.last["some"] = (every, some, rows[some])
-        _, some, picked = self.at.last["some"]
+        some, picked = self._picked(every)
         return every * weighed_squares(picked, across[some], self.at.gram / every)
 
     def _along(self, curvature: Curvature, every: int) -> Array:
         """Return what the curvatures along the groups' directions add, by what the rows are."""
         _, along, u = curvature
-        bent = every * along[::every].nonzero()[0]
-        return every * weighed_squares(self.loss.projected(self.at.rows, u, bent), along[bent])
+        rows = self.at.rows
+        if every > 1:
+            some, rows = self._picked(every)
+            along, u = along[::every], u[some]
+        bent = along.nonzero()[0]
+        return every * weighed_squares(self.loss.projected(rows, u, bent, every), along[bent])
+
+    def _picked(self, every: int) -> tuple[np.ndarray, Array]:
+        """Return the places (k,) and the rows of one of every so many groups, row by row."""
+        if self.at.last.get("picked", (0,))[0] != every:
+            some = self.loss.picked(every)
+            self.at.last["picked"] = (every, some, np.ascontiguousarray(self.at.rows[some]))
+        return self.at.last["picked"][1:]
 
     def _searched(self, point: Point, z: Array, step: Array) -> Point:
         """Return the point along a step where the smoothed objective is about least."""

@@ -143,9 +143,10 @@ class Separated:
             return np.arange(0, self.count, every)
         return np.flatnonzero(self.which % every == 0)
 
-    def projected(self, rows: Array, u: Array, groups: np.ndarray) -> Array:
-        """Return u'rows (G, p) of some groups, u (m,) and rows (m, p)."""
-        count, each = len(self._sizes), self._alike
+    def projected(self, rows: Array, u: Array, groups: np.ndarray, every: int = 1) -> Array:
+        """Return u'rows (G, p) of some groups, u (m,) and rows (m, p); all of them of one of every so many groups."""
+        sizes, each = self._sizes[::every], self._alike
+        count = len(sizes)
         if each:
             by_group = u.reshape(count, each), rows.reshape(count, each, -1)
             if len(groups) == count:
@@ -153,7 +154,7 @@ class Separated:
             if 2 * len(groups) > count:  # most of them: picked out afterwards
                 return np.einsum("nk,nkp->np", *by_group)[groups]
             return np.einsum("nk,nkp->np", *(some[groups] for some in by_group))
-        return np.add.reduceat(u[:, None] * rows, self._begin)[groups]
+        return np.add.reduceat(u[:, None] * rows, np.cumsum(sizes) - sizes)[groups]
 
     @cached_property
     def _alike(self) -> int:

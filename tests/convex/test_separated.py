@@ -126,6 +126,9 @@ def test_rows_are_projected_group_by_group(name: str) -> None:
     groups = np.array([0, 2, 5])
     expected = [u[loss.which == g] @ rows[loss.which == g] for g in groups]
     assert loss.projected(rows, u, groups) == pytest.approx(np.array(expected), rel=1e-12)
+    some = loss.picked(2)
+    assert set(loss.which[some]) == set(range(0, loss.which[-1] + 1, 2))
+    assert loss.projected(rows[some], u[some], np.array([0, 1]), 2) == pytest.approx(np.array(expected[:2]), rel=1e-12)
 
 
 def test_a_loss_that_falls_or_has_kinks_elsewhere_is_not_separated() -> None:
