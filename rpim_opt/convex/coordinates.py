@@ -72,9 +72,7 @@ class Coordinates:
         """
         left_out = self.rows[~kept]
         gram = self.gram - left_out.T @ left_out
-        rows, b = self.rows.copy(), self.b.copy()
-        rows[~kept] = 0.0
-        b[~kept] = 0.0
+        rows, b = np.where(kept[:, None], self.rows, 0.0), np.where(kept, self.b, 0.0)
         return replace(self, rows=rows, b=b, gram=gram)
 
     @cached_property
