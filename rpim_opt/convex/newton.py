@@ -174,7 +174,7 @@ class Newton(Whitened):
             ended = self._judged(ahead, slope_ahead, steps)
             best.meets(ended)
             bent = self._updated(bent, point, ahead, slope_ahead - slope)
-            if not exact and not self._left(slope_ahead, bent, ended) <= SLOW * left:
+            if not exact and not self._left(slope_ahead, bent, ended) < SLOW * left:
                 bent = None
                 every = 1 if anew else self._stride
             point = ahead

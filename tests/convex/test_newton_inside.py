@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex import coordinates
+from rpim_opt.convex import coordinates, newton
 from rpim_opt.convex import met as minima
 from rpim_opt.convex.coordinates import Coordinates
 from rpim_opt.convex.interior import _whitened
@@ -123,6 +123,23 @@ def test_another_weight_begins_where_the_last_ended(name: str, over: str) -> Non
     for other in (replace(first, loss=replace(first.loss)), replace(first, at=replace(first.at))):
         assert other._begin(ended.z, ended.kinked).along is None
     assert first._begin(ended.z.copy(), ended.kinked).along is None
+
+
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_a_second_derivative_that_promises_nothing_finite_is_computed_anew(
+    name: str, over: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rounding may leave a neighbour's without a Cholesky factor: no step with it is taken for a good one."""
+    monkeypatch.setattr(newton, "DEAR", 0)
+    method, _ = made(name, over)
+    upside_down = Kinked([], 1.0, -np.eye(N))
+    point = method._placed(Z, upside_down)
+    bent = method._known(point)
+    assert bent is not None
+    assert method._promised(method._slope(point), 1e6 * bent) == np.inf
+    found = method.minimum(Z, upside_down._replace(curved=-1e6 * np.eye(N)))
+    assert found.good
+    assert found.steps <= method.minimum(Z).steps + 1
 
 
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
