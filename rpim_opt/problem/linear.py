@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.lapack import qr_in_place
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.room import room
@@ -134,15 +135,28 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
 
 def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
     """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR."""
-    n = A.shape[1] + 1
-    together = min(n, WIDE if n >= MANY else NARROW)
+    stacked, rows = beneath(R, A.shape[1] + 1, len(b))
+    rows[:, :-1] = A
+    rows[:, -1] = b
+    return rotated(stacked)
+
+
+def beneath(R: Array | None, n: int, count: int) -> tuple[Array, Array]:
+    """Return a matrix (m, n) with R (k, n) above, whose columns stand together, and of it the rows (count, n) beneath.
+
+    It stands until the same thread asks for the next one; the rows are to be written.
+    """
     above = 0 if R is None else len(R)
-    stacked = room("stacked", n, max(above + len(b), n)).T
-    stacked[:above] = 0 if R is None else R
-    stacked[above : above + len(b), :-1] = A
-    stacked[above : above + len(b), -1] = b
-    stacked[above + len(b) :] = 0.0
-    qr_in_place(stacked, together)
+    stacked = room("stacked", n, max(above + count, n)).T
+    stacked[:above] = 0.0 if R is None else R
+    stacked[above + count :] = 0.0
+    return stacked, stacked[above : above + count]
+
+
+def rotated(stacked: Array) -> Array:
+    """Return the upper triangle (n, n) of what `beneath` made room for, which is overwritten."""
+    n = stacked.shape[1]
+    qr_in_place(stacked, min(n, WIDE if n >= MANY else NARROW))
     return np.where(_upper(n), stacked[:n], 0.0)
 
 
@@ -202,6 +216,19 @@ def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0
     """
     group = np.zeros(len(R), dtype=int)
     return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)
+
+
+def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
+    """Rotate the equations of models, at least one, into one triangle, which stands for them all."""
+    R, equations, offset, last = None, 0, 0.0, None
+    for last in models:
+        equations += last.equations
+        offset += last.offset
+        with phase("reduction"):
+            R = reduced_equations(last.A, last.b, R)
+    if last is None or R is None:
+        raise InputError("data", "no row", "at least one")
+    return from_triangle(last, R, equations, offset)
 
 
 Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]

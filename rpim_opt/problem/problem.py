@@ -12,13 +12,12 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
-from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.functions import Functions, Kept, Structure, asked
 from rpim_opt.problem.identified import Identified, identified_of
-from rpim_opt.problem.linear import LinearModel, Reweigh
+from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
 from rpim_opt.problem.loads import (
     Loads,
     Needs,
@@ -30,7 +29,7 @@ from rpim_opt.problem.loads import (
 )
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
-from rpim_opt.robot.abreast import evaluated
+from rpim_opt.robot.abreast import evaluated, write
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
@@ -497,7 +496,7 @@ class CalibrationProblem(Tabled):
         weighed, offset = reweigh(model, x / self.parameters.free.scale)
         return replace(weighed, offset=offset)
 
-    def pieces(self, x: Array, most: int, passing: bool = False) -> Iterator[LinearModel]:
+    def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
         """Yield the linear model of `linearize` some rows at a time, block by block.
 
         Parameters
@@ -506,8 +505,6 @@ class CalibrationProblem(Tabled):
             (n,) deviations [SI].
         most
             Rows of a piece.
-        passing
-            Whether the caller is done with a piece when it asks for the next one, which is then written over it.
 
         Examples
         --------
@@ -517,18 +514,66 @@ class CalibrationProblem(Tabled):
         >>> [len(piece.b) for piece in problem.pieces(np.zeros(len(problem.parameters.free)), 5)]
         [15, 12]
         """
+        if self.scatter is not None or self.touches is not None:
+            yield from self._scattered(x, most)
+            return
+        n = len(x)
+        for i, part in self._spans(most):
+            block = self.data.blocks[i]
+            rows, each = block.row[part], len(block.measurement.components)
+            columns = np.empty((n + 1, len(rows), each))
+            self._write(x, i, part, columns.transpose(0, 2, 1))
+            A, r = columns[:-1].reshape(n, -1).T, columns[-1].ravel()
+            yield self._model(
+                A, r + A @ (x / self.parameters.free.scale), np.repeat(self.data.configuration[rows], each)
+            )
+
+    def triangle(self, x: Array, most: int) -> LinearModel:
+        """Return the model of `linearize` as its triangle: n + 1 equations, the same |A z - b| for every z.
+
+        Rows are evaluated where they are reduced, so that memory does not grow with their number.
+
+        Parameters
+        ----------
+        x
+            (n,) deviations [SI].
+        most
+            Rows that are evaluated and reduced together.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> model = problem.triangle(np.zeros(len(problem.parameters.free)), 5)
+        >>> model.A.shape, model.equations
+        ((27, 26), 27)
+        """
+        if self.scatter is not None or self.touches is not None:
+            return reduced_models(self._scattered(x, most))
+        R, equations, n = None, 0, len(x) + 1
+        for i, part in self._spans(most):
+            each = len(self.data.blocks[i].measurement.components)
+            stacked, rows = beneath(R, n, each * (part.stop - part.start))
+            self._write(x, i, part, rows.T.reshape(n, each, -1))
+            equations += len(rows)
+            with phase("reduction"):
+                R = rotated(stacked)
+        if R is None:
+            raise InputError("data", "no row", "at least one")
+        R[:, -1] += R[:, :-1] @ (x / self.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
+        return from_triangle(self._model(R[:, :-1], R[:, -1], self.data.configuration[:0]), R, equations)
+
+    def _spans(self, most: int) -> Iterator[tuple[int, slice]]:
+        """Yield the number of a block and some of its rows, until all have come, ``most`` at a time."""
+        for i, block in enumerate(self.data.blocks):
+            for start in range(0, len(block.row), most):
+                yield i, slice(start, min(start + most, len(block.row)))
+
+    def _model(self, A: Array, b: Array, group: np.ndarray) -> LinearModel:
         kinds = [block.measurement for block in self.data.blocks]
         constrained = any(not kind.columns and not kind.touching for kind in kinds)
-        if self.scatter is not None or self.touches is not None:
-            yield from self._scattered(x, most, constrained)
-            return
-        for i, block in enumerate(self.data.blocks):
-            each = len(block.measurement.components)
-            for start in range(0, len(block.row), most):
-                part = slice(start, start + most)
-                A, b = self._equations(i, x, part, passing)
-                group = np.repeat(self.data.configuration[block.row[part]], each)
-                yield LinearModel(A, b, group, self._identified, constrained)
+        return LinearModel(A, b, group, self._identified, constrained)
 
     @cached_property
     def _identified(self) -> Identified:
@@ -536,22 +581,25 @@ class CalibrationProblem(Tabled):
         only = self.robots if isinstance(self.robots, Robot) else None
         return identified_of(only, self.parameters, self.data)
 
-    def _equations(self, i: int, x: Array, part: slice, passing: bool) -> tuple[Array, Array]:
-        """Return whitened, scaled A and b of some rows of a block; the columns of A stand together, as LAPACK asks."""
-        whitening = self._whitening[i]
-        L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._evaluate(self.data.blocks[i], "jacobian", x, part, passing=True)
+    def _write(self, x: Array, i: int, part: slice, found: Array) -> None:
+        """Write the whitened, scaled [A r] of N rows of a block into ``found`` (n + 1, k, N); b = r + A z."""
+        block, whitening = self.data.blocks[i], self._whitening[i]
         scale = self.parameters.free.scale
-        N, k, n = jacobian.shape
-        if passing:
-            columns = room("columns", n, N, k)
-        else:
-            columns = np.empty((n, N, k))
-        A = _weighted(L, jacobian.transpose(1, 2, 0), scale, columns).reshape(n, -1).T
-        r = _weighted(L, residual.transpose(2, 1, 0), np.ones(1), np.empty((1, N, k))).ravel()
-        return A, r + A @ (x / scale)
+        diagonal = np.diagonal(whitening[0])
+        if len(whitening) == 1 and np.count_nonzero(whitening) == len(diagonal):  # then the whole is a factor a number
+            into = [found[-1:], found[:-1].transpose(1, 0, 2)]
+            factors = [diagonal[None], diagonal[:, None] * scale]
+            function = self._functions(block)["jacobian"]
+            rows = self._rows(block, part)
+            with phase("evaluation"):
+                write(function, [x, self.parameters.nominal], rows, into, factors)
+            return
+        L = whitening if len(whitening) == 1 else whitening[part]
+        residual, jacobian = self._evaluate(block, "jacobian", x, part, passing=True)
+        _weigh(L, jacobian.transpose(1, 2, 0), scale, found[:-1])
+        _weigh(L, residual.transpose(2, 1, 0), np.ones(1), found[-1:])
 
-    def _scattered(self, x: Array, most: int, constrained: bool) -> Iterator[LinearModel]:
+    def _scattered(self, x: Array, most: int) -> Iterator[LinearModel]:
         """Yield the linear model by whole configurations, whose rows share the robot's scatter."""
         scale = self.parameters.free.scale
         parts = [np.arange(len(self.data))]
@@ -564,7 +612,7 @@ class CalibrationProblem(Tabled):
             residual, jacobian = problem.slopes(x)
             both = problem._whitened(problem.contrasts(np.column_stack([jacobian * scale, residual])))
             A, r = np.ascontiguousarray(both[:, :-1]), both[:, -1]
-            yield LinearModel(A, r + A @ (x / scale), problem.groups, self._identified, constrained)
+            yield self._model(A, r + A @ (x / scale), problem.groups)
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) [SI], evaluated together.
@@ -919,15 +967,14 @@ def _whitening(covariance: Array) -> Array:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
 
-def _weighted(L: Array, values: Array, scale: Array, found: Array) -> Array:
-    """Return L (N or 1, k, k) times values (k, c, N) of every row times scales (c,), in ``found`` (c, N, k)."""
+def _weigh(L: Array, values: Array, scale: Array, found: Array) -> None:
+    """Write L (N or 1, k, k) times values (k, c, N) of every row times scales (c,) into ``found`` (c, k, N)."""
     nonzero = np.any(L, axis=0).tolist()
     for i, terms in enumerate(nonzero):
         first, *others = [j for j, there in enumerate(terms) if there]  # a triangle's diagonal has no zero
-        np.multiply(values[first], _factors(L[:, i, first], scale), out=found[:, :, i])
+        np.multiply(values[first], _factors(L[:, i, first], scale), out=found[:, i])
         for j in others:
-            found[:, :, i] += values[j] * _factors(L[:, i, j], scale)
-    return found
+            found[:, i] += values[j] * _factors(L[:, i, j], scale)
 
 
 def _factors(entries: Array, scale: Array) -> Array:

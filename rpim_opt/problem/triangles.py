@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.phases import phase
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.data.dataset import whole_configurations
-from rpim_opt.problem.linear import LinearModel, Reweigh, by_twos, from_triangle, reduced_equations
+from rpim_opt.problem.linear import LinearModel, Reweigh, by_twos, from_triangle, reduced_models
 from rpim_opt.problem.problem import CalibrationProblem
 
 ROWS = 4096
@@ -47,9 +45,9 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
     ((35, 34), 120)
     """
     if reweigh is None:
-        return _rotated(problem.pieces(x, FEW, passing=True))
+        return problem.triangle(x, FEW)
     groups = whole_configurations(problem.data, ROWS)
-    return _rotated(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
+    return reduced_models(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
 
 
 def joined(models: Sequence[LinearModel]) -> LinearModel:
@@ -57,16 +55,3 @@ def joined(models: Sequence[LinearModel]) -> LinearModel:
     R = [np.column_stack([model.A, model.b]) for model in models]
     equations = sum(model.equations for model in models)
     return from_triangle(models[0], by_twos(R), equations, sum(model.offset for model in models))
-
-
-def _rotated(models: Iterable[LinearModel]) -> LinearModel:
-    """Rotate the equations of models into one triangle, which stands for them all."""
-    R, equations, offset, last = None, 0, 0.0, None
-    for last in models:
-        equations += last.equations
-        offset += last.offset
-        with phase("reduction"):
-            R = reduced_equations(last.A, last.b, R)
-    if last is None or R is None:
-        raise InputError("data", "no row", "at least one")
-    return from_triangle(last, R, equations, offset)

@@ -18,7 +18,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.room import room
 from rpim_opt.basics.threads import on_all_cores
-from rpim_opt.robot.compiled import compiled
+from rpim_opt.robot.compiled import MachineCode, compiled
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.posture import SYMBOLS
 
@@ -41,14 +41,14 @@ LONGEST = 6_000
 class Abreast(NamedTuple):
     """A function of rows in two: ``common`` (shared inputs) and ``rows`` (that, rows (width, k)) -> (width, numbers).
 
-    ``shapes`` are those of the function's outputs; ``times`` is how many tables of so many rows one call evaluates.
+    ``shapes`` are those of the function's outputs; ``machine_code`` is what evaluates any number of rows, or None.
     """
 
     common: ca.Function
     rows: ca.Function
     width: int
     shapes: tuple[tuple[int, int], ...]
-    times: int = 1
+    machine_code: MachineCode | None = None
 
 
 class _Effort:
@@ -82,13 +82,35 @@ def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array, passi
         numbers = room("evaluated", size, len(rows))
     else:
         numbers = np.empty((size, len(rows)))
-    _on_columns(way, shared, rows, numbers)
     found = []
     end = 0
     for r, c in way.shapes:
         begin, end = end, end + r * c
-        found.append(numbers[begin:end].reshape(c, r, len(rows)).transpose(2, 0, 1))
-    return found
+        found.append(numbers[begin:end].reshape(c, r, len(rows)))
+    _on_columns(way, shared, rows, found, np.ones(size))
+    return [values.transpose(2, 0, 1) for values in found]
+
+
+def write(
+    function: ca.Function, shared: Sequence[Array], rows: Array, found: Sequence[Array], factors: Sequence[Array]
+) -> None:
+    """Write what `evaluated` returns, times factors, to where it is wanted, as quickly.
+
+    Parameters
+    ----------
+    function, shared, rows
+        As `call_rows` has them.
+    found
+        An array (c, r, N) for every output (r, c); from row to row they all go as far in memory.
+    factors
+        Of every output's numbers, (c, r).
+    """
+    way = _quickest(function, len(shared), len(rows))
+    if way is None:
+        for into, factor, values in zip(found, factors, call_rows(function, shared, rows), strict=True):
+            np.multiply(values.transpose(1, 2, 0), factor[:, :, None], out=into)
+        return
+    _on_columns(way, shared, rows, found, np.concatenate([factor.ravel() for factor in factors]))
 
 
 def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
@@ -101,21 +123,21 @@ def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
     if effort.rows < PAYS:
         return None
     if effort.rows >= SOME and function.n_instructions() <= LONGEST:
-        made = _machine_code(function, shared, count // VECTOR, effort.rows >= MANY)
+        made = _machine_code(function, shared, effort.rows >= MANY)
         if made is not None:
             return made
     return abreast(function, shared, max(count, NARROW))
 
 
 @lru_cache(maxsize=256)
-def _machine_code(function: ca.Function, shared: int, times: int, make: bool) -> Abreast | None:
+def _machine_code(function: ca.Function, shared: int, make: bool) -> Abreast | None:
     way = abreast(function, shared, VECTOR)
     if way is None:
         return None
     made = compiled(way.rows, make)
     if made is None:
         return None
-    return way._replace(rows=ca.Function.map(made, "rows", "serial", times, [0], [], {}), times=times)
+    return way._replace(machine_code=made)
 
 
 @lru_cache(maxsize=256)
@@ -199,17 +221,41 @@ class _Memory:
 
 
 class _Own:
-    """The memory of both functions in one thread: ``table`` (times, k, width) gives ``numbers`` (times, n, width)."""
+    """The memory of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width)."""
 
     def __init__(self, way: Abreast):
-        rows = way.rows
-        self.count = way.times * way.width
-        common = np.zeros(rows.size1_in(0))
-        self.table = np.zeros((way.times, rows.size2_in(1) // way.times, way.width))
-        self.numbers = np.zeros((way.times, rows.size2_out(0) // way.times, way.width))
+        self.way = way
+        self.given = np.zeros(way.rows.size1_in(0))
         self.shared = [np.zeros(way.common.size1_in(i)) for i in range(way.common.n_in())]
-        self.common = _Memory(way.common, self.shared, common)
-        self.rows = _Memory(rows, [common, self.table], self.numbers)
+        self.common = _Memory(way.common, self.shared, self.given)
+        if way.machine_code is None:
+            self.table = np.zeros((way.rows.size2_in(1), way.width))
+            self.numbers = np.zeros((way.rows.size2_out(0), way.width))
+            self.rows = _Memory(way.rows, [self.given, self.table], self.numbers)
+
+    def write(self, rows: Array, found: Sequence[Array], factors: Array) -> None:
+        """Write the numbers of rows (N, k), times factors (n,), into arrays (c, r, N)."""
+        made = self.way.machine_code
+        if made is not None:
+            step = found[0].strides[2] // found[0].itemsize
+            made(self.given, np.ascontiguousarray(rows), _places(found), step, factors)
+            return
+        for start in range(0, len(rows), self.way.width):
+            part = slice(start, start + self.way.width)
+            self._together(rows[part], [into[:, :, part] for into in found], factors)
+
+    def _together(self, rows: Array, found: Sequence[Array], factors: Array) -> None:
+        """Evaluate ``width`` rows, or fewer; the last one stands for those that are not there."""
+        there = len(rows)
+        self.table[:, :there] = rows.T
+        self.table[:, there:] = rows[-1][:, None]
+        self.rows.evaluate()
+        end = 0
+        for into in found:
+            c, r, _ = into.shape
+            begin, end = end, end + c * r
+            numbers = self.numbers[begin:end, :there].reshape(into.shape)
+            np.multiply(numbers, factors[begin:end].reshape(c, r, 1), out=into)
 
 
 @lru_cache(maxsize=64)
@@ -217,35 +263,25 @@ def _own(way: Abreast, _thread: int) -> _Own:
     return _Own(way)
 
 
-def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Array) -> None:
-    """Find the numbers (numbers, N) of a table (N, k)."""
-    N = len(rows)
+def _places(found: Sequence[Array]) -> np.ndarray:
+    """Return where in memory the first row's numbers of arrays (c, r, N) stand, (numbers,)."""
+    places = []
+    for into in found:
+        c, r, _ = into.shape
+        further = np.add.outer(into.strides[0] * np.arange(c), into.strides[1] * np.arange(r))
+        places.append(into.ctypes.data + further.ravel())
+    return np.concatenate(places)
+
+
+def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Sequence[Array], factors: Array) -> None:
+    """Find the numbers of a table (N, k), times factors (n,), in arrays (c, r, N)."""
 
     def evaluate(begin: int) -> None:
         own = _own(way, threading.get_ident())
         for own_values, values in zip(own.shared, shared, strict=True):
             own_values[:] = values
         own.common.evaluate()
-        for start in range(begin, min(begin + SHARE, N), own.count):
-            part = slice(start, start + own.count)
-            _together(own, rows[part], found[:, part])
+        part = slice(begin, begin + SHARE)
+        own.write(rows[part], [into[:, :, part] for into in found], factors)
 
-    on_all_cores(evaluate, range(0, N, SHARE))
-
-
-def _together(own: _Own, rows: Array, found: Array) -> None:
-    """Evaluate as many rows as go into one call, or fewer; the last one stands for those that are not there."""
-    there = len(rows)
-    if there < own.count:
-        given = rows
-        rows = np.empty((own.count, given.shape[1]))
-        rows[:there] = given
-        rows[there:] = given[-1]
-    inputs = own.table.transpose(1, 0, 2)
-    inputs[:] = rows.T.reshape(inputs.shape)
-    own.rows.evaluate()
-    numbers = own.numbers.transpose(1, 0, 2)
-    if there < own.count:
-        found[:] = numbers.reshape(len(found), own.count)[:, :there]
-    else:
-        found.reshape(numbers.shape)[:] = numbers
+    on_all_cores(evaluate, range(0, len(rows), SHARE))

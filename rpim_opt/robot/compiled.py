@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
 import platform
@@ -14,13 +15,19 @@ from importlib.metadata import version
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes
+from rpim_opt.basics.room import room
 from rpim_opt.basics.writing import scratch_folder, write_files
 
-FLAGS = ("-O3", "-march=native", "-ffp-contract=off", "-fPIC", "-shared")
-"""No product is fused with a sum, so that machine code has the virtual machine's last bits."""
+FLAGS = (
+    "-O2", "-march=native", "-ftree-vectorize", "-ffp-contract=off", "-fno-semantic-interposition", "-fPIC", "-shared",
+)  # fmt: skip
+"""No product is fused with a sum, so that machine code has the virtual machine's last bits; nobody replaces CasADi's
+own small functions, so that they may be inlined. -O3 unrolls the loops over rows, which takes longer."""
 SWITCH = "RPIM_OPT_COMPILE"
 """Environment variable; 0 leaves everything to CasADi's virtual machine."""
 PATIENCE = 120
@@ -28,11 +35,83 @@ PATIENCE = 120
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
-@lru_cache(maxsize=256)
-def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
-    """Return the function as machine code, a few times as fast as CasADi's virtual machine; None where that fails.
+ROWS = """
+CASADI_SYMBOL_EXPORT void rows(const double* common, const double* table, long long N, double* work,
+                               double* const* found, long long step, const double* factor) {{
+  const casadi_real* arg[{sz_arg}];
+  casadi_real* res[{sz_res}];
+  casadi_int iw[{sz_iw} + 1];
+  double *given = work, *numbers = given + {inputs}*{width}, *own = numbers + {numbers}*{width};
+  for (long long start = 0; start < N; start += {width}) {{
+    const int there = N - start < {width} ? (int)(N - start) : {width};
+    const double* first = table + start*{inputs};
+    for (int k = 0; k < {inputs}; ++k)
+      for (int i = 0; i < {width}; ++i) given[k*{width} + i] = first[(i < there ? i : there - 1)*{inputs} + k];
+    arg[0] = common;
+    arg[1] = given;
+    res[0] = numbers;
+    {name}(arg, res, iw, own, 0);
+    for (int k = 0; k < {numbers}; ++k) {{
+      const double* from = numbers + k*{width};
+      double* into = found[k] + start*step;
+      if (step == 1 && there == {width})
+        for (int i = 0; i < {width}; ++i) into[i] = factor[k]*from[i];
+      else
+        for (int i = 0; i < there; ++i) into[i*step] = factor[k]*from[i];
+    }}
+  }}
+}}
+"""
+"""C of what evaluates a function of some rows abreast at any number of them; the last one stands for those missing."""
 
-    Without ``make`` only a library that was made before is taken.
+
+class MachineCode:
+    """A function (common, rows (width, k)) -> numbers (width, n) that is evaluated at any number of rows.
+
+    Parameters
+    ----------
+    function
+        As CasADi has it.
+    library
+        What was made of it.
+
+    Raises
+    ------
+    OSError
+        Where the file is no library.
+    """
+
+    def __init__(self, function: ca.Function, library: Path):
+        self._rows = ctypes.CDLL(str(library)).rows
+        self._rows.restype = None
+        address = ctypes.c_void_p
+        self._rows.argtypes = [address, address, ctypes.c_longlong, address, address, ctypes.c_longlong, address]
+        self._size = function.nnz_in(1) + function.nnz_out(0) + function.sz_w()
+
+    def __call__(self, common: Array, rows: Array, places: np.ndarray, step: int, factors: Array) -> None:
+        """Write a function's numbers of rows (N, k), times factors (n,).
+
+        Parameters
+        ----------
+        common, rows
+            Its inputs, both dense.
+        places
+            (n,) addresses of every number of the first row.
+        step
+            How many numbers later in memory that of the next row stands.
+        factors
+            (n,) of every number.
+        """
+        work = room("machine code", self._size)
+        given = [each.ctypes.data for each in (common, rows, work, places, factors)]
+        self._rows(given[0], given[1], len(rows), given[2], given[3], step, given[4])
+
+
+@lru_cache(maxsize=256)
+def compiled(function: ca.Function, make: bool = True) -> MachineCode | None:
+    """Return a function of rows abreast as machine code, a few times as fast as CasADi's virtual machine, or None.
+
+    Without ``make`` only a library that was made before is taken; None, too, where it cannot be made.
 
     The library's name is a digest of its source, of the compiler and of the processor, so that a stale one is never
     taken, and the digest of its content stands beside it, so that a damaged one is made anew. A folder or a library
@@ -44,7 +123,7 @@ def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
         return None
     generator = ca.CodeGenerator(function.name())
     generator.add(function)
-    source = generator.dump()
+    source = generator.dump() + _driver(function)
     made_of = "\0".join([source, *compiler, _version(compiler), *FLAGS, _processor(compiler), version("casadi")])
     library = (
         folder / f"{function.name()}-{hashlib.sha256(made_of.encode(errors='surrogateescape')).hexdigest()[:32]}.so"
@@ -52,9 +131,17 @@ def compiled(function: ca.Function, make: bool = True) -> ca.Function | None:
     if not _is_whole(library) and not (make and _make(library, source, compiler)):
         return None
     try:
-        return ca.external(function.name(), str(library))
-    except RuntimeError:
+        return MachineCode(function, library)
+    except (OSError, AttributeError):
         return None
+
+
+def _driver(function: ca.Function) -> str:
+    width, inputs = function.size_in(1)
+    return ROWS.format(
+        name=function.name(), width=width, inputs=inputs, numbers=function.size2_out(0),
+        sz_arg=function.sz_arg(), sz_res=function.sz_res(), sz_iw=function.sz_iw(),
+    )  # fmt: skip
 
 
 def _compiler() -> tuple[str, ...] | None:

@@ -22,6 +22,8 @@ from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.triangles import reduced
 from rpim_opt.robot import compiled as native
+from rpim_opt.robot.abreast import abreast
+from rpim_opt.robot.kinematics import call_rows
 
 PARTS, ROWS = 5, 1100
 
@@ -81,6 +83,20 @@ def test_pieces_stay_as_they_are_when_the_next_one_comes() -> None:
     assert len(pieces) > 3
     assert np.array_equal(rows.A, np.concatenate([piece.A for piece in pieces]))
     assert rows.b == pytest.approx(np.concatenate([piece.b for piece in pieces]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["position", "mixed", "pose", "tracker", "markers"])
+@pytest.mark.parametrize("few", [3, 7, 1024])
+def test_rows_that_are_written_where_they_are_reduced_say_the_same(name: str, few: int, monkeypatch) -> None:
+    monkeypatch.setattr("rpim_opt.problem.triangles.FEW", few)
+    problem = ro.load(name).problem
+    x = 0.1 * problem.parameters.free.scale
+    rows, found = problem.linearize(x), reduced(problem, x)
+    assert found.equations == len(rows.b)
+    assert found.constrained == rows.constrained
+    all_of_it, here = (np.column_stack([model.A, model.b]) for model in (rows, found))
+    gram = all_of_it.T @ all_of_it
+    np.testing.assert_allclose(here.T @ here, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
 
 
 def test_triangles_of_fewer_rows_than_columns() -> None:
@@ -195,29 +211,36 @@ def jacobian_of(problem: CalibrationProblem):
     return problem._functions(problem.data.blocks[0])["jacobian"]
 
 
-def test_machine_code_agrees_with_the_virtual_machine(whole, tmp_path: Path, monkeypatch) -> None:
+def test_machine_code_has_the_bits_of_the_virtual_machine(whole, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     native.compiled.cache_clear()
-    function = jacobian_of(whole)
-    made = native.compiled(function)
+    way = abreast(jacobian_of(whole), 2, 16)
+    made = native.compiled(way.rows)
     if made is None:
         pytest.skip("no C compiler here")
     libraries = list((tmp_path / "rpim_opt").glob("*.so"))
     assert len(libraries) == 1
     assert stat.S_IMODE((tmp_path / "rpim_opt").stat().st_mode) == 0o700
-    from rpim_opt.robot.kinematics import call_rows
-
     x, rows = 0.2 * whole.parameters.free.scale, np.random.default_rng(0).uniform(-2, 2, (300, 9))
-    for a, b in zip(*(call_rows(f, [x, whole.parameters.nominal], rows) for f in (function, made)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
+    residual, jacobian = call_rows(jacobian_of(whole), [x, whole.parameters.nominal], rows)
+    common = np.array(way.common(x, whole.parameters.nominal)).ravel()
+    wanted = np.concatenate([residual.reshape(300, -1), jacobian.reshape(300, -1)], axis=1)
+    factors = np.arange(1.0, 1 + wanted.shape[1])
+    for shape, axis in ((wanted.shape, 0), (wanted.shape[::-1], 1)):  # from row to row far, and near
+        found = np.zeros(shape)
+        far, near = (stride // found.itemsize for stride in found.strides)
+        number, step = (near, far) if axis == 0 else (far, near)
+        places = found.ctypes.data + found.itemsize * number * np.arange(len(factors))
+        made(common, rows, places, step, factors)
+        assert np.array_equal(found if axis == 0 else found.T, wanted * factors)
     written = libraries[0].stat().st_mtime_ns
     native.compiled.cache_clear()
-    assert native.compiled(function) is not None  # taken from the cache
+    assert native.compiled(way.rows) is not None  # taken from the cache
     assert libraries[0].stat().st_mtime_ns == written
 
 
 def test_where_nothing_can_be_compiled_the_virtual_machine_stays(whole, tmp_path: Path, monkeypatch) -> None:
-    function = jacobian_of(whole)
+    function = abreast(jacobian_of(whole), 2, 16).rows
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for name, value in (("CC", "no-such-compiler"), ("CC", "false"), (native.SWITCH, "0")):
         with monkeypatch.context() as context:
