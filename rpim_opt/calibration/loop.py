@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -392,7 +393,7 @@ def _rested(
     solved = formulation
     reweigh = None
     if not source.keeps_rows:
-        solved, reweigh = on_triangles(formulation, _equations(source))
+        solved, reweigh = on_triangles(formulation, partial(_equations, source))
     loop = Loop(source, formulation, reweigh, how, tolerance, max_iterations, about)
     try:
         state = _begun(loop, solved, choosing(weight, formulation.penalty is not None), start)
@@ -469,7 +470,7 @@ def _certified(loop: Loop, formulation: Formulation, problem: Source, state: Sta
     """Ask everything anew: the formulation's functions, and the measurements' model."""
     solved, model = formulation, state.program.model
     if loop.reweigh is not None:
-        solved, _ = on_triangles(formulation, model.equations)
+        solved, _ = on_triangles(formulation, lambda: model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last pass has to do
         model = around(problem.frozen().linearize(loop.source.parameters.free.scale * state.z), *loop.about)
     return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor)

@@ -141,10 +141,10 @@ def separable(loss: Callable[[Any], Any], over: str = "configuration") -> bool:
     return max(abs(whole - alone), abs(whole - mirrored)) <= SEPARATE * (1 + abs(whole))
 
 
-def on_triangles(formulation: Formulation, equations: int) -> tuple[Formulation, Squares | None]:
+def on_triangles(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, Squares | None]:
     """Return the formulation that triangles can be solved with, and what makes its squares of the equations.
 
-    A loss that sees only the length of the residual needs nothing.
+    A loss that sees only the length of the residual needs nothing. ``equations`` says how many they are.
 
     Raises
     ------
@@ -155,9 +155,9 @@ def on_triangles(formulation: Formulation, equations: int) -> tuple[Formulation,
     --------
     >>> import rpim_opt as ro
     >>> from rpim_opt.convex.majorize import on_triangles
-    >>> on_triangles(ro.tikhonov, 120) == (ro.tikhonov, None)
+    >>> on_triangles(ro.tikhonov, lambda: 120) == (ro.tikhonov, None)
     True
-    >>> on_triangles(ro.robust, 120)[0].loss_over
+    >>> on_triangles(ro.robust, lambda: 120)[0].loss_over
     'equation'
     """
     if invariant(formulation, equations):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -462,7 +463,7 @@ def _for_triangle(formulation: Formulation, equations: int) -> Formulation:
 
     A loss may ask how many residuals there are: a mean square of the equations is no mean of the triangle's rows.
     """
-    if not invariant(formulation, equations):
+    if not invariant(formulation, lambda: equations):
         found = f"formulation '{formulation.name}'"
         raise InputError(found, "equations of which only the triangle is kept", "a squared loss")
     form = None
@@ -479,15 +480,21 @@ def _kept(formulation: Formulation, shape: Shape) -> Posed:
     return Posed(formulation, shape)
 
 
-def invariant(formulation: Formulation, equations: int) -> bool:
-    """Return whether the loss sees only the length of the whole residual: the triangle of [A b] then says all."""
+def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
+    """Return whether the loss sees only the length of the whole residual: the triangle of [A b] then says all.
+
+    How many equations there are is only asked where it matters: of tables, they would be read for it.
+    """
     if formulation.loss_over != "equation" or np.isfinite(formulation.largest):
         return False
     if formulation.loss in INVARIANT:
         return True
-    if formulation.ready or equations > FEW:
+    if formulation.ready:
         return False
-    form = _loss_form(formulation, equations)
+    count = equations()
+    if count > FEW:
+        return False
+    form = _loss_form(formulation, count)
     return form is not None and form.diagonal and not form.c.any() and bool(np.ptp(form.L) == 0)
 
 

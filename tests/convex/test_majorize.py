@@ -125,9 +125,9 @@ def test_what_is_a_sum_over_residuals() -> None:
 
 def test_what_triangles_cannot_hold_is_refused() -> None:
     with pytest.raises(ro.InputError, match="found a loss that is no sum, with measurements in parts"):
-        on_triangles(ro.minimax, 120)
+        on_triangles(ro.minimax, lambda: 120)
     with pytest.raises(ro.InputError, match="found a largest norm, with measurements in parts"):
-        on_triangles(ro.Formulation("limited", largest=3.0), 120)
+        on_triangles(ro.Formulation("limited", largest=3.0), lambda: 120)
     squares = Squares(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)
     with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without slope"):
@@ -135,7 +135,7 @@ def test_what_triangles_cannot_hold_is_refused() -> None:
 
 
 def test_a_loss_over_triangles_is_a_sum_of_squares_and_its_maker() -> None:
-    solved, squares = on_triangles(ro.robust, 120)
+    solved, squares = on_triangles(ro.robust, lambda: 120)
     assert (solved.loss, solved.loss_over, solved.penalty) == (SQUARES, "equation", ro.robust.penalty)
     assert squares is not None
     assert (squares.loss, squares.over, squares.before) == (ro.robust.loss, "configuration", None)

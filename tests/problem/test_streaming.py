@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -119,6 +120,23 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     assert 0.9 < again.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
     assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
+
+
+TWICE = ro.Formulation("twice", loss=lambda r: 2 * cp.sum_squares(r), penalty=ro.tikhonov.penalty)
+
+
+@pytest.mark.parametrize(("formulation", "more"), [(ro.tikhonov, 0), (ro.robust, 0), (TWICE, 1)], ids=str)
+def test_parts_are_read_as_often_as_they_are_linearized(whole, parts, formulation, more: int) -> None:
+    """A loss of one's own is asked whether it is a sum of squares of so many equations: they are counted first."""
+    read = []
+
+    def reader() -> ro.Dataset:
+        read.append(1)
+        return parts[0]
+
+    problem = PartitionedProblem(whole.robot, whole.parameters, parts[0], [reader])
+    result = ro.calibrate(problem, formulation, 1.0, max_iterations=3)
+    assert len(read) == len(result.history) + 1 + more
 
 
 def test_bounds_on_parts(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
