@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -108,6 +108,24 @@ class Block(Brief):
         )
 
 
+class _Numbered:
+    """A field of numbers, or of a function that finds them, which is called when somebody first asks."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, data: Dataset | None, owner: type) -> np.ndarray:
+        if data is None:
+            raise AttributeError(self._name)  # the field has no default
+        own = vars(data)
+        if callable(own[self._name]):
+            own[self._name] = own[self._name]()
+        return own[self._name]
+
+    def __set__(self, data: Dataset, value: np.ndarray | Callable[[], np.ndarray]) -> None:
+        vars(data)[self._name] = value
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Dataset(Tabled):
     """Rows of measurements, of one kind or several.
@@ -120,7 +138,7 @@ class Dataset(Tabled):
         N row labels, unique.
     configuration
         (N,) number of the configuration a row belongs to: rows of one configuration stay together
-        in cross-validation.
+        in cross-validation. Or a function that returns them, called once when somebody asks.
 
     Examples
     --------
@@ -134,7 +152,7 @@ class Dataset(Tabled):
 
     blocks: tuple[Block, ...]
     label: tuple[str, ...]
-    configuration: np.ndarray
+    configuration: _Numbered = _Numbered()
 
     def _short(self) -> str:
         kinds = ", ".join(dict.fromkeys(block.measurement.name for block in self.blocks))

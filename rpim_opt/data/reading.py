@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -199,10 +200,18 @@ def _require_two_points(whole: Block, markers: Sequence[Sequence[str]], label: S
             raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
 
 
-def _configurations(table: Columns, q: Array) -> np.ndarray:
-    """Return the number of every row's configuration: as stated, or by equal joint values."""
+def _configurations(table: Columns, q: Array) -> np.ndarray | Callable[[], np.ndarray]:
+    """Return the number of every row's configuration: as stated, or what finds them by equal joint values.
+
+    That takes a third of the time in which a table is read, and who adds up its rows does not ask.
+    """
     if "configuration" in table:
         return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    return partial(_by_joints, q)
+
+
+def _by_joints(q: Array) -> np.ndarray:
+    """Return the number of every row's configuration by equal joint values (N, p, dof)."""
     joints = q.reshape(len(q), -1)
     first, which = np.unique(joints[:, 0], return_inverse=True)
     if len(first) == len(joints):  # then it alone decides the order, too; to sort numbers is ten times quicker

@@ -63,7 +63,7 @@ def identified_of(robot: Robot | None, parameters: Parameters, data: Dataset) ->
     blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(data.blocks))
     first = [int(block.row[0]) for block in data.blocks]
     labels = tuple(f"{data.label[row]}" for row in first)
-    few = Dataset(blocks, labels, data.configuration[first])
+    few = Dataset(blocks, labels, np.arange(len(blocks)))
     table = {each.name: getattr(parameters.free, each.name) for each in fields(Parameters)}
     return Identified(**table, machine=Machine(robot, parameters, few))
 

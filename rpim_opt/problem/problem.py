@@ -190,6 +190,8 @@ class CalibrationProblem(Tabled):
         return frozenset(block.robot for block in self.data.blocks)
 
     def _rows_of(self, robot: str) -> Dataset:
+        if self._present == {robot}:
+            return self.data
         return replace(self.data, blocks=tuple(block for block in self.data.blocks if block.robot == robot))
 
     def on(self, data: Dataset) -> CalibrationProblem:
@@ -562,7 +564,7 @@ class CalibrationProblem(Tabled):
         if R is None:
             raise InputError("data", "no row", "at least one")
         R[:, -1] += R[:, :-1] @ (x / self.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
-        return from_triangle(self._model(R[:, :-1], R[:, -1], self.data.configuration[:0]), R, equations)
+        return from_triangle(self._model(R[:, :-1], R[:, -1], np.zeros(n, dtype=int)), R, equations)
 
     def _spans(self, most: int) -> Iterator[tuple[int, slice]]:
         """Yield the number of a block and some of its rows, until all have come, ``most`` at a time."""

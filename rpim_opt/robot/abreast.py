@@ -42,6 +42,8 @@ class Abreast(NamedTuple):
     """A function of rows in two: ``common`` (shared inputs) and ``rows`` (that, rows (width, k)) -> (width, numbers).
 
     ``shapes`` are those of the function's outputs; ``machine_code`` is what evaluates any number of rows, or None.
+    ``angles``, if any, is (common, rows) -> (width, t): their sines, and then their cosines, are t columns each that
+    ``rows`` takes besides.
     """
 
     common: ca.Function
@@ -49,6 +51,7 @@ class Abreast(NamedTuple):
     width: int
     shapes: tuple[tuple[int, int], ...]
     machine_code: MachineCode | None = None
+    angles: ca.Function | None = None
 
 
 class _Effort:
@@ -131,17 +134,17 @@ def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
 
 @lru_cache(maxsize=256)
 def _machine_code(function: ca.Function, shared: int, make: bool) -> Abreast | None:
-    way = abreast(function, shared, VECTOR)
-    if way is None:
+    way = abreast(function, shared, VECTOR, apart=True)
+    if way is None or way.angles is None:
         return None
-    made = compiled(way.rows, make)
+    made = compiled(way.rows, way.angles, make)
     if made is None:
         return None
     return way._replace(machine_code=made)
 
 
 @lru_cache(maxsize=256)
-def abreast(function: ca.Function, shared: int, width: int) -> Abreast | None:
+def abreast(function: ca.Function, shared: int, width: int, apart: bool = False) -> Abreast | None:
     """Return a function of scalar operations on many rows; None for one that calls others.
 
     Parameters
@@ -152,6 +155,8 @@ def abreast(function: ca.Function, shared: int, width: int) -> Abreast | None:
         Number of inputs that are the same for all rows.
     width
         Rows.
+    apart
+        Whether sines and cosines of the same angle, which cost less together, are left to who evaluates it.
     """
     if not function.is_a("SXFunction"):
         return None
@@ -162,35 +167,70 @@ def abreast(function: ca.Function, shared: int, width: int) -> Abreast | None:
         left, symbols, values = ca.extract_parametric(numbers, given, {"extract_trivial": True})
         common = ca.Function("common", inputs[:shared], [ca.vertcat(ca.SX(0, 1), *values)])
         scalar = ca.Function("scalar", [ca.vertcat(ca.SX(0, 1), *symbols), inputs[-1]], [left])
-        rows = _widened(scalar, width)
-    if rows is None:
+        widened = _widened(scalar, width, apart)
+    if widened is None:
         return None
-    return Abreast(common, rows, width, tuple(function.size_out(i) for i in range(function.n_out())))
+    rows, angles = widened
+    shapes = tuple(function.size_out(i) for i in range(function.n_out()))
+    return Abreast(common, rows, width, shapes, angles=angles if apart else None)
 
 
-def _widened(scalar: ca.Function, width: int) -> ca.Function | None:
-    """Return a function (common, row) -> numbers with the rows of a table (width, k) in the place of a row."""
+class _Angles:
+    """Angles of rows with symbols for their sines and cosines; none that depends on such a symbol itself."""
+
+    def __init__(self, width: int):
+        self.width = width
+        self.angles: list[ca.MX] = []
+        self.turned: dict[int, list[ca.MX]] = {ca.OP_SIN: [], ca.OP_COS: []}
+        self._known: dict[int, tuple[int, ca.MX]] = {}
+
+    def symbol(self, operation: int, angle: ca.MX) -> ca.MX:
+        """Return what stands for the sine or the cosine of an angle."""
+        if hash(angle) not in self._known:  # the node's address, which nothing else has as long as it is kept
+            self._known[hash(angle)] = len(self.angles), angle
+            self.angles.append(_dense(angle, self.width))
+            for symbols in self.turned.values():
+                symbols.append(ca.MX.sym("turned", self.width))
+        return self.turned[operation][self._known[hash(angle)][0]]
+
+
+def _widened(scalar: ca.Function, width: int, apart: bool) -> tuple[ca.Function, ca.Function] | None:
+    """Return a function (common, row) -> numbers with the rows of a table (width, k) in the place of a row.
+
+    And the angles of those rows whose sines and cosines it takes besides: none unless they stand apart.
+    """
     common = ca.MX.sym("common", scalar.size1_in(0))
     table = ca.MX.sym("rows", width, scalar.size1_in(1))
     inputs = (ca.vertsplit(common), ca.horzsplit(table))
     column = ca.MX.zeros(width, 1)
     values: dict[int, ca.MX] = {}
     found = [column] * scalar.size1_out(0)
+    angles = _Angles(width)
+    turned: dict[int, bool] = {}  # whether a value depends on a sine or a cosine
     for k in range(scalar.n_instructions()):
         operation = scalar.instruction_id(k)
         taken = scalar.instruction_input(k)
         put = scalar.instruction_output(k)
         if operation == ca.OP_OUTPUT:
             found[put[1]] = _dense(values[taken[0]], width)
-        elif operation == ca.OP_INPUT:
-            values[put[0]] = inputs[taken[0]][taken[1]]
+            continue
+        turns = False
+        if operation == ca.OP_INPUT:
+            value = inputs[taken[0]][taken[1]]
         elif operation == ca.OP_CONST:
-            values[put[0]] = ca.MX(scalar.instruction_constant(k))
+            value = ca.MX(scalar.instruction_constant(k))
         elif operation in (ca.OP_CALL, ca.OP_PARAMETER):
             return None
+        elif apart and operation in angles.turned and not turned[taken[0]]:
+            turns = True
+            value = angles.symbol(operation, values[taken[0]])
         else:
-            values[put[0]] = _operation(operation, [values[i] for i in taken])
-    return ca.Function("abreast", [common, table], [ca.horzcat(*found)])
+            turns = any(turned[i] for i in taken)
+            value = _operation(operation, [values[i] for i in taken])
+        values[put[0]], turned[put[0]] = value, turns
+    both = [*angles.turned[ca.OP_SIN], *angles.turned[ca.OP_COS]]
+    rows = ca.Function("abreast", [common, table, *both], [ca.horzcat(*found)])
+    return rows, ca.Function("angles", [common, table], [ca.horzcat(ca.MX(width, 0), *angles.angles)])
 
 
 def _operation(operation: int, values: list[Any]) -> ca.MX:
@@ -265,12 +305,13 @@ def _own(way: Abreast, _thread: int) -> _Own:
 
 def _places(found: Sequence[Array]) -> np.ndarray:
     """Return where in memory the first row's numbers of arrays (c, r, N) stand, (numbers,)."""
-    places = []
-    for into in found:
-        c, r, _ = into.shape
-        further = np.add.outer(into.strides[0] * np.arange(c), into.strides[1] * np.arange(r))
-        places.append(into.ctypes.data + further.ravel())
-    return np.concatenate(places)
+    return np.concatenate([into.ctypes.data + _further(into.shape[:2], into.strides[:2]) for into in found])
+
+
+@lru_cache(maxsize=64)
+def _further(shape: tuple[int, ...], strides: tuple[int, ...]) -> np.ndarray:
+    """Return how much further in memory every number stands than the first one, (c * r,)."""
+    return np.add.outer(strides[0] * np.arange(shape[0]), strides[1] * np.arange(shape[1])).ravel()
 
 
 def _on_columns(way: Abreast, shared: Sequence[Array], rows: Array, found: Sequence[Array], factors: Array) -> None:

@@ -41,7 +41,9 @@ CASADI_SYMBOL_EXPORT void rows(const double* common, const double* table, long l
   const casadi_real* arg[{sz_arg}];
   casadi_real* res[{sz_res}];
   casadi_int iw[{sz_iw} + 1];
-  double *given = work, *numbers = given + {inputs}*{width}, *own = numbers + {numbers}*{width};
+  double *given = work, *turns = given + {inputs}*{width}, *sines = turns + {angles}*{width};
+  double *cosines = sines + {angles}*{width}, *numbers = cosines + {angles}*{width};
+  double *own = numbers + {numbers}*{width};
   for (long long start = 0; start < N; start += {width}) {{
     const int there = N - start < {width} ? (int)(N - start) : {width};
     const double* first = table + start*{inputs};
@@ -49,6 +51,19 @@ CASADI_SYMBOL_EXPORT void rows(const double* common, const double* table, long l
       for (int i = 0; i < {width}; ++i) given[k*{width} + i] = first[(i < there ? i : there - 1)*{inputs} + k];
     arg[0] = common;
     arg[1] = given;
+    res[0] = turns;
+    angles(arg, res, iw, own, 0);
+    for (int i = 0; i < {angles}*{width}; ++i) {{
+      const double angle = turns[i];
+      sines[i] = sin(angle);
+      cosines[i] = cos(angle);
+    }}
+    arg[0] = common;
+    arg[1] = given;
+    for (int k = 0; k < {angles}; ++k) {{
+      arg[2 + k] = sines + k*{width};
+      arg[2 + {angles} + k] = cosines + k*{width};
+    }}
     res[0] = numbers;
     {name}(arg, res, iw, own, 0);
     for (int k = 0; k < {numbers}; ++k) {{
@@ -62,16 +77,18 @@ CASADI_SYMBOL_EXPORT void rows(const double* common, const double* table, long l
   }}
 }}
 """
-"""C of what evaluates a function of some rows abreast at any number of them; the last one stands for those missing."""
+"""C of what evaluates a function of some rows abreast at any number of them; the last one stands for those missing.
+
+A sine and a cosine of one angle, side by side, are one call of C's library, which takes two thirds of the time."""
 
 
 class MachineCode:
-    """A function (common, rows (width, k)) -> numbers (width, n) that is evaluated at any number of rows.
+    """A function (common, rows (width, k), sines, cosines) -> numbers (width, n), evaluated at any number of rows.
 
     Parameters
     ----------
-    function
-        As CasADi has it.
+    function, angles
+        As `compiled` has them.
     library
         What was made of it.
 
@@ -81,12 +98,13 @@ class MachineCode:
         Where the file is no library.
     """
 
-    def __init__(self, function: ca.Function, library: Path):
+    def __init__(self, function: ca.Function, angles: ca.Function, library: Path):
         self._rows = ctypes.CDLL(str(library)).rows
         self._rows.restype = None
         address = ctypes.c_void_p
         self._rows.argtypes = [address, address, ctypes.c_longlong, address, address, ctypes.c_longlong, address]
-        self._size = function.nnz_in(1) + function.nnz_out(0) + function.sz_w()
+        self._size = function.nnz_in(1) + 3 * angles.nnz_out(0) + function.nnz_out(0)
+        self._size += max(function.sz_w(), angles.sz_w())
 
     def __call__(self, common: Array, rows: Array, places: np.ndarray, step: int, factors: Array) -> None:
         """Write a function's numbers of rows (N, k), times factors (n,).
@@ -108,8 +126,11 @@ class MachineCode:
 
 
 @lru_cache(maxsize=256)
-def compiled(function: ca.Function, make: bool = True) -> MachineCode | None:
+def compiled(function: ca.Function, angles: ca.Function, make: bool = True) -> MachineCode | None:
     """Return a function of rows abreast as machine code, a few times as fast as CasADi's virtual machine, or None.
+
+    It takes shared numbers, rows (width, k), and every sine and every cosine (width,) of the ``angles`` (width, t) of
+    the same inputs.
 
     Without ``make`` only a library that was made before is taken; None, too, where it cannot be made.
 
@@ -122,8 +143,9 @@ def compiled(function: ca.Function, make: bool = True) -> MachineCode | None:
     if os.environ.get(SWITCH) == "0" or compiler is None or folder is None:
         return None
     generator = ca.CodeGenerator(function.name())
+    generator.add(angles)
     generator.add(function)
-    source = generator.dump() + _driver(function)
+    source = generator.dump() + _driver(function, angles)
     made_of = "\0".join([source, *compiler, _version(compiler), *FLAGS, _processor(compiler), version("casadi")])
     library = (
         folder / f"{function.name()}-{hashlib.sha256(made_of.encode(errors='surrogateescape')).hexdigest()[:32]}.so"
@@ -131,16 +153,18 @@ def compiled(function: ca.Function, make: bool = True) -> MachineCode | None:
     if not _is_whole(library) and not (make and _make(library, source, compiler)):
         return None
     try:
-        return MachineCode(function, library)
+        return MachineCode(function, angles, library)
     except (OSError, AttributeError):
         return None
 
 
-def _driver(function: ca.Function) -> str:
+def _driver(function: ca.Function, angles: ca.Function) -> str:
     width, inputs = function.size_in(1)
+    both = (function, angles)
     return ROWS.format(
-        name=function.name(), width=width, inputs=inputs, numbers=function.size2_out(0),
-        sz_arg=function.sz_arg(), sz_res=function.sz_res(), sz_iw=function.sz_iw(),
+        name=function.name(), width=width, inputs=inputs, numbers=function.size2_out(0), angles=angles.size2_out(0),
+        sz_arg=max(of.sz_arg() for of in both), sz_res=max(of.sz_res() for of in both),
+        sz_iw=max(of.sz_iw() for of in both),
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.data import reading
 from rpim_opt.data.models import MEASUREMENTS
 from rpim_opt.problem import parts as streaming
 from rpim_opt.problem.linear import reduced_rows
@@ -120,6 +121,23 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     assert 0.9 < again.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
     assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
+
+
+def test_configurations_are_numbered_when_somebody_asks(whole: CalibrationProblem, monkeypatch) -> None:
+    block, asked, numbered = whole.data.blocks[0], [], reading._by_joints
+    columns = {f"q{i + 1}_rad": block.q[:, 0, i] for i in range(6)}
+    columns |= {f"{axis}_m": block.y[:, i] for i, axis in enumerate("xyz")}
+    monkeypatch.setattr(reading, "_by_joints", lambda q: asked.append(1) or numbered(q))
+    read = partial(ro.read_data, columns, whole.robot, {"position_mm": 0.05})
+    data = read()
+    PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: data]).linearize(np.zeros(33))
+    assert not asked
+    other = replace(read(), label=data.label)
+    assert np.array_equal(data.configuration, np.unique(data.q[:, 0], return_inverse=True)[1])
+    assert np.array_equal(data.configuration, other.configuration)
+    assert len(asked) == 2  # once each
+    monkeypatch.undo()
+    assert np.array_equal(pickle.loads(pickle.dumps(read())).configuration, data.configuration)
 
 
 TWICE = ro.Formulation("twice", loss=lambda r: 2 * cp.sum_squares(r), penalty=ro.tikhonov.penalty)
@@ -232,8 +250,8 @@ def jacobian_of(problem: CalibrationProblem):
 def test_machine_code_has_the_bits_of_the_virtual_machine(whole, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     native.compiled.cache_clear()
-    way = abreast(jacobian_of(whole), 2, 16)
-    made = native.compiled(way.rows)
+    way = abreast(jacobian_of(whole), 2, 16, apart=True)
+    made = native.compiled(way.rows, way.angles)
     if made is None:
         pytest.skip("no C compiler here")
     libraries = list((tmp_path / "rpim_opt").glob("*.so"))
@@ -253,22 +271,22 @@ def test_machine_code_has_the_bits_of_the_virtual_machine(whole, tmp_path: Path,
         assert np.array_equal(found if axis == 0 else found.T, wanted * factors)
     written = libraries[0].stat().st_mtime_ns
     native.compiled.cache_clear()
-    assert native.compiled(way.rows) is not None  # taken from the cache
+    assert native.compiled(way.rows, way.angles) is not None  # taken from the cache
     assert libraries[0].stat().st_mtime_ns == written
 
 
 def test_where_nothing_can_be_compiled_the_virtual_machine_stays(whole, tmp_path: Path, monkeypatch) -> None:
-    function = abreast(jacobian_of(whole), 2, 16).rows
+    way = abreast(jacobian_of(whole), 2, 16, apart=True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for name, value in (("CC", "no-such-compiler"), ("CC", "false"), (native.SWITCH, "0")):
         with monkeypatch.context() as context:
             context.setenv(name, value)
             native.compiled.cache_clear()
-            assert native.compiled(function) is None
+            assert native.compiled(way.rows, way.angles) is None
     (tmp_path / "rpim_opt").mkdir(exist_ok=True)
     os.chmod(tmp_path / "rpim_opt", 0o777)  # others could put their code there
     native.compiled.cache_clear()
-    assert native.compiled(function) is None
+    assert native.compiled(way.rows, way.angles) is None
     native.compiled.cache_clear()
 
 

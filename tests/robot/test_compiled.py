@@ -28,9 +28,10 @@ def function() -> ca.Function:
     return ca.Function("hardened", [x], [x**2 + ca.sin(x)])
 
 
-def rows_of_it() -> ca.Function:
+def rows_of_it() -> tuple[ca.Function, ca.Function]:
     """Return what is compiled of it."""
-    return ways.abreast(function(), 0, ways.VECTOR).rows
+    way = ways.abreast(function(), 0, ways.VECTOR, apart=True)
+    return way.rows, way.angles
 
 
 @pytest.fixture
@@ -69,7 +70,7 @@ def forget() -> None:
 
 def made() -> native.MachineCode | None:
     forget()
-    return native.compiled(rows_of_it())
+    return native.compiled(*rows_of_it())
 
 
 CODE = "from tests.robot.test_compiled import made; assert made() is not None"
@@ -119,7 +120,7 @@ def test_a_damaged_library_is_made_anew(library: Path, damage: str) -> None:
     path = library
     whole = path.read_bytes()
     path.write_bytes(DAMAGE[damage](whole))
-    assert native.compiled(rows_of_it(), make=False) is None
+    assert native.compiled(*rows_of_it(), make=False) is None
     assert_right(made())
     assert path.read_bytes() == whole
 
@@ -159,7 +160,7 @@ def test_a_library_that_others_can_write_is_not_loaded(cache: Path, library: Pat
     else:
         path.rename(cache / "elsewhere")
         path.symlink_to(cache / "elsewhere")
-    assert native.compiled(rows_of_it(), make=False) is None
+    assert native.compiled(*rows_of_it(), make=False) is None
     assert_right(made())
     found = path.lstat()
     assert stat.S_ISREG(found.st_mode)
@@ -189,7 +190,7 @@ def kill(command):
     return b""
 
 native._run = kill
-native.compiled(rows_of_it())
+native.compiled(*rows_of_it())
 """
 
 
