@@ -129,6 +129,13 @@ def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:
     return np.column_stack([columns[stem, ""] for stem in stems])
 
 
+def _side_by_side(points: Sequence[Array]) -> Array:
+    """Return values (N, dof) of every point as one array (N, p, dof); of one point without a copy."""
+    if len(points) == 1:
+        return points[0][:, None]
+    return np.stack(points, axis=1)
+
+
 def _joint_values(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
     """Return the joint values (N, p, dof); the second point is in the same configuration unless it states its own."""
     joints = [f"q{i}" for i in range(1, robot.dof + 1)]
@@ -137,7 +144,7 @@ def _joint_values(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> 
         points.append(_several(columns, [f"to_{stem}" for stem in joints], N))
     elif kind.points == 2:
         points.append(points[0])
-    return np.stack(points, axis=1)
+    return _side_by_side(points)
 
 
 def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array | None:
@@ -150,7 +157,7 @@ def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: 
         names = [f"to_{name}" for name in names]
     if kind.points == 2:
         points.append(_several(columns, names, N))
-    return np.stack(points, axis=1)
+    return _side_by_side(points)
 
 
 def _approach(columns: Numbers, robot: Robot, kind: Measurement, label: Sequence[str]) -> Array | None:

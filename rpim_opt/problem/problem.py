@@ -585,17 +585,15 @@ class CalibrationProblem(Tabled):
 
     def _write(self, x: Array, i: int, part: slice, found: Array) -> None:
         """Write the whitened, scaled [A r] of N rows of a block into ``found`` (n + 1, k, N); b = r + A z."""
-        block, whitening = self.data.blocks[i], self._whitening[i]
-        scale = self.parameters.free.scale
-        diagonal = np.diagonal(whitening[0])
-        if len(whitening) == 1 and np.count_nonzero(whitening) == len(diagonal):  # then the whole is a factor a number
+        block, whitening, factors = self.data.blocks[i], self._whitening[i], self._factors[i]
+        if factors is not None:
             into = [found[-1:], found[:-1].transpose(1, 0, 2)]
-            factors = [diagonal[None], diagonal[:, None] * scale]
             function = self._functions(block)["jacobian"]
             rows = self._rows(block, part)
             with phase("evaluation"):
                 write(function, [x, self.parameters.nominal], rows, into, factors)
             return
+        scale = self.parameters.free.scale
         L = whitening if len(whitening) == 1 else whitening[part]
         residual, jacobian = self._evaluate(block, "jacobian", x, part, passing=True)
         _weigh(L, jacobian.transpose(1, 2, 0), scale, found[:-1])
@@ -826,6 +824,21 @@ class CalibrationProblem(Tabled):
         if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
             raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
         return [_whitening(covariance) for covariance in self.covariances()]
+
+    @cached_property
+    def _factors(self) -> list[Array | None]:
+        """By what the numbers of a block's residual (k,) and Jacobian (k, n) are multiplied to be whitened and scaled.
+
+        None where that takes more: components that are correlated, or rows that are not alike.
+        """
+        found: list[Array | None] = []
+        for whitening in self._whitening:
+            diagonal = np.diagonal(whitening[0])
+            factors = None
+            if len(whitening) == 1 and np.count_nonzero(whitening) == len(diagonal):
+                factors = np.concatenate([diagonal, np.outer(diagonal, self.parameters.free.scale).ravel()])
+            found.append(factors)
+        return found
 
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].

@@ -85,18 +85,12 @@ def evaluated(function: ca.Function, shared: Sequence[Array], rows: Array, passi
         numbers = room("evaluated", size, len(rows))
     else:
         numbers = np.empty((size, len(rows)))
-    found = []
-    end = 0
-    for r, c in way.shapes:
-        begin, end = end, end + r * c
-        found.append(numbers[begin:end].reshape(c, r, len(rows)))
+    found = _of_outputs(numbers, [(c, r) for r, c in way.shapes])
     _on_columns(way, shared, rows, found, np.ones(size))
     return [values.transpose(2, 0, 1) for values in found]
 
 
-def write(
-    function: ca.Function, shared: Sequence[Array], rows: Array, found: Sequence[Array], factors: Sequence[Array]
-) -> None:
+def write(function: ca.Function, shared: Sequence[Array], rows: Array, found: Sequence[Array], factors: Array) -> None:
     """Write what `evaluated` returns, times factors, to where it is wanted, as quickly.
 
     Parameters
@@ -106,14 +100,25 @@ def write(
     found
         An array (c, r, N) for every output (r, c); from row to row they all go as far in memory.
     factors
-        Of every output's numbers, (c, r).
+        Of all outputs' numbers, one output after the other.
     """
     way = _quickest(function, len(shared), len(rows))
-    if way is None:
-        for into, factor, values in zip(found, factors, call_rows(function, shared, rows), strict=True):
-            np.multiply(values.transpose(1, 2, 0), factor[:, :, None], out=into)
+    if way is not None:
+        _on_columns(way, shared, rows, found, factors)
         return
-    _on_columns(way, shared, rows, found, np.concatenate([factor.ravel() for factor in factors]))
+    by_output = _of_outputs(factors[:, None], [into.shape for into in found])
+    for into, factor, values in zip(found, by_output, call_rows(function, shared, rows), strict=True):
+        np.multiply(values.transpose(1, 2, 0), factor, out=into)
+
+
+def _of_outputs(numbers: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Return numbers (n, m) of all outputs by output, each (c, r, m)."""
+    parts = []
+    end = 0
+    for c, r, *_ in shapes:
+        begin, end = end, end + c * r
+        parts.append(numbers[begin:end].reshape(c, r, numbers.shape[1]))
+    return parts
 
 
 def _quickest(function: ca.Function, shared: int, rows: int) -> Abreast | None:
@@ -290,12 +295,10 @@ class _Own:
         self.table[:, :there] = rows.T
         self.table[:, there:] = rows[-1][:, None]
         self.rows.evaluate()
-        end = 0
-        for into in found:
-            c, r, _ = into.shape
-            begin, end = end, end + c * r
-            numbers = self.numbers[begin:end, :there].reshape(into.shape)
-            np.multiply(numbers, factors[begin:end].reshape(c, r, 1), out=into)
+        shapes = [into.shape for into in found]
+        numbers, by_output = (_of_outputs(each, shapes) for each in (self.numbers[:, :there], factors[:, None]))
+        for into, factor, values in zip(found, by_output, numbers, strict=True):
+            np.multiply(values, factor, out=into)
 
 
 @lru_cache(maxsize=64)
