@@ -117,10 +117,10 @@ class _Numbered:
     def __get__(self, data: Dataset | None, owner: type) -> np.ndarray:
         if data is None:
             raise AttributeError(self._name)  # the field has no default
-        own = vars(data)
-        if callable(own[self._name]):
-            own[self._name] = own[self._name]()
-        return own[self._name]
+        value: Any = vars(data)[self._name]
+        if callable(value):
+            value = vars(data)[self._name] = value()
+        return value
 
     def __set__(self, data: Dataset, value: np.ndarray | Callable[[], np.ndarray]) -> None:
         vars(data)[self._name] = value

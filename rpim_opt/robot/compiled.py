@@ -24,10 +24,11 @@ from rpim_opt.basics.room import room
 from rpim_opt.basics.writing import scratch_folder, write_files
 
 FLAGS = (
-    "-O2", "-march=native", "-ftree-vectorize", "-ffp-contract=off", "-fno-semantic-interposition", "-fPIC", "-shared",
+    "-O2", "-march=native", "-ftree-vectorize", "-ffp-contract=off", "-fPIC", "-shared",
+    "-fvisibility=hidden", "-DCASADI_SYMBOL_EXPORT=",
 )  # fmt: skip
-"""No product is fused with a sum, so that machine code has the virtual machine's last bits; nobody replaces CasADi's
-own small functions, so that they may be inlined. -O3 unrolls the loops over rows, which takes longer."""
+"""No product is fused with a sum, so that machine code has the virtual machine's last bits. Nobody sees CasADi's own
+functions, so that they may be inlined. -O3 unrolls the loops over rows, which takes longer."""
 SWITCH = "RPIM_OPT_COMPILE"
 """Environment variable; 0 leaves everything to CasADi's virtual machine."""
 PATIENCE = 120
@@ -36,8 +37,9 @@ OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 ROWS = """
-CASADI_SYMBOL_EXPORT void rows(const double* common, const double* table, long long N, double* work,
-                               double* const* found, long long step, const double* factor) {{
+__attribute__((visibility("default")))
+void rows(const double* common, const double* table, long long N, double* work, double* const* found, long long step,
+          const double* factor) {{
   const casadi_real* arg[{sz_arg}];
   casadi_real* res[{sz_res}];
   casadi_int iw[{sz_iw} + 1];
