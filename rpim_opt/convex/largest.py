@@ -146,9 +146,9 @@ def of_norms(found: Topmost, starts: np.ndarray, equations: int) -> Largest | No
     return Largest(a, c + found.constant, np.zeros(equations), starts, signed=False)
 
 
-def of_equations(found: Topmost, order: np.ndarray) -> Largest | None:
-    """Return the largest over equations, put in another order; None where some do not matter."""
-    a, c = (each[order] for each in _each(found, len(order)))
+def of_equations(found: Topmost, equations: int) -> Largest | None:
+    """Return the largest over equations; None where some do not matter."""
+    a, c = _each(found, equations)
     constant = np.full(len(a), found.constant)
     if not np.all(a):
         return None

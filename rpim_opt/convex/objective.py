@@ -266,7 +266,7 @@ class Objective(Brief):
 
     @property
     def order(self) -> np.ndarray:
-        """(m,) equations in the order of their configurations."""
+        """(m,) equations in the order of their configurations, or as they are where the loss is over equations."""
         return self._posed.order
 
     @cached_property

@@ -186,12 +186,14 @@ class Posed:
         if found is None:
             return None
         if self.formulation.loss_over == "equation":
-            return of_equations(found, self.order)
+            return of_equations(found, len(self.groups))
         return of_norms(found, np.flatnonzero(np.diff(self.groups[self.order], prepend=-1)), len(self.groups))
 
     @cached_property
     def order(self) -> np.ndarray:
-        """(m,) equations in the order of their configurations."""
+        """(m,) equations in the order of their configurations; as they are, where the loss knows each by its place."""
+        if self.formulation.loss_over == "equation":
+            return np.arange(len(self.groups))
         return np.argsort(self.groups, kind="stable")
 
     @cached_property

@@ -76,6 +76,20 @@ def test_the_minimum_is_that_of_the_written_problem(name: str, over: str) -> Non
     assert program.solve(0.7).objective == pytest.approx(written, rel=1e-8)
 
 
+@pytest.mark.parametrize("loss", [EQUATIONS["weighed"], lambda r: cp.norm_inf(cp.multiply(np.geomspace(1, 9, 30), r))])
+def test_a_loss_knows_equations_by_their_places_however_configurations_are_mixed(loss: Any) -> None:
+    mixed = replace(MODEL, group=np.random.default_rng(5).permutation(MODEL.group))
+    formulation = ro.Formulation("mine", loss=loss, penalty=cp.sum_squares)
+    program = ro.convex.pose(formulation, mixed)
+    assert program.separated is not None or program.worst is not None
+    found = program.solve(0.7)
+    assert found.objective == pytest.approx(program.objective(found.z, 0.7), rel=1e-12)
+    assert found.objective == pytest.approx(ro.convex.pose(formulation, MODEL).solve(0.7).objective, rel=1e-9)
+    some = program.without(mixed.group == 3).solve(0.7)
+    expected = ro.convex.pose(formulation, mixed.scaled(np.where(mixed.group == 3, 0.0, 1.0))).solve(0.7)
+    assert some.objective == pytest.approx(expected.objective, rel=1e-9)
+
+
 @pytest.mark.parametrize(("name", "over"), CASES)
 def test_no_point_lies_lower_than_the_gap_allows(name: str, over: str) -> None:
     """At points of all kinds, some near the minimum, objective - gap is a lower bound."""
