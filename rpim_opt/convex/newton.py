@@ -35,6 +35,8 @@ SLOW = 0.05
 """Part of what a step with an old second derivative promises that it may leave."""
 ROUND = 1e-12
 """Changes of slope below this part of what lengths allow tell nothing."""
+CANCELLED = 1e-4
+"""Part of the longest residual on the way that is left of it when it is computed anew: steps add up its rounding."""
 
 _potrf: Any
 _potrs: Any
@@ -44,7 +46,8 @@ _potrf, _potrs = get_lapack_funcs(("potrf", "potrs"), (np.empty(1),))
 class Point(NamedTuple):
     """Where the method is: z (n,), coordinates a (p,), residual (m,), the kinks' state, and the smoothed loss there.
 
-    With the loss's slope by the coordinates (p,), where a descent has been.
+    With the loss's slope by the coordinates (p,), where a descent has been, and the square of the longest residual that
+    it was added up from.
     """
 
     z: Array
@@ -53,6 +56,7 @@ class Point(NamedTuple):
     kinked: Kinked
     smooth: Smoothed
     along: Array | None = None
+    longest: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +395,10 @@ class Newton(Whitened):
         found = searched(at, rise, point, self.box is None)
         if found is point:
             return point
-        return found._replace(z=self._place(found))
+        found = found._replace(z=self._place(found), longest=max(point.longest, float(point.r.dot(point.r))))
+        if found.r.dot(found.r) <= CANCELLED**2 * found.longest:
+            return self._placed(found.z, found.kinked)
+        return found
 
     def _place(self, point: Point) -> Array:
         """Return z (n,) of a point that a search has found: free of rounding, or inside the box."""

@@ -142,6 +142,18 @@ def test_a_second_derivative_that_promises_nothing_finite_is_computed_anew(
     assert found.steps <= method.minimum(Z).steps + 1
 
 
+@pytest.mark.parametrize("box", [None, BOX])
+@pytest.mark.parametrize(("name", "over"), SMOOTH)
+def test_from_far_away_the_residual_is_that_of_the_point(name: str, over: str, box: tuple[Array, Array] | None) -> None:
+    """Sums of steps would keep the rounding of the first: the gap were that of other data."""
+    wide = None if box is None else (1e12 * box[0], 1e12 * box[1])
+    method, _ = made(name, over, box=wide)
+    ended = method.minimum(1e10 * Z)
+    assert ended.good
+    assert ended.objective == pytest.approx(method.objective(ended.z), rel=1e-12)
+    assert ended.objective == pytest.approx(method.minimum(Z).objective, rel=1e-10)
+
+
 @pytest.mark.parametrize(("name", "over"), SMOOTH)
 def test_what_is_promised_is_what_a_quadratic_would_give(name: str, over: str) -> None:
     method, _ = made(name, over)
