@@ -18,6 +18,8 @@ RAISED, SAME = 1e-4, 1e-12
 """By how much norms are raised to see whether they matter to a loss; relative change of it that is rounding."""
 CLOSE = 3.0
 """Ratio of weights up to which a path is about a line between them."""
+KEPT = 500_000_000
+"""Bytes of equations that are kept for all parts together; of more, what is left without a part is made when asked."""
 MANY = 1_000_000
 """Residuals that are in memory together, of many weights."""
 
@@ -135,42 +137,45 @@ class Folds:
     """
 
     def __init__(self, program: Program, parts: Sequence[np.ndarray]):
-        self._whole = program
-        self._out = [np.isin(program.model.group, part) for part in parts]
-        self._programs = list(_folds(program, parts))
+        self._whole, self._parts = program, parts
+        self._kept: list[Program] = []
+        if program.on_triangles or len(parts) * program.model.A.nbytes <= KEPT:
+            self._kept = list(_folds(program, parts))
         self._met: list[dict[float, Array]] = [{} for _ in parts]
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
         if self._whole.worst is not None:  # most parts have no say in a largest norm: the minimum stays without them
             self._whole.path(weights, rough=True)
-        return np.hstack([self._norms(k, weights) for k in range(len(self._out))])
+        return np.hstack([self._norms(k, weights) for k in range(len(self._parts))])
 
     def _norms(self, k: int, weights: Array) -> Array:
-        model, out = self._whole.model, self._out[k]
-        Z = self._minima(k, weights)
+        model = self._whole.model
+        out = np.isin(model.group, self._parts[k])
+        program = self._kept[k] if self._kept else self._whole.without(out)
+        Z = self._minima(k, program, weights)
         squares = (Z @ model.A[out].T - model.b[out]) ** 2
         _, which = np.unique(model.group[out], return_inverse=True)
         sums = np.zeros((len(weights), which.max() + 1))
         np.add.at(sums.T, which, squares.T)
         return np.sqrt(sums)
 
-    def _minima(self, k: int, weights: Array) -> Array:
+    def _minima(self, k: int, program: Program, weights: Array) -> Array:
         """Return the solutions (K, n) without a part; of a penalty with kinks each from the nearest that is known."""
-        program, met = self._programs[k], self._met[k]
+        met = self._met[k]
         if program.faces is None or not (weights > 0).all():
             return np.array([estimate.z for estimate in program.path(weights, rough=True)])
         for weight in sorted({*weights.tolist()}, reverse=True):
-            met[weight] = program.path([weight], self._near(k, weight), rough=True)[0].z
+            met[weight] = program.path([weight], self._near(k, program, weight), rough=True)[0].z
         return np.array([met[weight] for weight in weights.tolist()])
 
-    def _near(self, k: int, weight: float) -> Array | None:
+    def _near(self, k: int, program: Program, weight: float) -> Array | None:
         """Return a point near the solution without a part: between its neighbours, or that without the part before."""
         near = between(self._met[k], weight)
         if k == 0:
             return near
         other = self._met[k - 1][weight]
-        faces, split = self._programs[k].faces, self._programs[k].split
+        faces, split = program.faces, program.split
         if near is None or faces is None or split is None:
             return other
         return min(other, near, key=lambda z: faces.value(split.y(z), weight))

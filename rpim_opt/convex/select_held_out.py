@@ -152,9 +152,8 @@ def _held_out(program: Program, name: str, parts: Sequence[np.ndarray] | None, e
         best = int(np.argmin(score))
     else:
         grid = weight_grid(program, COARSE)
-        error = _error_of_folds(program, parts)
-        if parts is None and not exact:
-            error = _quickly(program)
+        quickly = parts is None and not exact
+        error = _quickly(program) if quickly else _error_of_folds(program, parts)
         weights, score, best = searched(error, grid)
     interior = 0 < best < len(weights) - 1
     note = "smallest error of configurations held out"

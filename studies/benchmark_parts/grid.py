@@ -19,8 +19,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 
 RULES: dict[str, Any] = {"number": 1.0, **SELECTORS}
 """One weight, and every selector."""
-SEPARABLE = ("least_squares", "tikhonov", "bounded", "robust", "sum_of_norms")
-"""Whose loss is a sum over configurations: at 20,000 the others keep a program of 60,000 equations."""
 PATIENCE = {40: 30, 1_000: 60, 20_000: 240}
 """Seconds that a cell gets, by configurations."""
 TIMES, ENOUGH = 6, 6.0
@@ -34,10 +32,7 @@ def cells(quick: bool) -> list[dict[str, Any]]:
     if quick:
         rules = ("number", "reml", "l_curve", "gcv")
         return [_cell(name, rule, 40) for name in FORMULATIONS for rule in rules if _applies(name, rule)]
-    found = [
-        _cell(name, rule, n) for n in (40, 1_000) for name in FORMULATIONS for rule in RULES if _applies(name, rule)
-    ]
-    return found + [_cell(name, rule, 20_000) for name in SEPARABLE for rule in RULES if _applies(name, rule)]
+    return [_cell(name, rule, n) for n in PATIENCE for name in FORMULATIONS for rule in RULES if _applies(name, rule)]
 
 
 def _cell(formulation: str, rule: str, count: int) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import newton_step
+from rpim_opt.convex import left_out, newton_step, select_held_out
 from rpim_opt.convex.left_out import Folds, _folds, solved, solved_again, without_say
 from rpim_opt.convex.newton_step import NewtonStep
+from rpim_opt.convex.program import Program
 from rpim_opt.convex.select_held_out import _left_out_error, held_out_error
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_faces import box, whitened
@@ -72,6 +73,34 @@ def test_weights_asked_for_later_get_what_they_would_have_got_alone(formulation:
     later = np.array([1.2, 3.0, 0.3, 40.0])
     alone = np.vstack([Folds(ro.convex.pose(formulation, MODEL), parts).norms(later[[k]]) for k in range(4)])
     assert folds.norms(later) == pytest.approx(alone, rel=off)
+
+
+@pytest.mark.parametrize("formulation", [ro.robust, ro.sum_of_norms, ro.minimax], ids=lambda f: f.name)
+def test_equations_that_are_too_many_to_be_kept_for_every_part_are_left_out_when_asked(
+    formulation: ro.Formulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, weights = [np.array([0, 5]), np.array([1]), np.arange(6, 12)], np.array([40.0, 2.0, 0.3])
+    program = ro.convex.pose(formulation, MODEL)
+    kept = Folds(program, parts).norms(weights)
+    monkeypatch.setattr(left_out, "KEPT", 3 * MODEL.A.nbytes - 1)
+    made = []
+    without = Program.without
+    monkeypatch.setattr(Program, "without", lambda self, out: made.append(out) or without(self, out))
+    folds = Folds(ro.convex.pose(formulation, MODEL), parts)
+    assert made == []
+    assert folds.norms(weights) == pytest.approx(kept, rel=1e-4)
+    assert len(made) == 3
+
+
+def test_what_few_have_a_say_in_is_not_solved_without_everybody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Copies of all equations, one a configuration, fill the memory."""
+    made = []
+    monkeypatch.setattr(select_held_out, "Folds", lambda *asked: made.append(asked) or Folds(*asked))
+    program = ro.convex.pose(ro.minimax, MODEL)
+    quick = ro.leave_one_out(program)
+    assert made == []
+    assert quick.weight == pytest.approx(ro.leave_one_out(program, exact=True).weight, rel=1e-2)
+    assert len(made) == 1
 
 
 def test_a_step_of_squares_is_exact_where_the_face_stays() -> None:
