@@ -147,12 +147,9 @@ class Learning:
         rounds
             How often the evidence is asked.
         """
-        fit = self._once(problem, x, [] if before is None else [before], STEPS)
+        fit = self._once(problem, x, before, before is None, STEPS)
         for k in range(1, rounds):
-            known = [fit.point.logs]
-            if k == 1 and fit.several:
-                known += [other.logs for other in fit.others]
-            again = self._once(problem, fit.x, known, STEPS * 2**k)
+            again = self._once(problem, fit.x, fit.point.logs, k == 1 and fit.several, STEPS * 2**k)
             moved = _moved(again.x, fit.x, again.laid)
             resized = np.abs(again.point.logs - fit.point.logs).max()
             fit = replace(again, others=again.others or fit.others)
@@ -160,10 +157,12 @@ class Learning:
                 break
         return fit
 
-    def _once(self, problem: CalibrationProblem, x: Array, known: Sequence[Array], steps: int) -> Fit:
-        """Return sizes at one linearization, from known ones (s,) on if any, and the deviations that they lead to."""
+    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, steps: int) -> Fit:
+        """Return sizes at one linearization, from known ones (s,) and from several sides, and what they lead to."""
         evidence = self.evidence(problem, x)
-        starts = known or evidence.starts()[: None if few(problem) else 1]
+        starts = [] if known is None else [known]
+        if several:
+            starts += evidence.starts()[: None if few(problem) else 1]
         with phase("selection"):
             point, *others = evidence.mode(starts)
         laid = self.laid(problem, evidence, point, x)
