@@ -15,7 +15,7 @@ from rpim_opt.calibration.learned import Learned
 from rpim_opt.calibration.learning import sampled
 from rpim_opt.calibration.models import compared, extended, restricted, size_names
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.sizing import Learning, few
+from rpim_opt.calibration.sizing import Learning, sides
 from rpim_opt.convex.evidence import CENTRES, Evidence, Point
 from rpim_opt.convex.prior import Prior, family_of
 from rpim_opt.problem.problem import CalibrationProblem
@@ -111,10 +111,8 @@ class Comparison:
         evidence = restricted(self.columns, used)
         if self.result.learned is not None:
             first = [_learned_by(self.result.learned, evidence)]
-        elif few(self.problem):
-            first = evidence.starts()
         else:
-            first = evidence.starts()[:1]
+            first = sides(self.problem, evidence)
         return Judged((), self.own, evidence, evidence.mode(first, EXACT)[0])
 
     @cached_property

@@ -162,7 +162,7 @@ class Learning:
         evidence = self.evidence(problem, x)
         starts = [] if known is None else [known]
         if several:
-            starts += evidence.starts()[: None if few(problem) else 1]
+            starts += sides(problem, evidence)
         with phase("selection"):
             point, *others = evidence.mode(starts)
         laid = self.laid(problem, evidence, point, x)
@@ -195,9 +195,12 @@ def _moved(x: Array, before: Array, laid: CalibrationProblem) -> float:
     return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
-def few(problem: CalibrationProblem) -> bool:
-    """Return whether the configurations are so few that the evidence may have several optima."""
-    return len(np.unique(problem.data.configuration)) <= FEW
+def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
+    """Return where its optimum is looked for: from several sides where configurations are few."""
+    starts = evidence.starts()
+    if len(np.unique(problem.data.configuration)) <= FEW:
+        return starts
+    return starts[:1]
 
 
 def _values(problem: CalibrationProblem, x: Array) -> Array:

@@ -137,22 +137,21 @@ class Folds:
     """
 
     def __init__(self, program: Program, parts: Sequence[np.ndarray]):
-        self._whole, self._parts = program, parts
+        self._whole, self._rows = program, _rows(program.model.group, parts)
         self._kept: list[Program] = []
         if program.on_triangles or len(parts) * program.model.A.nbytes <= KEPT:
-            self._kept = list(_folds(program, parts))
+            self._kept = list(_folds(program, self._rows))
         self._met: list[dict[float, Array]] = [{} for _ in parts]
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
         if self._whole.worst is not None:  # most parts have no say in a largest norm: the minimum stays without them
             self._whole.path(weights, rough=True)
-        return np.hstack([self._norms(k, weights) for k in range(len(self._parts))])
+        return np.hstack([self._norms(k, weights) for k in range(len(self._rows))])
 
     def _norms(self, k: int, weights: Array) -> Array:
-        model = self._whole.model
-        out = np.isin(model.group, self._parts[k])
-        program = self._kept[k] if self._kept else self._whole.without(out)
+        model, out = self._whole.model, self._rows[k]
+        program = self._kept[k] if self._kept else _without(self._whole, out)
         Z = self._minima(k, program, weights)
         squares = (Z @ model.A[out].T - model.b[out]) ** 2
         _, which = np.unique(model.group[out], return_inverse=True)
@@ -258,8 +257,24 @@ def by_their_say(program: Program, weights: Array) -> Array:
     return np.array(found)
 
 
+def _rows(group: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the rows of each of some parts, which have different configurations; ``group`` (m,) is every row's."""
+    place = np.full(int(group.max()) + 1, -1)
+    for k, part in enumerate(parts):
+        place[part] = k
+    of_part = place[group]
+    order = np.argsort(of_part, kind="stable")
+    return np.split(order, np.searchsorted(of_part[order], np.arange(len(parts) + 1)))[1:-1]
+
+
+def _without(program: Program, rows: np.ndarray) -> Program:
+    out = np.zeros(len(program.model.group), dtype=bool)
+    out[rows] = True
+    return program.without(out)
+
+
 def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
-    """Return the program without each of the parts, one after the other.
+    """Return the program without the rows of each of the parts, one after the other.
 
     The rows of a squared loss are reduced part by part, once: what is left without a part is the triangles of the parts
     before it over those after it. Rows are added to triangles only, never taken from them, so that nothing is lost to
@@ -269,20 +284,16 @@ def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
     n = model.A.shape[1]
     if not program.on_triangles or len(parts) < 2:
         for part in parts:
-            yield program.without(np.isin(model.group, part))
+            yield _without(program, part)
         return
     rows = np.column_stack([model.A, model.b])
-    place = np.full(int(model.group.max()) + 1, -1)
-    for k, part in enumerate(parts):
-        place[part] = k
-    of_part = place[model.group]
-    each = [reduced_rows(rows[of_part == k]) for k in range(len(parts))]
-    rest = reduced_rows(rows[of_part < 0])
+    each = [reduced_rows(rows[part]) for part in parts]
+    rest = reduced_rows(np.delete(rows, np.concatenate(parts), axis=0))
     after = [np.zeros((n + 1, n + 1))]
     for triangle in reversed(each[1:]):
         after.append(reduced_rows(triangle, after[-1]))
     before = rest
     for k, triangle in enumerate(each):
         left = reduced_rows(before, after[-1 - k])
-        yield program.on(from_triangle(model, left, model.equations - int(np.sum(of_part == k))))
+        yield program.on(from_triangle(model, left, model.equations - len(parts[k])))
         before = reduced_rows(triangle, before)
