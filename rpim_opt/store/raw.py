@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.layouts import RawTable, read_raw
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.models import MEASUREMENTS, Measurement, eye_in_hand, pose, position, revisit
@@ -24,7 +24,6 @@ from rpim_opt.problem.orientation import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import read_arm
 from rpim_opt.store.drawing import find_source
-from rpim_opt.store.named import pick
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
