@@ -17,68 +17,25 @@ _attach, _, _names = lazy_loader.attach_stub(__name__, __file__)
 _FOLDERS = ("basics", "robot", "data", "problem", "convex", "calibration", "store", "use", "study", "show")
 _NAMESPACES = (*_FOLDERS, "baselines", "constraints", "plot", "select")
 __all__ = sorted(set(_names) - set(_NAMESPACES))
-_MOVED = {
-    "basics": ("RpimError",),
-    "calibration": ("Calibration", "Uncertainty", "monte_carlo"),
-    "constraints": ("Box", "at_nominal", "by_kind", "by_link", "differences", "equal", "signed"),
-    "data": ("LaserTracker", "Measurement", "Record"),
-    "plot": (
-        "plot_error_axes",
-        "plot_error_histogram",
-        "plot_error_vectors",
-        "plot_errors",
-        "plot_l_curve",
-        "plot_parameters",
-        "plot_picard",
-        "plot_selection",
-        "plot_selectors",
-    ),
-    "problem": (
-        "Design",
-        "Inspection",
-        "LinearModel",
-        "Observability",
-        "PartitionedProblem",
-        "choose",
-        "hand_eye",
-        "inspect",
-        "observe",
-        "on_cluster",
-        "partitions",
-        "random_candidates",
-        "register",
-        "starting_parameters",
-        "tool_from_distances",
-    ),
-    "robot": (
-        "Described",
-        "Parameters",
-        "Robot",
-        "forward_kinematics",
-        "model_parameters",
-        "without_beta",
-        "write_robodk",
-        "write_robot",
-        "write_ur_calibration",
-        "write_ur_kinematics",
-        "write_urdf",
-    ),
-    "select": ("Selection",),
-    "show": ("write_report",),
-    "store": ("Instance", "new_problem"),
-    "study": ("Metric", "Report"),
-    "use": ("Compensation", "Validation", "compensate", "compensate_file", "export_urdf", "identified", "validate"),
-}
-"""Names that stood here in version 0.1, by where they are now; ``plot_errors`` is ``plot.errors``."""
 
 
 def __getattr__(name: str) -> Any:
     if name in _names:
         return _attach(name)
-    for place, names in _MOVED.items():
-        if name in names:
-            raise AttributeError(f"rpim_opt.{name} is now rpim_opt.{place}.{name.removeprefix('plot_')}")
-    raise AttributeError(f"module 'rpim_opt' has no attribute '{name}'")
+    raise AttributeError(f"module 'rpim_opt' has no attribute '{name}'{_hint(name)}")
+
+
+def _hint(name: str) -> str:
+    """Return the folder that has a name, or the names here that are spelled like it."""
+    if name.startswith("_"):  # what others look for in every module
+        return ""
+    from difflib import get_close_matches
+
+    where = [f"rpim_opt.{folder}.{name}" for folder in _FOLDERS if name in dir(_attach(folder))]
+    alike = where or [f"rpim_opt.{each}" for each in get_close_matches(name, __all__)]
+    if not alike:
+        return ""
+    return f"; did you mean {' or '.join(alike)}?"
 
 
 def __dir__() -> list[str]:

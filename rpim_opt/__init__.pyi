@@ -11,7 +11,6 @@ from . import use as use
 from .basics import InputError as InputError
 from .basics import NoSolutionFound as NoSolutionFound
 from .calibration import baselines as baselines
-from .calibration import calibrate as calibrate
 from .calibration import influence as influence
 from .convex import Formulation as Formulation
 from .convex import bounded as bounded
@@ -50,6 +49,7 @@ from .robot import read_ur_kinematics as read_ur_kinematics
 from .robot import read_urdf as read_urdf
 from .robot import robots as robots
 from .show import plot as plot
+from .store import calibrate as calibrate
 from .store import load as load
 from .store import load_result as load_result
 from .study import compare as compare

@@ -68,7 +68,8 @@ def calibrate(
     Parameters
     ----------
     problem
-        What was measured, and what is to be identified.
+        What was measured, and what is to be identified. ``ro.calibrate`` takes an instance of `load` as well, or the
+        name or folder that it loads: what is not stated here is then as its file has it.
     formulation
         The convex program of a pass, or the name of a ready one (``"robust"``); its functions are asked now.
     weight

@@ -89,21 +89,6 @@ class Influence(Tabled):
         """
         return np.divide(self.change, self.deviation, out=np.zeros_like(self.change), where=self.deviation > 0)
 
-    def strongest(self) -> dict[str, tuple[str, float]]:
-        """Return for every parameter the configuration that moves it most, and by how many standard deviations.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("blunders").problem, ro.tikhonov, weight=1.0)
-        >>> label, moved = ro.calibration.influence(result).strongest()["d2"]
-        >>> label, round(moved, 1)
-        ('c1', 0.7)
-        """
-        moved = self.standardized
-        size = np.where(np.isnan(moved), np.inf, np.abs(moved))
-        most = np.argmax(size, axis=0)
-        columns = range(len(self.parameters))
-        return {self.parameters[j]: (self.label[most[j]], float(moved[most[j], j])) for j in columns}
-
     def to_frame(self) -> Any:
         """Return a data frame (pandas), one row a configuration; a parameter's change in its unit, ``a2_mm``.
 

@@ -82,8 +82,12 @@ class Iteration:
     damping: float
 
 
+COVERAGE_FACTOR = 2.0
+"""Of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution."""
+
+
 class Prediction(NamedTuple):
-    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor of their intervals.
+    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor k of U = k u.
 
     The factor is (N, 1) where rows have degrees of ``freedom`` (N,) of their own: readings of a session that is not
     known, where a few sessions told how far they lie apart. ``outside`` says which rows are beyond the joint ranges
@@ -99,7 +103,7 @@ class Prediction(NamedTuple):
 
     position: Array
     covariance: Array
-    coverage_factor: float | Array = 1.0
+    coverage_factor: float | Array = COVERAGE_FACTOR
     outside: Outside = Outside()
     freedom: float | Array = np.inf
 
@@ -115,7 +119,7 @@ class Prediction(NamedTuple):
 
     @property
     def expanded(self) -> Array:
-        """Half widths (N, 3) [m] of the intervals of the coordinates."""
+        """Expanded uncertainties U = k u (N, 3) [m] of the coordinates: half widths of their intervals."""
         return self.coverage_factor * self.standard
 
 
@@ -255,8 +259,8 @@ class Outcome:
     ) -> Prediction:
         """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
 
-        Positions in the instrument's frame, and their covariance at coverage factor 1 (`Uncertainty.predict` states
-        the factor of a confidence).
+        Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u
+        (`Uncertainty.predict` takes the coverage factor of a confidence instead).
 
         Parameters
         ----------
@@ -297,7 +301,7 @@ class Outcome:
             covariance = covariance + added.reading[0]
             if added.session[0].any():
                 freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, added.session[0])
-        return Prediction(problem.modelled(self.x)[0], covariance, 1.0, self.outside(problem.data), freedom)
+        return Prediction(problem.modelled(self.x)[0], covariance, COVERAGE_FACTOR, self.outside(problem.data), freedom)
 
     def outside(self, data: Dataset) -> Outside:
         """Return which rows are beyond the measured joint ranges, where no measurement checked the model.

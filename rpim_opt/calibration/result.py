@@ -58,11 +58,6 @@ class Calibration(Outcome):
      parameter   unit    nominal   identified   deviation      std
     """
 
-    def __getattr__(self, name: str) -> Any:
-        if name == "save":
-            raise AttributeError("Calibration.save is now rpim_opt.store.save_result(result, path, record)")
-        raise AttributeError(f"'Calibration' object has no attribute '{name}'")
-
     @property
     def selector(self) -> str:
         """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""

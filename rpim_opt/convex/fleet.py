@@ -116,31 +116,6 @@ class Fleet:
         others = [learned([other for other in self.arms if other is not arm]) for arm in self.arms]
         return np.array([_gain(arm, found) for arm, found in zip(self.arms, others, strict=True)])
 
-    def gain_of(self, result: Result) -> float:
-        """Return the same of another arm, which the fleet has not: where it is negative, the fleet's prior is doubted.
-
-        Parameters
-        ----------
-        result
-            A calibration of that arm, with any prior: its data alone count.
-
-        Raises
-        ------
-        InputError
-            For an arm of another nominal robot.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> part = [problem.on(problem.data.take(np.arange(k, 40, 3))) for k in range(3)]
-        >>> one, two, three = (ro.calibrate(each, ro.tikhonov, ro.reml) for each in part)
-        >>> ro.convex.Fleet.of([one, two]).gain_of(three) > 0  # of the same arm
-        True
-        """
-        return _gain(self._seen("the arm", result), self._learned)
-
     def _seen(self, label: str, result: Result) -> Arm:
         """Return what an arm's data say of the parameters of the fleet."""
         free = result.problem.parameters.free

@@ -87,12 +87,8 @@ def _link() -> ca.Function:
     return ca.Function("link", numbers, [ca.densify(product(link(*numbers)))])
 
 
-def rotation_rpy(rx: Symbol, ry: Symbol, rz: Symbol) -> ca.SX:
-    """Return Rz(rz) Ry(ry) Rx(rx): roll, pitch, yaw about fixed axes, as in URDF."""
-    return product(_turns(rx, ry, rz))
-
-
 def _turns(rx: Symbol, ry: Symbol, rz: Symbol) -> list[ca.SX]:
+    """Return Rz(rz), Ry(ry) and Rx(rx), whose product has roll, pitch, yaw about fixed axes, as in URDF."""
     return [rotation_z(rz), rotation_y(ry), rotation_x(rx)]
 
 

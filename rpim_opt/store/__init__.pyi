@@ -1,4 +1,5 @@
 from .instances import Instance as Instance
+from .instances import calibrate as calibrate
 from .instances import load as load
 from .prior_file import load_prior as load_prior
 from .prior_file import save_prior as save_prior

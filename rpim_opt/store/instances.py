@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import sha256_of
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.basics.units import UNITS
-from rpim_opt.calibration.asking import calibrate
+from rpim_opt.calibration import asking
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import Box, Constraint
 from rpim_opt.convex.drawn import Drawn
@@ -27,6 +29,7 @@ from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.frames import starting_parameters
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
@@ -126,7 +129,7 @@ class Instance(Tabled):
         """
         asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
         asked |= {"model": self.model, "noise": self.noise}
-        return replace(calibrate(self.problem, **{**asked, **changes}), record=self.record)
+        return replace(asking.calibrate(self.problem, **{**asked, **changes}), record=self.record)
 
     @property
     def record(self) -> Record:
@@ -205,6 +208,40 @@ def load(
         details=details,
         requirement=requirement,
     )
+
+
+_Options = ParamSpec("_Options")
+
+
+def _also_of_folders(
+    function: Callable[Concatenate[Source, _Options], Calibration],
+) -> Callable[Concatenate[Source | Instance | str | Path, _Options], Calibration]:
+    """Return `calibration.calibrate` for instances and names, too: what is not stated is then as the folder has it."""
+
+    @wraps(function, assigned=("__name__", "__qualname__", "__doc__"))
+    def calibrate(
+        problem: Source | Instance | str | Path, *arguments: _Options.args, **options: _Options.kwargs
+    ) -> Calibration:
+        if isinstance(problem, str | Path):
+            problem = load(problem)
+        if not isinstance(problem, Instance):
+            return function(problem, *arguments, **options)
+        stated = signature(function).bind(problem.problem, *arguments, **options).arguments
+        del stated["problem"]
+        return problem.calibrate(**stated)
+
+    return calibrate
+
+
+calibrate = _also_of_folders(asking.calibrate)
+"""Identify the parameters of a problem, an `Instance`, or one that `load` finds by its name or folder.
+
+Arguments and errors as for `calibration.calibrate`; what is not stated is as the instance has it.
+
+>>> import rpim_opt as ro
+>>> ro.calibrate("paper_arm").selector, ro.calibrate(ro.load("paper_arm"), weight="reml").selector
+('l_curve', 'reml')
+"""
 
 
 def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:

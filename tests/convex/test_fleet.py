@@ -177,23 +177,3 @@ def test_arms_of_another_type_are_refused() -> None:
     results = [ro.calibrate(ro.load(name).problem, ro.tikhonov, 1.0) for name in ("position", "paper_arm")]
     with pytest.raises(ro.InputError, match="arms of one type"):
         Prior.from_fleet(results)
-
-
-def test_an_arm_that_the_fleet_has_not_is_believed_or_doubted() -> None:
-    problem = ro.load("position").problem
-    free = problem.parameters.free
-    rng = np.random.default_rng(9)
-    common = np.where(free.of_frames, 0.0, 2.0 * rng.standard_normal(len(free)))
-
-    def calibrated(seed: int, sign: float) -> ro.calibration.Calibration:
-        own = np.random.default_rng(seed)
-        x = free.scale * (sign * common + 0.1 * own.standard_normal(len(free)))
-        q = own.uniform(-1.2, 1.2, (12, 6))
-        exact = problem.on(ro.Dataset.of(q, np.zeros((12, 3)), 5e-5)).modelled(x)[0]
-        return ro.calibrate(
-            problem.on(ro.Dataset.of(q, exact + 5e-5 * own.standard_normal((12, 3)), 5e-5)), ro.tikhonov, ro.reml
-        )
-
-    found = Fleet.of([calibrated(seed, 1.0) for seed in range(4)])
-    assert found.gain_of(calibrated(10, 1.0)) > 10
-    assert found.gain_of(calibrated(11, -1.0)) < -10

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.starts import anchor_start, plane_start, sphere_start
-from rpim_opt.robot.kinematics import rotation_rpy
+from rpim_opt.robot.kinematics import numeric_frame
 
 POINTS = np.random.default_rng(3).normal([1.0, -2.0, 0.5], 0.3, size=(12, 3))
 """Of a tool, in a cell that is not about the origin [m]."""
@@ -36,7 +35,7 @@ def test_a_plane() -> None:
     found = plane_start(on, np.zeros((12, 1)))
     x, y, z, *turn = found.values()
     assert np.array([x, y, z]) @ normal == pytest.approx(1.5)
-    assert np.abs(np.array(ca.DM(rotation_rpy(*turn)))[:3, 2] @ normal) == pytest.approx(1.0)
+    assert np.abs(numeric_frame([0, 0, 0, *turn])[:3, 2] @ normal) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("start", [anchor_start, plane_start, sphere_start])
