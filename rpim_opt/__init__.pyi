@@ -3,8 +3,8 @@ from . import calibration as calibration
 from . import convex as convex
 from . import data as data
 from . import problem as problem
+from . import report as report
 from . import robot as robot
-from . import show as show
 from . import store as store
 from . import study as study
 from . import use as use
@@ -41,6 +41,7 @@ from .data import Dataset as Dataset
 from .data import read_data as read_data
 from .problem import CalibrationProblem as CalibrationProblem
 from .problem import together as together
+from .report import plot as plot
 from .robot import Model as Model
 from .robot import read_mdh as read_mdh
 from .robot import read_robot as read_robot
@@ -48,7 +49,6 @@ from .robot import read_ur_calibration as read_ur_calibration
 from .robot import read_ur_kinematics as read_ur_kinematics
 from .robot import read_urdf as read_urdf
 from .robot import robots as robots
-from .show import plot as plot
 from .store import calibrate as calibrate
 from .store import load as load
 from .store import load_result as load_result

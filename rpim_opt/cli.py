@@ -18,8 +18,23 @@ from typer.core import TyperGroup
 
 from rpim_opt import __version__
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
-from rpim_opt.show.console import arriving, fail, left_out_line, progress, show, written_line, written_to
-from rpim_opt.show.options import carried, corrected_files, require_positive, tool_frame
+from rpim_opt.report.console import (
+    arriving,
+    asked_of,
+    carried,
+    corrected_files,
+    fail,
+    left_out_line,
+    listed_numbers,
+    listed_words,
+    progress,
+    require_positive,
+    required,
+    show,
+    tool_frame,
+    written_line,
+    written_to,
+)
 
 if TYPE_CHECKING:
     from rpim_opt.calibration.result import Calibration
@@ -132,7 +147,6 @@ def new(
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with progress():
         from rpim_opt.basics.writing import refused
-        from rpim_opt.show.options import asked_of
         from rpim_opt.store.raw import understand_tables
         from rpim_opt.store.starting import new_problem
 
@@ -219,8 +233,7 @@ def calibrate(
     with progress() as say:
         from rpim_opt.basics.phases import clock
         from rpim_opt.calibration.causes import named
-        from rpim_opt.show.options import required
-        from rpim_opt.show.summary import describe, describe_times, summary
+        from rpim_opt.report.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
 
         say("reading the problem")
@@ -325,7 +338,7 @@ def report(
     with progress() as say:
         from rpim_opt.basics.inputs import inside
         from rpim_opt.basics.writing import refused
-        from rpim_opt.show.report import write_report
+        from rpim_opt.report.report import write_report
         from rpim_opt.store.result_file import load_result
 
         say("reading the result")
@@ -388,7 +401,6 @@ def accept(
     """
     with progress() as say:
         from rpim_opt.calibration.acceptance import accept
-        from rpim_opt.show.options import required
         from rpim_opt.store.result_file import load_result
         from rpim_opt.use.validation import read_measurements
 
@@ -489,7 +501,7 @@ def monitor(
     Exit code 1 if the robot is not where its calibration says.
     """
     with progress() as say:
-        from rpim_opt.show.checks_page import written_checks
+        from rpim_opt.report.checks_page import written_checks
         from rpim_opt.store.result_file import load_result
         from rpim_opt.use.monitoring import monitor, read_checks
 
@@ -739,7 +751,6 @@ def compare(
 
     With --out every replicate is written down when it is finished, and a page index.html in the end.
     """
-    from rpim_opt.show.options import listed_numbers, listed_words
     from rpim_opt.study.comparing import compare
     from rpim_opt.study.metrics import USUAL
 

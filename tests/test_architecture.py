@@ -33,9 +33,9 @@ FLOORS: dict[str, set[str]] = {
     "store": {"pydantic"},
     # casadi: compensation differentiates the tool's pose
     "use": {"casadi"},
-    "study": {"distributed", "joblib", "matplotlib", "pyarrow"},
-    # rich: tables and what goes on, on a console
-    "show": {"matplotlib", "rich"},
+    # rich: progress on a console; jinja2: pages
+    "report": {"jinja2", "markupsafe", "matplotlib", "rich"},
+    "study": {"distributed", "jinja2", "joblib", "markupsafe", "matplotlib", "pyarrow"},
 }
 """Third-party packages that a folder may import besides those for all; its place is its floor."""
 EVERYWHERE = {"numpy", "scipy"}

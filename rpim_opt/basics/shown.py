@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rpim_opt.basics.markup import html_table
 from rpim_opt.basics.tables import frame_of
+from rpim_opt.basics.text import html_table
 
 MOST = 60
 """Rows of a table in a notebook."""

@@ -1,8 +1,9 @@
-"""Tables as text."""
+"""Tables as text and for notebooks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from html import escape
 from io import StringIO
 from unicodedata import category
 
@@ -47,6 +48,23 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table; the first column is aligned left, the others right."""
     lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
+"""Style of a table in a notebook: a long one scrolls."""
+
+
+def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str] = (), title: str = "") -> str:
+    """Return a table for a notebook as HTML, with a title above it and notes below it; all texts are escaped."""
+    columns = "".join(f'<th scope="col">{escape(name)}</th>' for name in header)
+    body = "".join(
+        f'<tr><th scope="row">{escape(first)}</th>{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>'
+        for first, *cells in rows
+    )
+    above = f"<p><b>{escape(title)}</b></p>" if title else ""
+    below = "".join(f"<p>{escape(note)}</p>" for note in notes)
+    table = f"<table><thead><tr>{columns}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div>{above}<div style="{BOX}">{table}</div>{below}</div>'
 
 
 def three_digits(value: float) -> str:

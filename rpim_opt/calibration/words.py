@@ -9,8 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.markup import html_table
-from rpim_opt.basics.text import joined, listed, table
+from rpim_opt.basics.text import html_table, joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.learned_words import sentences

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import bullets, data_table, facts, page, section
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.writing import refused, write_files
+from rpim_opt.report.frame import bullets, data_table, facts, page, section
+from rpim_opt.report.markup import Element, tag
 from rpim_opt.study.drawing import drawn
 from rpim_opt.study.replicate import NUMBERS
 from rpim_opt.study.standing import Summary, number

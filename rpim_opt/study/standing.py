@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rpim_opt.basics.markup import html_table
 from rpim_opt.basics.tables import frame_of
-from rpim_opt.basics.text import listed, table
+from rpim_opt.basics.text import html_table, listed, table
 from rpim_opt.study.pairs import CONFIDENCE, ENOUGH, TIE, Standing
 from rpim_opt.study.replicate import NUMBERS
 

@@ -96,7 +96,7 @@ def report(problem: CalibrationProblem, formulation: ro.Formulation) -> dict[str
     calibration = time.perf_counter() - start
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "report.html"
-        seconds = _seconds(lambda: ro.show.write_report(result, file))
+        seconds = _seconds(lambda: ro.report.write_report(result, file))
         size = file.stat().st_size / 1e6
     return {"calibration": calibration, "seconds": seconds, "mb": size}
 

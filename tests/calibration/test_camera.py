@@ -13,8 +13,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.units import split_unit
 from rpim_opt.calibration.camera_words import camera_remarks
-from rpim_opt.show.report import write_report
-from rpim_opt.show.summary import summary
+from rpim_opt.report.report import write_report
+from rpim_opt.report.summary import summary
 from rpim_opt.store.named import problems_folder
 from rpim_opt.study.grid import load_study
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.show.report import write_report
+from rpim_opt.report.report import write_report
 from rpim_opt.store.known import UNSTATED
 from rpim_opt.study.grid import load_study
 from tests import SHARED

@@ -11,12 +11,12 @@ import pytest
 from scipy.spatial import KDTree
 
 import rpim_opt as ro
-from rpim_opt.basics.markup import html, tag
 from rpim_opt.calibration.alike import _nearest as nearest
 from rpim_opt.calibration.alike import alike
 from rpim_opt.calibration.lack_of_fit import LackOfFit, foreseen, judged, lack_of_fit
 from rpim_opt.calibration.left_over import FEWEST
-from rpim_opt.show.section_summary import summary_section
+from rpim_opt.report.markup import html, tag
+from rpim_opt.report.section_summary import summary_section
 from tests.simulate import ALL, ARM, simulated
 
 NOISE = 5e-5

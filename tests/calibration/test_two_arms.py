@@ -97,7 +97,7 @@ def test_a_result_goes_to_a_file_and_a_report(result, tmp_path: Path) -> None:
     again = ro.load_result(tmp_path / "result.json")
     assert np.array_equal(again.x, result.x)
     assert np.allclose(again.errors(), result.errors(), atol=1e-12)
-    ro.show.write_report(result, tmp_path / "report.html")
+    ro.report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "how well the robots meet there, and repeat themselves, from all sides" in page
 

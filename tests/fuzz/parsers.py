@@ -22,9 +22,9 @@ from rpim_opt.data.models import MEASUREMENTS, Measurement
 from rpim_opt.data.reading import read_data
 from rpim_opt.data.spelling import parse_units
 from rpim_opt.data.understanding import Asked
+from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
-from rpim_opt.show.options import carried, listed_numbers, tool_frame
 from rpim_opt.store.content import digest
 from rpim_opt.store.named import named_formulation, named_weight, problems_folder
 from rpim_opt.store.prior_file import load_prior, save_prior

@@ -230,7 +230,7 @@ def test_a_result_goes_to_a_file_and_a_report_and_commands_and_back(tmp_path: Pa
     assert np.array_equal(again.problem.parameters.periodic, whole.parameters.periodic)
     assert str(again) == str(result)
     assert ro.load_result(tmp_path / "result.json", model=ro.Model([term])).problem.arms.keys() == {"left", "right"}
-    ro.show.write_report(result, tmp_path / "report.html")
+    ro.report.write_report(result, tmp_path / "report.html")
     assert "left: test arm" in (tmp_path / "report.html").read_text()
     assert lack_of_fit(result).left < 3 * SIGMA
     assert ro.calibration.likely_causes(result) == []

@@ -250,5 +250,5 @@ def test_measurements_without_a_length_are_kept_too(tmp_path: Path) -> None:
     result = ro.load_result(tmp_path, [tilt])
     assert json.loads((tmp_path / "result.json").read_text())["identification"]["count"] == 0
     with pytest.raises(ro.InputError, match="no measurement of a length"):
-        ro.show.write_report(result, tmp_path / "report.html")
+        ro.report.write_report(result, tmp_path / "report.html")
     assert not (tmp_path / "report.html").exists()

@@ -160,7 +160,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     np.testing.assert_allclose(again.x, second.x, atol=1e-8)
     third = ro.use.update(second, crashed.now.take(np.arange(6)))
     assert len(third.result.record.earlier) == 2
-    ro.show.write_report(second, tmp_path / "report.html")
+    ro.report.write_report(second, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert last.digest in page
     assert "changed since: theta4" in page

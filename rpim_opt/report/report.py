@@ -7,20 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rpim_opt.basics.page import page as whole
 from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.section_acceptance import acceptance_section, verdict
-from rpim_opt.show.section_errors import errors_section
-from rpim_opt.show.section_evidence import convergence_section, distrusted_section, identifiability_section
-from rpim_opt.show.section_parameters import parameters_section
-from rpim_opt.show.section_provenance import provenance_section, stated_details
-from rpim_opt.show.section_reach import reach_section
-from rpim_opt.show.section_space import space_section
-from rpim_opt.show.section_summary import summary_section
-from rpim_opt.show.section_weight import weight_section
-from rpim_opt.show.summary import acceptance
+from rpim_opt.report.frame import page as whole
+from rpim_opt.report.section_acceptance import acceptance_section, verdict
+from rpim_opt.report.section_errors import errors_section
+from rpim_opt.report.section_evidence import convergence_section, distrusted_section, identifiability_section
+from rpim_opt.report.section_parameters import parameters_section
+from rpim_opt.report.section_provenance import provenance_section, stated_details
+from rpim_opt.report.section_reach import reach_section
+from rpim_opt.report.section_space import space_section
+from rpim_opt.report.section_summary import summary_section
+from rpim_opt.report.section_weight import weight_section
+from rpim_opt.report.summary import acceptance
 
 HERE = Path(__file__).resolve().parent
 
@@ -53,7 +53,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
-    >>> ro.show.write_report(result, "report.html", instance.validation)
+    >>> ro.report.write_report(result, "report.html", instance.validation)
     >>> "0.032" in Path("report.html").read_text(encoding="utf-8")
     True
     """

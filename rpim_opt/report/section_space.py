@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import section
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import sets
-from rpim_opt.show.scales import magnification, mm
+from rpim_opt.report.frame import section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import sets
+from rpim_opt.report.scales import magnification, mm
 
 MOST = 2000
 """Points that are drawn at most."""

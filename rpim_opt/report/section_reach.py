@@ -8,17 +8,17 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import section
 from rpim_opt.basics.text import percent
 from rpim_opt.calibration.reaching import reaching
 from rpim_opt.calibration.region import Region, region_of
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.predicting import in_base
-from rpim_opt.show.chart import Axis, Cells, Chart, Line, Mark
-from rpim_opt.show.pieces import figure
-from rpim_opt.show.scales import mm
+from rpim_opt.report.chart import Axis, Cells, Chart, Line, Mark
+from rpim_opt.report.frame import section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure
+from rpim_opt.report.scales import mm
 
 ANY = Requirement(limit=1.0)
 """All that was measured, where nothing is demanded."""

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics import page
-from rpim_opt.show.chart import Axis, Bars, Cells, Chart, Dots, Line, Segments
-from rpim_opt.show.on_axes import COLORS, color_of, on_axes
-from rpim_opt.show.svg import Picture, Scale
+from rpim_opt.report import frame as page
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Segments
+from rpim_opt.report.on_axes import COLORS, color_of, on_axes
+from rpim_opt.report.svg import Picture, Scale
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, facts, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block
 from rpim_opt.data.record import Earlier
+from rpim_opt.report.frame import data_table, facts, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import sets
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.show.pieces import sets
 from rpim_opt.store.definition import definition
 from rpim_opt.store.stated_record import FIELDS
 

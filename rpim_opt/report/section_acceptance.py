@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import facts, section
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration.acceptance import Acceptance
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.report.frame import facts, section
+from rpim_opt.report.markup import Element, tag
 
 WORDS = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Cannot be decided"}
 

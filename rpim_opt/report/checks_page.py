@@ -9,12 +9,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, page, section
 from rpim_opt.basics.writing import refused, write_text
-from rpim_opt.show.chart import Axis, Chart, Dots, Line, Mark
-from rpim_opt.show.pieces import figure
-from rpim_opt.show.scales import mm
+from rpim_opt.report.chart import Axis, Chart, Dots, Line, Mark
+from rpim_opt.report.frame import data_table, page, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure
+from rpim_opt.report.scales import mm
 from rpim_opt.use.monitored import Monitoring
 
 DAY, HOUR = 86400.0, 3600.0
@@ -38,7 +38,7 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
-    >>> ro.show.write_checks(found, "checks.html", "Cell 7")
+    >>> ro.report.write_checks(found, "checks.html", "Cell 7")
     >>> "No drift in 40 checks." in Path("checks.html").read_text(encoding="utf-8")
     True
     """

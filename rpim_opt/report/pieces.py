@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from rpim_opt.basics.markup import Element, tag
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.chart import Chart
-from rpim_opt.show.svg import Picture
+from rpim_opt.report.chart import Chart
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.svg import Picture
 
 
 def figure(picture: Picture | Chart, caption: str = "", *above: Element) -> Element:

@@ -11,7 +11,7 @@ Element = ElementTree.Element
 def tag(name: str, /, *children: str | Element, **attributes: object) -> Element:
     """Return an element; ``class_`` stands for ``class``, ``aria_label`` for ``aria-label``.
 
-    >>> from rpim_opt.basics.markup import html, tag
+    >>> from rpim_opt.report.markup import html, tag
     >>> html(tag("p", "a < b ", tag("b", "c"), class_="note"))
     '<p class="note">a &lt; b <b>c</b></p>'
     """
@@ -38,14 +38,3 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Element:
     head = tag("tr", *(tag("th", name, scope="col") for name in header))
     body = [tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows]
     return tag("table", tag("thead", head), tag("tbody", *body))
-
-
-BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
-"""How a long table stands in a notebook: it scrolls, and its border says that it goes on."""
-
-
-def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str] = (), title: str = "") -> str:
-    """Return a table with a line above it and sentences below it as HTML; a long one scrolls in a box."""
-    above = [tag("p", tag("b", title))] if title else []
-    box = tag("div", table(header, rows), style=BOX)
-    return html(tag("div", *above, box, *(tag("p", note) for note in notes)))

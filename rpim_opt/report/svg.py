@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.show.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
+from rpim_opt.report.markup import Element, tag
 
 WIDTH = 420
 TOP = 12

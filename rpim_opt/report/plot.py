@@ -12,7 +12,7 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.charts_result import (
+from rpim_opt.report.charts_result import (
     MANY,
     axes_chart,
     deviations_chart,
@@ -20,9 +20,9 @@ from rpim_opt.show.charts_result import (
     lengths_of,
     rows_chart,
 )  # fmt: skip
-from rpim_opt.show.charts_weight import choices_chart, l_curve_chart, picard_chart, score_chart
-from rpim_opt.show.on_axes import COLORS, Axes, axes_of, on_axes
-from rpim_opt.show.scales import magnification
+from rpim_opt.report.charts_weight import choices_chart, l_curve_chart, picard_chart, score_chart
+from rpim_opt.report.on_axes import COLORS, Axes, axes_of, on_axes
+from rpim_opt.report.scales import magnification
 
 __all__ = [
     "error_axes",

@@ -9,7 +9,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.selection import Selection
-from rpim_opt.show.chart import Axis, Chart, Dots, Line, Mark
+from rpim_opt.report.chart import Axis, Chart, Dots, Line, Mark
 
 VANISHED = 1e-4
 """Penalties below this part of the middle one are not drawn: a lasso has nothing left there."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.contact_words import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.charts_result import along_axes, axes_chart, directed, histogram_chart, lengths_of, rows_chart
-from rpim_opt.show.pieces import figure, sets
-from rpim_opt.show.scales import mm
+from rpim_opt.report.charts_result import along_axes, axes_chart, directed, histogram_chart, lengths_of, rows_chart
+from rpim_opt.report.frame import data_table, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure, sets
+from rpim_opt.report.scales import mm
 
 
 def errors_section(result: Calibration) -> list[Element]:

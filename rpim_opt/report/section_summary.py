@@ -6,8 +6,6 @@ from typing import Any
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import bullets
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined
 from rpim_opt.calibration.camera_words import camera_remarks
@@ -15,8 +13,10 @@ from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.show.pieces import quantity, repeated, sets
-from rpim_opt.show.scales import mm
+from rpim_opt.report.frame import bullets
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import quantity, repeated, sets
+from rpim_opt.report.scales import mm
 
 KEPT_APART = "kept apart"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.show.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments
 
 Axes = Any  # matplotlib's, which is imported by whoever makes the axes
 

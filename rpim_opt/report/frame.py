@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 
-from rpim_opt.basics.markup import Element, html, table, tag
+from rpim_opt.report.markup import Element, html, table, tag
 
 STYLE = Path(__file__).resolve().parent / "page.css"
 

@@ -11,17 +11,17 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.program import Estimate, Program, pose
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
-from rpim_opt.show.charts_weight import l_curve_chart
-from rpim_opt.show.pieces import figure, sets
-from rpim_opt.show.scales import mm
-from rpim_opt.show.svg import Picture
+from rpim_opt.report.charts_weight import l_curve_chart
+from rpim_opt.report.frame import data_table, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure, sets
+from rpim_opt.report.scales import mm
+from rpim_opt.report.svg import Picture
 
 TITLE = "Weight of the penalty"
 WHY = {"learned": "largest evidence of all sizes"}

@@ -11,8 +11,8 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.show.chart import Axis, Bars, Chart, Dots, Line, Mark, Segments
-from rpim_opt.show.scales import below, error_bins, kept_tolerance, mm
+from rpim_opt.report.chart import Axis, Bars, Chart, Dots, Line, Mark, Segments
+from rpim_opt.report.scales import below, error_bins, kept_tolerance, mm
 
 MANY = 100
 """Rows from which each is a small point without a name."""

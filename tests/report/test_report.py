@@ -15,11 +15,11 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.program import Program
-from rpim_opt.show import section_evidence, section_weight
-from rpim_opt.show.chart import Axis
-from rpim_opt.show.report import page
-from rpim_opt.show.scales import below
-from rpim_opt.show.svg import Scale
+from rpim_opt.report import section_evidence, section_weight
+from rpim_opt.report.chart import Axis
+from rpim_opt.report.report import page
+from rpim_opt.report.scales import below
+from rpim_opt.report.svg import Scale
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
 from tests.test_cli import run
@@ -226,7 +226,7 @@ def chromium() -> Iterator[Browser]:
 @pytest.fixture
 def opened(chromium: Browser, arm, tmp_path: Path) -> Browser:
     path = tmp_path / "report.html"
-    ro.show.write_report(arm, path)
+    ro.report.write_report(arm, path)
     chromium.open(path)
     return chromium
 

@@ -6,15 +6,15 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import data_table, section
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import turned_frames
-from rpim_opt.show.charts_result import deviations_chart
-from rpim_opt.show.pieces import figure
-from rpim_opt.show.scales import kept_tolerance
+from rpim_opt.report.charts_result import deviations_chart
+from rpim_opt.report.frame import data_table, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure
+from rpim_opt.report.scales import kept_tolerance
 
 
 def parameters_section(result: Calibration) -> list[Element]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.basics.markup import Element, tag
-from rpim_opt.basics.page import bullets, data_table, section
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.observability import combination, observe
-from rpim_opt.show.charts_weight import picard_chart
-from rpim_opt.show.pieces import figure
-from rpim_opt.show.scales import mm
+from rpim_opt.report.charts_weight import picard_chart
+from rpim_opt.report.frame import bullets, data_table, section
+from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.pieces import figure
+from rpim_opt.report.scales import mm
 
 DIRECTIONS = "At the solution: the penalty holds directions below the line; data near 1 are noise (Picard's condition)."
 

@@ -1,0 +1,226 @@
+"""The command line's terminal: what its options mean, what it prints, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+from threading import Timer
+from typing import TYPE_CHECKING, Any, TextIO
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import LARGEST
+
+if TYPE_CHECKING:
+    from rpim_opt.data.requirement import Requirement
+    from rpim_opt.data.understanding import Asked
+
+# --- output ------------------------------------------------------------------------------------------------
+
+
+def show(text: object, document: dict[str, Any], as_json: bool) -> None:
+    """Print the text, or the document as JSON."""
+    if as_json:
+        from rpim_opt.basics.files import json_text
+
+        text = json_text(document).rstrip("\n")
+    _print(str(text), sys.stdout)
+
+
+def fail(text: str, code: int) -> None:
+    """Print an error on stderr, as JSON with ``--json``, and end with an exit code."""
+    if "--json" in sys.argv:
+        from rpim_opt.basics.files import json_text
+
+        text = json_text({"error": text}).rstrip("\n")
+    try:
+        _print(text, sys.stderr)
+    except OSError:  # nobody reads it
+        _close(sys.stderr)
+    sys.exit(code)
+
+
+def _print(text: str, stream: TextIO) -> None:
+    """Print a text without control characters, flushed so that a closed pipe is noticed."""
+    from rpim_opt.basics.text import visible
+
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print(visible(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+@contextmanager
+def arriving() -> Iterator[None]:
+    """End quietly when the output's reader is gone, and with a sentence for other errors of the system."""
+    try:
+        yield
+    except BrokenPipeError:
+        _close(sys.stdout)
+        sys.exit(1)
+    except OSError as error:
+        if error.filename is not None:  # a name that is too long, a folder without permission
+            fail(f"{error.filename}: {error.strerror}.", 2)
+        _close(sys.stdout)
+        fail(f"The output cannot be written: {error}.", 2)
+
+
+def _close(stream: TextIO) -> None:
+    """Drop what a stream still holds; Python would try to write it at exit."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """Show the current step after one second, on an interactive terminal only."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    status = console.status("starting")
+    timer = Timer(1.0, status.start)
+    timer.daemon = True
+    if console.is_terminal:
+        timer.start()
+    try:
+        yield lambda text: status.update(text)
+    finally:
+        timer.cancel()
+        status.stop()
+
+
+def written_to(path: Path | None, text: str) -> list[Path]:
+    """Write a text where a path is given, and return the paths written."""
+    from rpim_opt.basics.writing import refused, write_text
+
+    if path is None:
+        return []
+    with refused(path):
+        write_text(path, text)
+    return [path]
+
+
+def written_line(path: Path | None) -> str:
+    """Return the line that names a written file."""
+    return f"\nWritten: {path}" if path else ""
+
+
+def left_out_line(columns: Sequence[str]) -> str:
+    """Return the line that names columns that were not read."""
+    return f"\nColumns that were left out: {', '.join(columns)}." if columns else ""
+
+
+# --- options -----------------------------------------------------------------------------------------------
+
+
+def require_positive(where: str, value: float | None) -> None:
+    """Raise InputError for a limit that is not positive."""
+    if value is not None and not value > 0:
+        raise InputError(where, f"{value:g}", "a number greater than zero [mm]")
+
+
+def corrected_files(
+    writers: Sequence[tuple[Path | None, Callable[[Path], Any]]], out: Path | None
+) -> list[tuple[Path, Callable[[Path], Any]]]:
+    """Return target and writer of every corrected file: ``--out``, or a file of the source's name in that folder."""
+    sources = [(source, write) for source, write in writers if source]
+    if not sources:
+        return []
+    if out is None:
+        raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
+    several = len(sources) > 1 or out.is_dir()
+    files = [(source, out / source.name if several else out, write) for source, write in sources]
+    for source, target, _ in files:
+        if target.resolve() == source.resolve():
+            raise InputError("--out", f"the original, {source}", "another place: the original stays")
+    return [(target, write) for _, target, write in files]
+
+
+def _numbers(option: str, text: str, counts: tuple[int, ...], accepted: str, least: float = -LARGEST) -> list[float]:
+    """Return the numbers of ``1,2,3``; InputError for another count of them, or one that is out of range."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(abs(value) < LARGEST for value in values) or values[0] < least:
+        raise InputError(option, f"'{text}'", accepted)
+    return values
+
+
+def tool_frame(text: str | None) -> list[float] | None:
+    """Return the tool frame [m, rad] of ``--tool``."""
+    if text is None:
+        return None
+    values = _numbers("--tool", text, (6,), "six numbers: x,y,z [mm], roll,pitch,yaw [deg]")
+    return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]
+
+
+def carried(text: str | None) -> tuple[float | None, list[float] | None]:
+    """Return mass [kg] and centre of mass [m], or None, of ``--payload``."""
+    if text is None:
+        return None, None
+    accepted = "a mass [kg], or mass and centre: kg,x,y,z [mm]"
+    mass, *centre = _numbers("--payload", text, (1, 4), accepted, least=0.0)
+    return mass, [1e-3 * v for v in centre] or None
+
+
+def required(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
+    """Return the requirement of ``--limit`` [mm] and ``--box``, which replace what the problem or result states."""
+    from rpim_opt.data.requirement import Requirement
+
+    require_positive("--limit", limit)
+    if limit is None and stated is None:
+        if box is not None:
+            raise InputError("--box", "no limit", "--limit with it [mm]")
+        return None
+    sides = None
+    if box is not None:
+        x0, x1, y0, y1, z0, z1 = _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")
+        sides = ((1e-3 * x0, 1e-3 * x1), (1e-3 * y0, 1e-3 * y1), (1e-3 * z0, 1e-3 * z1))
+    if stated is None:
+        return Requirement(1e-3 * (limit or 0.0), sides)
+    if limit is not None:
+        stated = replace(stated, limit=1e-3 * limit)
+    return replace(stated, box=sides or stated.box)
+
+
+def asked_of(
+    units: str,
+    *,
+    columns: str,
+    key: str,
+    quaternion: str,
+    rotation: str,
+    within: float | None = None,
+    **layout: str,
+) -> Asked:
+    """Return what the options of a command state of its raw tables."""
+    from rpim_opt.basics.layouts import Layout
+    from rpim_opt.data.spelling import parse_units
+    from rpim_opt.data.understanding import Asked
+
+    names = tuple(name.strip() for name in columns.split(",")) if columns else ()
+    return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key, within)
+
+
+def listed_words(text: str) -> list[str]:
+    """Return the words of ``tikhonov,robust``."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def listed_numbers(text: str) -> list[str | int | float]:
+    """Return the words of ``learned,1.0``, those that are numbers as numbers."""
+    return [_number_or_word(word) for word in listed_words(text)]
+
+
+def _number_or_word(word: str) -> str | int | float:
+    for kind in (int, float):
+        try:
+            return kind(word)
+        except ValueError:
+            continue
+    return word
