@@ -12,9 +12,10 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.problem.loads import Loads, Stated
+from rpim_opt.robot.evaluation import SYMBOLS
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, tool_prefix
-from rpim_opt.robot.posture import SYMBOLS, Symbol
+from rpim_opt.robot.posture import Symbol
 from rpim_opt.robot.terms import Term
 
 Functions = Mapping[str, ca.Function]

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.lapack import qr_in_place
 from rpim_opt.basics.phases import phase
-from rpim_opt.basics.room import room
 from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
@@ -122,6 +121,8 @@ class LinearModel(Brief):
 BLOCK = 430_000
 """Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
 triangles of the blocks cost little beside them."""
+
+
 NARROW, WIDE = 8, 32
 """Columns that are reduced together, of matrices with few and with many columns: as is quickest."""
 MANY = 100
@@ -144,26 +145,23 @@ def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
 def beneath(R: Array | None, n: int, count: int) -> tuple[Array, Array]:
     """Return a matrix (m, n) with R (k, n) above, whose columns stand together, and of it the rows (count, n) beneath.
 
-    It stands until the same thread asks for the next one; the rows are to be written.
+    The rows are to be written.
     """
     above = 0 if R is None else len(R)
-    stacked = room("stacked", n, max(above + count, n)).T
+    stacked = np.empty((n, max(above + count, n))).T
     stacked[:above] = 0.0 if R is None else R
     stacked[above + count :] = 0.0
     return stacked, stacked[above : above + count]
 
 
 def rotated(stacked: Array) -> Array:
-    """Return the upper triangle (n, n) of what `beneath` made room for, which is overwritten."""
+    """Return the upper triangle R (n, n) of a matrix (m, n) of `beneath`, which is overwritten.
+
+    LAPACK's blocked QR whose blocks are reduced by halves: twice as fast as the usual one where rows are many.
+    """
     n = stacked.shape[1]
-    qr_in_place(stacked, min(n, WIDE if n >= MANY else NARROW))
-    return np.where(_upper(n), stacked[:n], 0.0)
-
-
-@lru_cache(maxsize=16)
-def _upper(n: int) -> np.ndarray:
-    """Return which places (n, n) a triangle has."""
-    return np.triu(np.ones((n, n), dtype=bool))
+    R: Array = lapack.dgeqrt(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
+    return np.triu(R)
 
 
 def triangle_of(A: Array, b: Array) -> Array:

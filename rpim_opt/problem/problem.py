@@ -29,7 +29,7 @@ from rpim_opt.problem.loads import (
 )
 from rpim_opt.problem.scatter import Scatter, Stack, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
-from rpim_opt.robot.abreast import evaluated, write
+from rpim_opt.robot.evaluation import evaluate_rows, write_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
@@ -591,11 +591,11 @@ class CalibrationProblem(Tabled):
             function = self._functions(block)["jacobian"]
             rows = self._rows(block, part)
             with phase("evaluation"):
-                write(function, [x, self.parameters.nominal], rows, into, factors)
+                write_rows(function, [x, self.parameters.nominal], rows, into, factors)
             return
         scale = self.parameters.free.scale
         L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._evaluate(block, "jacobian", x, part, passing=True)
+        residual, jacobian = self._evaluate(block, "jacobian", x, part)
         _weigh(L, jacobian.transpose(1, 2, 0), scale, found[:-1])
         _weigh(L, residual.transpose(2, 1, 0), np.ones(1), found[-1:])
 
@@ -884,13 +884,11 @@ class CalibrationProblem(Tabled):
             begin += k * len(block.row)
         return blocks
 
-    def _evaluate(
-        self, block: Block, what: str, x: Array, part: slice = slice(None), passing: bool = False
-    ) -> list[Array]:
+    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
         rows = self._rows(block, part)
         function = self._functions(block)[what]
         with phase("evaluation"):
-            return evaluated(function, [x, self.parameters.nominal], rows, passing)
+            return evaluate_rows(function, [x, self.parameters.nominal], rows)
 
     def _functions(self, block: Block) -> Functions:
         if id(block) not in self._structures:

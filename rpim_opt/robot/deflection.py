@@ -9,8 +9,9 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.robot.evaluation import call_rows
 from rpim_opt.robot.gravity import STANDARD, Gravity
-from rpim_opt.robot.kinematics import call_rows, transforms
+from rpim_opt.robot.kinematics import transforms
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.posture import Posture, Symbol
 

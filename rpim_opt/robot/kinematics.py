@@ -9,13 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, reduce
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.threads import on_all_cores
+from rpim_opt.robot.evaluation import call_rows
 from rpim_opt.robot.joint_terms import displacement, motion
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.posture import Posture, Symbol
@@ -26,10 +25,6 @@ FRAME = ("x", "y", "z", "rx", "ry", "rz")
 
 FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
 
-CHUNK = 256
-"""Rows that CasADi evaluates in one call: to make the function of many rows costs as much as to call it."""
-SHARE = 16 * CHUNK
-"""Rows that one thread evaluates before it takes more: enough to be worth handing over."""
 ZERO, ONE = ca.SX(0), ca.SX(1)
 """Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
 
@@ -223,48 +218,3 @@ def forward_kinematics(robot: Robot, q: Array) -> Array:
     configurations = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
     function = _flange(tuple(robot.joint_types))
     return call_rows(function, [robot.mdh.ravel()], configurations)[0].reshape(-1, 4, 4).transpose(0, 2, 1)
-
-
-def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
-    """Evaluate a CasADi function on every row of a table, many in one call, without copies.
-
-    Parameters
-    ----------
-    function
-        Inputs: one column for each of ``shared``, then one column that changes with the row.
-    shared
-        Inputs that are the same for all rows.
-    rows
-        (N, k), one input column a row.
-
-    Returns
-    -------
-    For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
-    """
-    results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
-    arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
-
-    def evaluate(begin: int) -> None:
-        buffers: dict[int, Any] = {}
-        end = min(begin + SHARE, len(rows))
-        for start in range(begin, end, CHUNK):
-            part = slice(start, min(start + CHUNK, end))
-            N = len(rows[part])
-            if N not in buffers:
-                buffers[N] = _mapped(function, len(shared), N).buffer()
-                for i, values in enumerate(arguments[:-1]):
-                    buffers[N][0].set_arg(i, values.data)
-            buffer, trigger = buffers[N]
-            buffer.set_arg(len(shared), arguments[-1][part].data)
-            for i, values in enumerate(results):
-                buffer.set_res(i, values[part].data)
-            trigger()
-
-    on_all_cores(evaluate, range(0, len(rows), SHARE))
-    return results
-
-
-@lru_cache(maxsize=512)
-def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
-    """Return the function of N rows."""
-    return ca.Function.map(function, "rows", "serial", N, list(range(shared)), [], {})

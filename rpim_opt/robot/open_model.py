@@ -10,7 +10,8 @@ from typing import NamedTuple
 import casadi as ca
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.robot.posture import SYMBOLS, Joint, Posture, Symbol
+from rpim_opt.robot.evaluation import SYMBOLS
+from rpim_opt.robot.posture import Joint, Posture, Symbol
 from rpim_opt.robot.terms import Entry, Term, moved
 
 

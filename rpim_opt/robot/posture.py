@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -12,8 +11,6 @@ import casadi as ca
 from rpim_opt.basics.exceptions import InputError
 
 Symbol = Any  # ca.SX or a number: CasADi ships no types
-SYMBOLS = threading.RLock()
-"""CasADi counts its symbols without a lock; reentrant, since a user's function may itself evaluate a problem."""
 
 
 class Weight(Protocol):

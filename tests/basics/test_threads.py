@@ -35,9 +35,12 @@ def test_linear_algebra_runs_on_one_thread_and_gets_its_threads_back() -> None:
 def test_answers_come_in_order_whatever_the_number_of_cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     monkeypatch.setattr(threads, "cores", lambda: count)
     used = set()
+    together = threading.Barrier(count)  # nobody goes on before all threads have an item
 
     def work(k: int) -> int:
         used.add(threading.get_ident())
+        if k < count:
+            together.wait(30)
         time.sleep(0.001 * (7 - k))
         return k
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import stat
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -23,9 +21,6 @@ from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.triangles import reduced
-from rpim_opt.robot import compiled as native
-from rpim_opt.robot.abreast import abreast
-from rpim_opt.robot.kinematics import call_rows
 
 PARTS, ROWS = 5, 1100
 
@@ -238,56 +233,13 @@ def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.D
         partitions([], whole.robot, {"position_mm": 0.05})
 
 
-def test_ready_measurements_stay_the_same_in_other_processes() -> None:
-    for measurement in MEASUREMENTS.values():
-        assert pickle.loads(pickle.dumps(measurement)) is measurement
-
-
 def jacobian_of(problem: CalibrationProblem):
     return problem._functions(problem.data.blocks[0])["jacobian"]
 
 
-def test_machine_code_has_the_bits_of_the_virtual_machine(whole, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    native.compiled.cache_clear()
-    way = abreast(jacobian_of(whole), 2, 16, apart=True)
-    made = native.compiled(way.rows, way.angles)
-    if made is None:
-        pytest.skip("no C compiler here")
-    libraries = list((tmp_path / "rpim_opt").glob("*.so"))
-    assert len(libraries) == 1
-    assert stat.S_IMODE((tmp_path / "rpim_opt").stat().st_mode) == 0o700
-    x, rows = 0.2 * whole.parameters.free.scale, np.random.default_rng(0).uniform(-2, 2, (300, 9))
-    residual, jacobian = call_rows(jacobian_of(whole), [x, whole.parameters.nominal], rows)
-    common = np.array(way.common(x, whole.parameters.nominal)).ravel()
-    wanted = np.concatenate([residual.reshape(300, -1), jacobian.reshape(300, -1)], axis=1)
-    factors = np.arange(1.0, 1 + wanted.shape[1])
-    for shape, axis in ((wanted.shape, 0), (wanted.shape[::-1], 1)):  # from row to row far, and near
-        found = np.zeros(shape)
-        far, near = (stride // found.itemsize for stride in found.strides)
-        number, step = (near, far) if axis == 0 else (far, near)
-        places = found.ctypes.data + found.itemsize * number * np.arange(len(factors))
-        made(common, rows, places, step, factors)
-        assert np.array_equal(found if axis == 0 else found.T, wanted * factors)
-    written = libraries[0].stat().st_mtime_ns
-    native.compiled.cache_clear()
-    assert native.compiled(way.rows, way.angles) is not None  # taken from the cache
-    assert libraries[0].stat().st_mtime_ns == written
-
-
-def test_where_nothing_can_be_compiled_the_virtual_machine_stays(whole, tmp_path: Path, monkeypatch) -> None:
-    way = abreast(jacobian_of(whole), 2, 16, apart=True)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for name, value in (("CC", "no-such-compiler"), ("CC", "false"), (native.SWITCH, "0")):
-        with monkeypatch.context() as context:
-            context.setenv(name, value)
-            native.compiled.cache_clear()
-            assert native.compiled(way.rows, way.angles) is None
-    (tmp_path / "rpim_opt").mkdir(exist_ok=True)
-    os.chmod(tmp_path / "rpim_opt", 0o777)  # others could put their code there
-    native.compiled.cache_clear()
-    assert native.compiled(way.rows, way.angles) is None
-    native.compiled.cache_clear()
+def test_ready_measurements_stay_the_same_in_other_processes() -> None:
+    for measurement in MEASUREMENTS.values():
+        assert pickle.loads(pickle.dumps(measurement)) is measurement
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(400, 7), (500, 34), (300, 120), (40, 120)])

@@ -1,4 +1,4 @@
-"""Functions of rows abreast: the bits of one row after the other, for every operation, number of rows and thread."""
+"""Vectorized functions: the bits of one row after the other, for every operation, number of rows and thread."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics import threads
-from rpim_opt.robot import abreast as ways
-from rpim_opt.robot.kinematics import call_rows
+from rpim_opt.robot import evaluation
+from rpim_opt.robot.evaluation import call_rows
 
 SHARED = [np.array([0.3, -1.7]), np.array([2.5])]
 
@@ -42,66 +42,59 @@ def require_same(here: list[np.ndarray], there: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("N", [1, 64, 65, 255, 256, 257, 9000])
-def test_rows_abreast_have_the_bits_of_one_after_the_other(N: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "PAYS", 1)
+def test_vectorized_functions_have_the_bits_of_one_after_the_other(N: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evaluation, "PAYS", 1)
     function = every_operation()
-    assert min(N, ways.WIDTH) <= ways._quickest(function, 2, N).width <= max(2 * N, ways.NARROW)
-    require_same(ways.evaluated(function, SHARED, table(N)), call_rows(function, SHARED, table(N)))
+    assert min(N, evaluation.WIDTH) <= evaluation._quickest(function, 2, N).width <= max(2 * N, evaluation.NARROW)
+    require_same(evaluation.evaluate_rows(function, SHARED, table(N)), call_rows(function, SHARED, table(N)))
 
 
 def test_what_is_shared_may_change_and_may_be_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "PAYS", 1)
+    monkeypatch.setattr(evaluation, "PAYS", 1)
     function = every_operation()
     rows = table(300)
-    first = ways.evaluated(function, SHARED, rows)
+    first = evaluation.evaluate_rows(function, SHARED, rows)
     other = [SHARED[0] + 1, SHARED[1]]
-    require_same(ways.evaluated(function, other, rows), call_rows(function, other, rows))
-    require_same(ways.evaluated(function, SHARED, rows), first)  # none of it stayed
+    require_same(evaluation.evaluate_rows(function, other, rows), call_rows(function, other, rows))
+    require_same(evaluation.evaluate_rows(function, SHARED, rows), first)  # none of it stayed
     row = ca.SX.sym("row", 3)
     alone = ca.Function("alone", [row], [ca.sin(row) * row])
-    require_same(ways.evaluated(alone, [], rows), call_rows(alone, [], rows))
+    require_same(evaluation.evaluate_rows(alone, [], rows), call_rows(alone, [], rows))
 
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_threads_change_no_bit(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "cores", lambda: cores)
     function = every_operation()
-    rows = table(4 * ways.SHARE + 11)
-    require_same(ways.evaluated(function, SHARED, rows), call_rows(function, SHARED, rows))
+    rows = table(4 * evaluation.SHARE + 11)
+    require_same(evaluation.evaluate_rows(function, SHARED, rows), call_rows(function, SHARED, rows))
 
 
 @pytest.mark.parametrize("pays", [1, 10**9])
 def test_values_are_written_with_their_factors_wherever_they_are_wanted(pays: int, monkeypatch) -> None:
-    monkeypatch.setattr(ways, "PAYS", pays)
+    monkeypatch.setattr(evaluation, "PAYS", pays)
     function, rows = every_operation(), table(300)
     wanted = call_rows(function, SHARED, rows)
     factors = np.arange(1.0, 1 + sum(values[0].size for values in wanted))
     for step in (1, 3):
         found = [np.zeros((*values.shape[1:], step * len(rows)))[:, :, ::step] for values in wanted]
-        ways.write(function, SHARED, rows, found, factors)
+        evaluation.write_rows(function, SHARED, rows, found, factors)
         whole = np.concatenate([values.reshape(len(rows), -1) for values in wanted], axis=1) * factors
         assert np.array_equal(np.concatenate([into.reshape(-1, len(rows)) for into in found]), whole.T)
 
 
 def test_few_rows_are_evaluated_one_after_the_other() -> None:
     function = every_operation()
-    assert ways._quickest(function, 2, ways.PAYS - 1) is None
-    assert ways._quickest(function, 2, 1) is not None  # as many in all
-    assert ways._quickest(every_operation(), 2, ways.PAYS) is not None
+    assert evaluation._quickest(function, 2, evaluation.PAYS - 1) is None
+    assert evaluation._quickest(function, 2, 1) is not None  # as many in all
+    assert evaluation._quickest(every_operation(), 2, evaluation.PAYS) is not None
 
 
 def test_a_function_of_matrices_stays_as_it_is() -> None:
     x = ca.MX.sym("x", 3)
     function = ca.Function("matrices", [x], [ca.sum1(x) * x])
-    assert ways._quickest(function, 0, ways.PAYS) is None
-    require_same(ways.evaluated(function, [], table(2500)), call_rows(function, [], table(2500)))
-
-
-def test_a_long_function_is_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "SOME", 1)
-    monkeypatch.setattr(ways, "LONGEST", 3)
-    monkeypatch.setattr(ways, "compiled", lambda *_: pytest.fail("asked for machine code"))
-    assert ways._quickest(every_operation(), 2, ways.PAYS).width == ways.WIDTH
+    assert evaluation._quickest(function, 0, evaluation.PAYS) is None
+    require_same(evaluation.evaluate_rows(function, [], table(2500)), call_rows(function, [], table(2500)))
 
 
 @pytest.mark.parametrize("name", ["position", "pose", "distance", "cable", "joints"])
@@ -109,7 +102,7 @@ def test_ready_measurements(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = ro.load(name).problem
     x = 0.3 * problem.parameters.free.scale
     slow = problem.linearize(x)
-    monkeypatch.setattr(ways, "PAYS", 1)
+    monkeypatch.setattr(evaluation, "PAYS", 1)
     quick = problem.linearize(x)
     assert np.array_equal(quick.A, slow.A)
     assert np.array_equal(quick.b, slow.b)

@@ -1,0 +1,272 @@
+"""Evaluation of CasADi functions at many rows.
+
+CasADi's virtual machine spends most of its time between operations. `_vectorize` rebuilds a function of scalars so that
+every operation is done on `WIDTH` rows at once, in a fifteenth of the time; what depends on shared inputs alone is
+computed once. Operations and their order stay, and with them every bit of the values.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.threads import on_all_cores
+
+SYMBOLS = threading.RLock()
+"""CasADi counts its symbols without a lock; reentrant, since a user's function may itself evaluate a problem."""
+WIDTH = 256
+"""Rows of one call: in the virtual machine their numbers stay in the processor's second cache."""
+NARROW = 64
+"""Rows of one call for small tables."""
+SHARE = 16 * WIDTH
+"""Rows that one thread evaluates before it takes more: enough to be worth handing over."""
+PAYS = 2_000
+"""Rows, at once or in all, from which a vectorized function pays: to build it takes as long as to evaluate them."""
+
+
+def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+    """Evaluate a CasADi function on every row of a table, many in one call, without copies.
+
+    Parameters
+    ----------
+    function
+        Inputs: one column for each of ``shared``, then one column that changes with the row.
+    shared
+        Inputs that are the same for all rows.
+    rows
+        (N, k), one input column a row.
+
+    Returns
+    -------
+    For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
+    """
+    results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
+    arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
+
+    def evaluate(begin: int) -> None:
+        buffers: dict[int, Any] = {}
+        end = min(begin + SHARE, len(rows))
+        for start in range(begin, end, WIDTH):
+            part = slice(start, min(start + WIDTH, end))
+            N = len(rows[part])
+            if N not in buffers:
+                buffers[N] = _mapped(function, len(shared), N).buffer()
+                for i, values in enumerate(arguments[:-1]):
+                    buffers[N][0].set_arg(i, values.data)
+            buffer, trigger = buffers[N]
+            buffer.set_arg(len(shared), arguments[-1][part].data)
+            for i, values in enumerate(results):
+                buffer.set_res(i, values[part].data)
+            trigger()
+
+    on_all_cores(evaluate, range(0, len(rows), SHARE))
+    return results
+
+
+@lru_cache(maxsize=512)
+def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
+    """Return the function of N rows."""
+    return ca.Function.map(function, "rows", "serial", N, list(range(shared)), [], {})
+
+
+def evaluate_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+    """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows.
+
+    Of many rows the values of every number stand side by side in memory: (N, c, r) arrays whose first axis is dense.
+    """
+    vectorized = _quickest(function, len(shared), len(rows))
+    if vectorized is None:
+        return call_rows(function, shared, rows)
+    results = [np.empty((c, r, len(rows))) for r, c in vectorized.shapes]
+    _evaluate(vectorized, shared, rows, results, None)
+    return [values.transpose(2, 0, 1) for values in results]
+
+
+def write_rows(
+    function: ca.Function, shared: Sequence[Array], rows: Array, results: Sequence[Array], factors: Array
+) -> None:
+    """Write what `evaluate_rows` returns, times factors, into arrays.
+
+    Parameters
+    ----------
+    function, shared, rows
+        As `call_rows` has them.
+    results
+        An array (c, r, N) for every output (r, c).
+    factors
+        Of all outputs' numbers, one output after the other.
+    """
+    vectorized = _quickest(function, len(shared), len(rows))
+    if vectorized is not None:
+        _evaluate(vectorized, shared, rows, results, factors)
+        return
+    by_output = _split(factors[:, None], results)
+    for into, factor, values in zip(results, by_output, call_rows(function, shared, rows), strict=True):
+        np.multiply(values.transpose(1, 2, 0), factor, out=into)
+
+
+def _split(numbers: Array, results: Sequence[Array]) -> list[Array]:
+    """Return numbers (n, m) of all outputs by output, each (c, r, m)."""
+    ends = np.cumsum([into.shape[0] * into.shape[1] for into in results])
+    parts = np.split(numbers, ends[:-1])
+    return [part.reshape(*into.shape[:2], -1) for part, into in zip(parts, results, strict=True)]
+
+
+class _Vectorized(NamedTuple):
+    """A function of rows in two: ``common`` (shared inputs) and ``rows`` (that, rows (width, k)) -> (width, numbers).
+
+    ``shapes`` are those of the function's outputs.
+    """
+
+    common: ca.Function
+    rows: ca.Function
+    width: int
+    shapes: tuple[tuple[int, int], ...]
+
+
+class _Effort:
+    """Rows at which a function was evaluated."""
+
+    rows = 0
+
+
+@lru_cache(maxsize=256)
+def _effort(_: ca.Function) -> _Effort:
+    return _Effort()
+
+
+def _quickest(function: ca.Function, shared: int, rows: int) -> _Vectorized | None:
+    """Return how a function is evaluated at some rows more; None for one row after the other."""
+    effort = _effort(function)
+    effort.rows += rows
+    if effort.rows < PAYS:
+        return None
+    width = WIDTH
+    while rows <= width // 2 and width > NARROW:  # few of them are evaluated for nothing
+        width //= 2
+    return _vectorize(function, shared, width)
+
+
+@lru_cache(maxsize=256)
+def _vectorize(function: ca.Function, shared: int, width: int) -> _Vectorized | None:
+    """Return a function of scalar operations at ``width`` rows; None for one that calls others.
+
+    The first ``shared`` inputs are the same for all rows, the last one changes.
+    """
+    if not function.is_a("SXFunction"):
+        return None
+    with SYMBOLS:
+        inputs = function.sx_in()
+        numbers = ca.cse(ca.vertcat(*map(ca.vec, function.call(inputs))))
+        constant = ca.vertcat(*inputs[:shared])
+        remaining, symbols, values = ca.extract_parametric(numbers, constant, {"extract_trivial": True})
+        common = ca.Function("common", inputs[:shared], [ca.vertcat(ca.SX(0, 1), *values)])
+        scalar = ca.Function("scalar", [ca.vertcat(ca.SX(0, 1), *symbols), inputs[-1]], [remaining])
+        rows = _widen(scalar, width)
+    if rows is None:
+        return None
+    return _Vectorized(common, rows, width, tuple(function.size_out(i) for i in range(function.n_out())))
+
+
+def _widen(scalar: ca.Function, width: int) -> ca.Function | None:
+    """Return a function (common, row) -> numbers with the rows of a table (width, k) in the place of a row."""
+    common = ca.MX.sym("common", scalar.size1_in(0))
+    table = ca.MX.sym("rows", width, scalar.size1_in(1))
+    inputs = (ca.vertsplit(common), ca.horzsplit(table))
+    values: dict[int, ca.MX] = {}
+    outputs = [ca.MX.zeros(width, 1)] * scalar.size1_out(0)
+    for k in range(scalar.n_instructions()):
+        operation = scalar.instruction_id(k)
+        source = scalar.instruction_input(k)
+        target = scalar.instruction_output(k)
+        if operation == ca.OP_OUTPUT:
+            outputs[target[1]] = _dense(values[source[0]], width)
+        elif operation == ca.OP_INPUT:
+            values[target[0]] = inputs[source[0]][source[1]]
+        elif operation == ca.OP_CONST:
+            values[target[0]] = ca.MX(scalar.instruction_constant(k))
+        elif operation in (ca.OP_CALL, ca.OP_PARAMETER):
+            return None
+        elif len(source) == 1:
+            values[target[0]] = ca.MX.unary(operation, values[source[0]])
+        else:
+            values[target[0]] = ca.MX.binary(operation, *(values[i] for i in source))
+    return ca.Function("vectorized", [common, table], [ca.horzcat(*outputs)])
+
+
+def _dense(values: ca.MX, width: int) -> ca.MX:
+    """Return a number of every row (width, 1), where it may be one for all."""
+    values = ca.densify(values)
+    if values.numel() == width:
+        return values
+    return ca.repmat(values, width, 1)
+
+
+class _Memory:
+    """Inputs and outputs of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width).
+
+    They are set once: CasADi takes longer to set them than to evaluate.
+    """
+
+    def __init__(self, vectorized: _Vectorized):
+        common, rows = vectorized.common, vectorized.rows
+        self.constants = np.zeros(rows.size1_in(0))
+        self.width = vectorized.width
+        self.shared = [np.zeros(common.size1_in(i)) for i in range(common.n_in())]
+        self.table = np.zeros((rows.size2_in(1), self.width))
+        self.numbers = np.zeros((rows.size2_out(0), self.width))
+        self._common = _buffer(common, self.shared, self.constants)
+        self._rows = _buffer(rows, [self.constants, self.table], self.numbers)
+
+    def share(self, shared: Sequence[Array]) -> None:
+        """Take the inputs that are the same for all rows."""
+        for own, values in zip(self.shared, shared, strict=True):
+            own[:] = values
+        self._common[1]()
+
+    def evaluate(self, rows: Array) -> Array:
+        """Return the numbers (n, N) of at most ``width`` rows (N, k); the last one stands for those missing."""
+        N = len(rows)
+        self.table[:, :N] = rows.T
+        self.table[:, N:] = rows[-1][:, None]
+        self._rows[1]()
+        return self.numbers[:, :N]
+
+
+def _buffer(function: ca.Function, inputs: Sequence[Array], output: Array) -> Any:
+    """Return a buffer and what evaluates the function in it; both and the arrays have to be kept."""
+    buffer, trigger = function.buffer()
+    for i, values in enumerate(inputs):
+        buffer.set_arg(i, values.data)
+    buffer.set_res(0, output.data)
+    return buffer, trigger
+
+
+@lru_cache(maxsize=64)
+def _memory(vectorized: _Vectorized, _thread: int) -> _Memory:
+    return _Memory(vectorized)
+
+
+def _evaluate(
+    vectorized: _Vectorized, shared: Sequence[Array], rows: Array, results: Sequence[Array], factors: Array | None
+) -> None:
+    """Write the numbers of a table (N, k), times factors (n,), into arrays (c, r, N)."""
+
+    def evaluate(begin: int) -> None:
+        memory = _memory(vectorized, threading.get_ident())
+        memory.share(shared)
+        for start in range(begin, min(begin + SHARE, len(rows)), memory.width):
+            part = slice(start, min(start + memory.width, begin + SHARE))
+            numbers = memory.evaluate(rows[part])
+            if factors is not None:
+                numbers *= factors[:, None]
+            for into, values in zip(results, _split(numbers, results), strict=True):
+                into[:, :, part] = values
+
+    on_all_cores(evaluate, range(0, len(rows), SHARE))
