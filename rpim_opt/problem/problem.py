@@ -708,7 +708,7 @@ class CalibrationProblem(Tabled):
         """
         if self.touches is None:
             return ()
-        return self.touches.located(self._untouched)
+        return [thing.level for thing in self.touches.located(self._untouched)]
 
     def joint_slopes(self, at: Array | None = None) -> Array:
         """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.

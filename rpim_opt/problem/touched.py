@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,14 @@ UNKNOWNS = 3
 
 
 class Moved(NamedTuple):
-    """How a point or the centre of a plane moves (3, c) [m], and how its normal turns (3, c); zero for a point."""
+    """How a point or the centre of a plane moves (3, c) [m], and how its normal turns (3, c); zero for a point.
+
+    ``across`` (2, 3, c) is how the plane's two directions turn with it; None where all that is parallel turns with it.
+    """
 
     centre: Array
     normal: Array
+    across: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +63,11 @@ class Point:
         return cls(positions.mean(axis=0), len(positions), np.zeros(3), np.zeros((2, 3)))
 
     @property
+    def level(self) -> Point:
+        """The point itself."""
+        return self
+
+    @property
     def kept(self) -> np.ndarray:
         """Which of the touches' coordinates (K, 3) give a contrast its place."""
         found = np.ones((self.count, 3), dtype=bool)
@@ -69,8 +78,8 @@ class Point:
         """Return what of values (K, 3, c) of the positions a touch shows, (K, 3, c)."""
         return values
 
-    def without(self, values: Array) -> Array:
-        """Return what is left of values (K, 3, c) that a touch shows where the point follows them."""
+    def slopes(self, values: Array) -> Array:
+        """Return how far touches are off the point (K, 3, c) changes, where positions move by values (K, 3, c)."""
         return values - values.mean(axis=0)
 
     def contrasts(self, values: Array) -> Array:
@@ -98,8 +107,13 @@ class Plane:
     ----------
     centre, normal
         (3,) each.
+    axis
+        The number of the coordinate axis whose projection into the plane is its first direction; None for a plane that
+        is parallel to those that should be.
     across
         (2, 3) two directions in the plane.
+    height
+        (K,) s of every touch [m].
     places
         (K, 3): 1 and the coordinates u, v [m] of every touch in the plane.
     aside
@@ -116,7 +130,9 @@ class Plane:
 
     centre: Array
     normal: Array
+    axis: int | None
     across: Array
+    height: Array
     places: Array
     aside: Array
 
@@ -126,13 +142,21 @@ class Plane:
         centre = positions.mean(axis=0)
         normal = np.linalg.svd(positions - centre)[2][2]
         normal = normal * np.copysign(1.0, normal[np.argmax(np.abs(normal))])
-        axis = np.eye(3)[np.argmin(np.abs(normal))]
-        first = axis - normal * (axis @ normal)
+        axis = int(np.argmin(np.abs(normal)))
+        first = np.eye(3)[axis] - normal * normal[axis]
         first = first / np.linalg.norm(first)
         across = np.array([first, np.cross(normal, first)])
         places = np.column_stack([np.ones(len(positions)), (positions - centre) @ across.T])
         aside = np.linalg.qr(places, mode="complete")[0][:, UNKNOWNS:]
-        return cls(centre, normal, across, places, aside)
+        return cls(centre, normal, axis, across, (positions - centre) @ normal, places, aside)
+
+    @property
+    def level(self) -> Plane:
+        """The plane with its touches in it, as they were: what the nominal robot is off is no noise.
+
+        And planes that are to be parallel are.
+        """
+        return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @property
     def kept(self) -> np.ndarray:
@@ -147,10 +171,12 @@ class Plane:
         found[:, 0] = np.einsum("kic,i->kc", values, self.normal)
         return found
 
-    def without(self, values: Array) -> Array:
-        """Return what is left of values (K, 3, c) that a touch shows where the plane follows them."""
+    def slopes(self, values: Array) -> Array:
+        """Return how s changes (K, 3, c), its first coordinate, where positions move by values (K, 3, c)."""
         found = np.zeros_like(values)
-        found[:, 0] = self.aside @ (self.aside.T @ values[:, 0])
+        moved = self.moved(values)
+        q = self.places[:, 1:] @ self.across + np.outer(self.height, self.normal)
+        found[:, 0] = np.einsum("kic,i->kc", values - moved.centre, self.normal) + q @ moved.normal
         return found
 
     def contrasts(self, values: Array) -> Array:
@@ -160,7 +186,22 @@ class Plane:
         return found
 
     def moved(self, values: Array) -> Moved:
-        """Return how it moves where its touches move by values (K, 3, c)."""
-        along = np.einsum("kic,i->kc", values, self.normal)
-        slopes = np.linalg.pinv(self.places)[1:] @ along
-        return Moved(values.mean(axis=0), -self.across.T @ slopes)
+        """Return how it moves where its touches move by values (K, 3, c).
+
+        n is the eigenvector of M = sum_i q_i q_i', q_i = p_i - centre, with the least eigenvalue s's::
+
+            dn = -E' (E M E' - s's)^-1 E dM n,    dM n = sum_i q_i n'dp_i + s_i dp_i,    E the directions in the plane
+        """
+        n = self.normal
+        E = self.across
+        uv = self.places[:, 1:]
+        turn = uv.T @ np.einsum("kic,i->kc", values, n) + E @ np.einsum("k,kic->ic", self.height, values)
+        normal = -E.T @ np.linalg.solve(uv.T @ uv - self.height @ self.height * np.eye(2), turn)
+        if self.axis is None:
+            return Moved(values.mean(axis=0), normal, None)
+        # E_1 = (a - n n'a) / |a - n n'a| with a coordinate axis a, E_2 = n x E_1
+        a = np.eye(3)[self.axis]
+        first = -(np.outer(n, a @ normal) + normal * (a @ n))
+        first = (first - np.outer(E[0], E[0] @ first)) / np.sqrt(1 - n[self.axis] ** 2)
+        second = np.cross(normal, E[0][:, None], axis=0) + np.cross(n[:, None], first, axis=0)
+        return Moved(values.mean(axis=0), normal, np.stack([first, second]))

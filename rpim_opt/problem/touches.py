@@ -141,7 +141,7 @@ class Touches:
             return left, None
         slopes = jacobian.copy()
         for thing, index in zip(where, self.rows, strict=True):
-            slopes[index] = unit * thing.without(thing.seen(jacobian[index]))
+            slopes[index] = unit * thing.slopes(jacobian[index])
         if size > CLOSE:
             every = np.concatenate(self.rows)
             away = -residual[every] - np.mean(-residual[every], axis=0)
@@ -237,7 +237,9 @@ def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
         return turned[None] / np.sqrt(max(1 - cosine**2, 1e-12))
     if tie.kind == "known_parallel":
         same = np.copysign(1.0, first.normal @ second.normal)
-        return first.across @ (same * other.normal - one.normal)
+        if one.across is None:
+            return first.across @ (same * other.normal - one.normal)
+        return same * (first.across @ other.normal + np.einsum("aic,i->ac", one.across, second.normal))
     apart = second.centre - first.centre
     if isinstance(first, Plane):
         along = first.normal @ (other.centre - one.centre) + apart @ one.normal
@@ -395,7 +397,7 @@ def _left(thing: Point | Plane, V: Array) -> Array:
         return V
     values = np.zeros((K, 3, K, 3))
     values[np.arange(K), :, np.arange(K)] = np.eye(3)
-    through = thing.without(thing.seen(values.reshape(K, 3, 3 * K))).reshape(K, 3, K, 3)
+    through = thing.slopes(values.reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
     found = np.einsum("aibj,bjk,albk->ail", through, V, through)
     own = np.einsum("kii->ki", found)
     # directions that a touch does not show have no error: any positive variance serves
