@@ -1,8 +1,10 @@
-"""Postures in which a robot's tool is at a stated point: what touches it, from many sides."""
+"""Inverse kinematics from random configurations: a tool at stated points, or whatever else is to vanish there."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,21 +15,22 @@ from rpim_opt.data.models import revisit
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.mdh import Robot
 
 DRAWS = 200
-"""Random postures that are tried for each."""
+"""Random configurations that are tried for each row."""
 FIRST, FAR = 10, 1e-3
-"""After so many a point is out of reach from which the nearest posture is further [m]."""
+"""After so many draws a row is out of reach from which the nearest configuration is further [m]."""
 STEPS = 40
-"""Steps from each of them."""
+"""Newton steps from each: some dozen long ones until the target is near, then a few to rounding."""
 LONGEST = 0.1
 """Largest step, in ranges of the joints: close starts stay close on their way."""
 DIFFERENCE = 1e-4
-"""Step of the slopes' differences, in ranges."""
+"""Step of the central differences, in ranges: their rounding is 1e-12, and Newton's method forgives their bend."""
 DAMPING = 1e-9
 """Square of the slopes [m^2] at which a step is half as long: a stretched arm does not leap."""
 THERE = 1e-11
-"""Largest distance [m] of a posture from its point."""
+"""Largest distance [m] of a configuration from its target; one more step then leaves rounding alone."""
 
 
 def postures_at(
@@ -40,12 +43,7 @@ def postures_at(
 ) -> Array:
     """Return joint values (N, dof) [rad or m] at which the tool is at N points.
 
-    From a random posture, steps of least norm in units of the joints' ranges::
-
-        u <- u - G' (G G' + d)^-1 (p - point),    G = dp / du
-
-    and no further than the joints' limits. One that does not get there is drawn again. It is arithmetic on single
-    numbers, row by row, as for `touching_poses`: the same on every processor.
+    From random configurations by Newton's steps (`Target`), all the way within the joints' limits.
 
     Parameters
     ----------
@@ -82,27 +80,90 @@ def postures_at(
         x = np.zeros(len(problem.parameters.free))
     if marker is None:
         marker = problem.data.blocks[0].markers[0]
-    rng = np.random.default_rng(seed)
-    reached = _Reached(problem, x, marker)
-    low = problem.robot.limits.mean(axis=1) - share * np.ptp(problem.robot.limits, axis=1) / 2
-    high = problem.robot.limits.mean(axis=1) + share * np.ptp(problem.robot.limits, axis=1) / 2
-    postures = np.empty((len(points), problem.robot.dof))
-    missing = np.ones(len(points), dtype=bool)
-    nearest = np.full(len(points), np.inf)
-    for draw in range(DRAWS):
-        # for all rows, also those that have their posture: a row's draws do not depend on another row's luck
-        q = random_candidates(problem.robot, len(points), rng, share)
-        some = np.flatnonzero(missing)
-        q, taken = reached.led(q[some], points[some], low, high)
-        nearest[some] = np.minimum(nearest[some], np.sum((reached.at(q) - points[some]) ** 2, axis=1))
-        if draw >= FIRST and (nearest > FAR**2).any():
-            break
-        postures[some[taken]] = q[taken]
-        missing[some[taken]] = False
-        if not missing.any():
-            return postures
-    point = ", ".join(f"{1e3 * v:g}" for v in points[int(np.argmax(nearest * missing))])
-    raise InputError("the point", f"({point}) mm, out of reach", "one that the tool can be at")
+
+    def away(q: Array, rows: np.ndarray) -> Array:
+        data = Dataset.of(q, np.empty((len(q), 0)), 1.0, measurement=revisit)
+        data = bearing(data, problem.data, None)
+        block = replace(data.blocks[0], markers=(marker,))
+        return problem.on(Dataset((block,), data.label, data.configuration)).modelled(x)[0] - points[rows]
+
+    middle = problem.robot.limits.mean(axis=1)
+    half = share * np.ptp(problem.robot.limits, axis=1) / 2
+    target = Target(problem.robot, away, np.column_stack([middle - half, middle + half]))
+    q, beyond = target.reached(len(points), np.random.default_rng(seed), share)
+    if beyond is not None:
+        point = ", ".join(f"{1e3 * v:g}" for v in points[beyond])
+        raise InputError("the point", f"({point}) mm, out of reach", "one that the tool can be at")
+    return q
+
+
+class Target(NamedTuple):
+    """What is to vanish at joint values: Newton's steps of least norm, in units u of the joints' ranges, lead there.
+
+    ::
+
+        u <- u - G' (G G' + d)^-1 e,    G = de / du
+
+    ``away`` maps joint values (M, dof) and the numbers (M,) of their rows to e (M, k) [m]; no step leaves ``within``
+    (dof, 2), by default the ends alone keep the joints' limits; d is ``damping`` [m^2].
+    """
+
+    robot: Robot
+    away: Callable[[Array, np.ndarray], Array]
+    within: Array | None = None
+    damping: float = DAMPING
+
+    def reached(self, count: int, rng: np.random.Generator, share: float) -> tuple[Array, int | None]:
+        """Return joint values (N, dof) [rad or m] of so many rows, and the row that is out of reach, if there is one.
+
+        A configuration that does not get there is drawn again, from a share of the ranges. Rows do not depend on each
+        other. What processors differ by in rounding grows 2 times on the way in the median and 100 times at worst, to
+        a thousandth of what a table prints.
+        """
+        q = np.empty((count, self.robot.dof))
+        missing = np.ones(count, dtype=bool)
+        nearest = np.full(count, np.inf)
+        for draw in range(DRAWS):
+            rows = np.flatnonzero(missing)
+            # drawn for all rows, also those that are there: a row's draws do not depend on another row's luck
+            q[rows] = random_candidates(self.robot, count, rng, share)[rows]
+            q[rows], missing[rows] = self._led(q[rows], rows)
+            nearest[rows] = np.minimum(nearest[rows], np.linalg.norm(self.away(q[rows], rows), axis=1))
+            if not missing.any():
+                return q, None
+            if draw >= FIRST and (nearest > FAR).any():
+                break
+        return q, int(np.argmax(nearest * missing))
+
+    def _led(self, q: Array, rows: np.ndarray) -> tuple[Array, np.ndarray]:
+        """Return joint values led from q (M, dof), and which of them (M,) are not there or beyond the limits."""
+        low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
+        there = np.zeros(len(q), dtype=bool)
+        for _ in range(STEPS):
+            way = np.flatnonzero(~there)
+            q[way] = np.clip(q[way] + self._step(q[way], rows[way]), low, high)
+            there[way] = np.linalg.norm(self.away(q[way], rows[way]), axis=1) < THERE
+            if there.all():
+                break
+        # a last step for all: rounding is then all that is left, the same on every processor
+        q = q + self._step(q, rows)
+        low, high = (self.robot.limits if self.within is None else self.within).T
+        return q, ~there | np.any((q < low) | (q > high), axis=1)
+
+    def _step(self, q: Array, rows: np.ndarray) -> Array:
+        """Return every row's step (M, dof), no longer than `LONGEST` ranges."""
+        M, dof = q.shape
+        span = np.ptp(self.robot.limits, axis=1)
+        shifts = np.diag(DIFFERENCE * span)
+        near = np.concatenate([q[None], q + shifts[:, None], q - shifts[:, None]])
+        e = self.away(near.reshape(-1, dof), np.tile(rows, 2 * dof + 1)).reshape(2 * dof + 1, M, -1)
+        G = np.moveaxis(e[1 : dof + 1] - e[dof + 1 :], 0, 2) / (2 * DIFFERENCE)
+        damped = np.tile(np.sqrt(self.damping) * np.eye(e.shape[2]), (M, 1, 1))
+        # [G'; sqrt(d) I] = Q R leaves more digits than G G' + d where an arm is nearly stretched
+        Q, R = np.linalg.qr(np.concatenate([G.transpose(0, 2, 1), damped], axis=1))
+        step = -(Q[:, :dof] @ np.linalg.solve(R.transpose(0, 2, 1), e[0][:, :, None]))[:, :, 0]
+        length = np.linalg.norm(step, axis=1)
+        return step * np.minimum(1.0, LONGEST / np.maximum(length, LONGEST))[:, None] * span
 
 
 def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Array:
@@ -134,66 +195,3 @@ def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Arr
     middle = np.mean(centres, axis=0)
     # one of them: their middle may be where no tool reaches
     return min(centres, key=lambda centre: float(np.sum((centre - middle) ** 2)))
-
-
-class _Reached:
-    """Where a tool is in the robot's base frame."""
-
-    def __init__(self, problem: CalibrationProblem, x: Array, marker: str):
-        self.problem = problem
-        self.x = x
-        self.marker = marker
-        self.span = np.ptp(problem.robot.limits, axis=1)
-
-    def at(self, q: Array) -> Array:
-        """Return the positions (N, 3) [m] at joint values (N, dof)."""
-        data = Dataset.of(q, np.empty((len(q), 0)), 1.0, measurement=revisit)
-        data = bearing(data, self.problem.data, None)
-        block = replace(data.blocks[0], markers=(self.marker,))
-        there = self.problem.on(Dataset((block,), data.label, data.configuration))
-        return there.modelled(self.x)[0]
-
-    def led(self, q: Array, points: Array, low: Array, high: Array) -> tuple[Array, np.ndarray]:
-        """Return postures (N, dof) led to their points from q (N, dof), and which of them are there (N,)."""
-        q = q.copy()
-        there = np.zeros(len(q), dtype=bool)
-        for _ in range(STEPS):
-            left = np.flatnonzero(~there)
-            q[left] = np.clip(q[left] + self.step(q[left], points[left]), low, high)
-            away = self.at(q[left]) - points[left]
-            there[left] = np.sum(away**2, axis=1) < THERE**2
-            if there.all():
-                break
-        # a last step for all: rounding is then all that is left, the same on every processor
-        last = q + self.step(q, points)
-        inside = np.all((last >= low) & (last <= high), axis=1)
-        return np.where(inside[:, None], last, q), there & inside
-
-    def step(self, q: Array, points: Array) -> Array:
-        """Return every row's step (N, dof) towards its point, no longer than `LONGEST` ranges."""
-        N, dof = q.shape
-        shifts = np.diag(DIFFERENCE * self.span)
-        near = np.concatenate([q[None], q + shifts[:, None], q - shifts[:, None]])
-        p = self.at(near.reshape(-1, dof)).reshape(-1, N, 3)
-        G = np.moveaxis(p[1 : dof + 1] - p[dof + 1 :], 0, 2) / (2 * DIFFERENCE)
-        away = p[0] - points
-        weighed = _solved(G, away)
-        step = -np.sum(G * weighed[:, :, None], axis=1)
-        length = np.sqrt(np.sum(step**2, axis=1))
-        return step * np.minimum(1.0, LONGEST / np.maximum(length, LONGEST))[:, None] * self.span
-
-
-def _solved(G: Array, away: Array) -> Array:
-    """Return (G G' + d)^-1 e of every row (N, 3), by cofactors."""
-    M = np.sum(G[:, :, None, :] * G[:, None, :, :], axis=3)
-    for i in range(3):
-        M[:, i, i] += DAMPING
-    rows = [M[:, i] for i in range(3)]
-    cofactors = np.stack([_cross(rows[1], rows[2]), _cross(rows[2], rows[0]), _cross(rows[0], rows[1])], axis=1)
-    determinant = np.sum(rows[0] * cofactors[:, 0], axis=1)
-    return np.sum(cofactors * away[:, :, None], axis=1) / determinant[:, None]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    parts = [a[:, (i + 1) % 3] * b[:, (i + 2) % 3] - a[:, (i + 2) % 3] * b[:, (i + 1) % 3] for i in range(3)]
-    return np.stack(parts, axis=1)

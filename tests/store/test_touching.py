@@ -7,7 +7,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
-from rpim_opt.store import touching
+from rpim_opt.problem import postures
 from rpim_opt.store.touching import touching_poses
 
 SURFACES = ("plane", "sphere")
@@ -46,9 +46,9 @@ def test_poses_touch_within_the_limits(name: str) -> None:
 def test_a_change_in_the_last_digits_stays_there(name: str, monkeypatch) -> None:
     poses = touched(name)[0].data.blocks[0].q
     noise = np.random.default_rng(1)
-    draw = touching.random_candidates
+    draw = postures.random_candidates
     monkeypatch.setattr(
-        touching,
+        postures,
         "random_candidates",
         lambda *arguments: draw(*arguments) + 1e-12 * noise.normal(size=poses[:, 0].shape),
     )
@@ -65,9 +65,8 @@ def test_further_draws_do_not_depend_on_how_many_poses_were_tried() -> None:
     assert rng.normal() == np.random.default_rng(4).normal()
 
 
-def test_a_surface_out_of_reach_is_refused(monkeypatch) -> None:
+def test_a_surface_out_of_reach_is_refused() -> None:
     problem = problem_of("sphere")
     x = np.zeros(len(problem.parameters.free))
-    monkeypatch.setattr(touching, "DRAWS", 2)
     with pytest.raises(ro.InputError, match="out of reach"):
         touching_poses(problem, x, np.full(len(problem.data), 50.0), np.random.default_rng(0))
