@@ -30,7 +30,8 @@ FLOORS: dict[str, set[str]] = {
     "convex": {"clarabel", "cvxpy"},
     # casadi: a reflector's transform is a measurement, too; pandas: a data frame, where one is asked for
     "calibration": {"casadi", "pandas"},
-    "store": {"pydantic"},
+    # cattrs: values as JSON and back; pydantic: the schema of problem.toml
+    "store": {"cattrs", "pydantic"},
     # casadi: compensation differentiates the tool's pose
     "use": {"casadi"},
     # rich: progress on a console; jinja2: pages
@@ -158,10 +159,9 @@ ELSEWHERE = {
     "rpim_opt.data.tracker",
     "rpim_opt.problem.observability",
     "rpim_opt.robot.urdf",
-    "rpim_opt.store.prior_file",
-    "rpim_opt.store.schema",
+    "cattrs",
 }
-"""What a plain calibration has no use of, each with modules of its own: a limit, cameras, a drawing's words, a file."""
+"""What a plain calibration has no use of: a limit, cameras, a drawing's words, a result file."""
 HEAVY = {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.spatial"}
 """Libraries that a calibration without cones does not use."""
 UNUSED = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections import Counter
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -180,15 +181,25 @@ def parse_json(text: str) -> Any:
     Raises
     ------
     ValueError
-        For what is no JSON, is nested too deeply, or has half a surrogate pair, which no file of UTF-8 can hold.
+        For what is no JSON, is nested too deeply, states a key twice, or has half a surrogate pair, which no file of
+        UTF-8 can hold.
     """
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_unique)
         if _HALF_PAIR.search(text):
             json.dumps(content, ensure_ascii=False).encode()
     except RecursionError as error:
         raise ValueError(str(error)) from None
     return content
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object's keys and values; of a key that stands there twice, nobody knows which value is meant."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
+        raise ValueError(f"the key '{twice}' twice in one object")
+    return found
 
 
 def sha256_of(path: Path) -> str:

@@ -36,7 +36,7 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.named import named_formulation, named_weight
 from rpim_opt.store.observations import Tables, read_tables
-from rpim_opt.store.prior_table import prior_files, stated_prior
+from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
 from rpim_opt.store.stated_record import stated_details, stated_requirement
 
@@ -306,12 +306,5 @@ def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
         used[stated.table.target] = folder / stated.table.target
     for files in tables.files.values():
         used |= {file: folder / file for file in files}
-    used |= {file: _result(folder / file) for file in prior_files(stated.table.prior)}
+    used |= stated.table.prior.files(stated.path)
     return {name: sha256_of(file) for name, file in used.items()}
-
-
-def _result(file: Path) -> Path:
-    """Return a result's file, which may be named by its folder."""
-    if file.is_dir():
-        return file / "result.json"
-    return file

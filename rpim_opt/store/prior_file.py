@@ -1,47 +1,28 @@
-"""Priors that last: one JSON file each, in which every number reads back to the same bits."""
+"""Priors in files: ``[prior]`` of a problem file, and JSON files in which every number reads back to the same bits."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import read_json, validate, write_json
+from rpim_opt.basics.files import Table, read_json, write_json
+from rpim_opt.basics.inputs import inside
+from rpim_opt.basics.patterns import fits
+from rpim_opt.basics.units import split_unit
 from rpim_opt.convex.prior import Prior
-from rpim_opt.convex.statement import Statement
-from rpim_opt.store.parts import finite
-from rpim_opt.store.schema import Matrix, Part, Vector
+from rpim_opt.convex.stated import FRAMES
+from rpim_opt.convex.stated import JOINT_OFFSET as FACTOR
+from rpim_opt.data.models import Measurement
+from rpim_opt.robot.overlay import JOINT_OFFSET, is_joint_offset
+from rpim_opt.robot.parameters import Parameters
 
 FORMAT = "rpim-opt prior"
-
-
-class StatementPart(Part):
-    """A linear Gaussian statement."""
-
-    names: list[str]
-    dimensions: list[str]
-    rows: Matrix
-    values: Vector
-    reference: Vector | None
-    whole: bool
-    text: str
-
-
-class PriorFile(Part):
-    """A prior; no tails are infinite ones."""
-
-    format: Literal["rpim-opt prior"]
-    version: Literal[1]
-    centre: dict[str, float]
-    scale: dict[str, float]
-    tails: float | None
-    groups: list[list[str]]
-    joint_offset: float
-    frames: float
-    statements: list[StatementPart]
-    doubted: bool = False
+VERSION = 1
 
 
 def save_prior(prior: Prior, path: str | Path) -> None:
@@ -62,19 +43,9 @@ def save_prior(prior: Prior, path: str | Path) -> None:
     >>> ro.store.load_prior("prior.json") == prior
     True
     """
-    content = {
-        "format": FORMAT,
-        "version": 1,
-        "centre": dict(prior.centre),
-        "scale": dict(prior.scale),
-        "tails": finite(prior.tails),
-        "groups": [list(group) for group in prior.groups],
-        "joint_offset": prior.joint_offset,
-        "doubted": prior.doubted,
-        "frames": prior.frames,
-        "statements": [vars(each) for each in prior.statements],
-    }
-    write_json(Path(path), content)
+    from rpim_opt.store.serialize import plain
+
+    write_json(Path(path), {"format": FORMAT, "version": VERSION, **plain(prior)})
 
 
 def load_prior(path: str | Path) -> Prior:
@@ -100,49 +71,184 @@ def load_prior(path: str | Path) -> Prior:
     """
     path = Path(path)
     stored = read_json(path)
-    if not is_prior(stored):
+    if not _is_prior(stored):
         raise InputError("the file", "no prior of rpim-opt", "a file of store.save_prior()", path)
-    return prior_of(stored, path)
+    return _prior(stored, path)
 
 
-def is_prior(stored: Any) -> bool:
-    """Whether a file's content says that it is a prior."""
+def _is_prior(stored: Any) -> bool:
     return isinstance(stored, dict) and stored.get("format") == FORMAT
 
 
-def prior_of(stored: dict[str, Any], path: Path) -> Prior:
+def _prior(stored: Mapping[str, Any], path: Path) -> Prior:
     """Return the prior of a file's content."""
-    file = validate(PriorFile, stored, path)
+    from rpim_opt.store.serialize import structured
+
     try:
-        return Prior(
-            centre=file.centre,
-            scale=file.scale,
-            tails=np.inf if file.tails is None else file.tails,
-            groups=tuple(tuple(group) for group in file.groups),
-            joint_offset=file.joint_offset,
-            doubted=file.doubted,
-            frames=file.frames,
-            statements=tuple(_statement(part, i) for i, part in enumerate(file.statements, start=1)),
-        )
+        if stored.get("version") != VERSION:
+            raise InputError("key version", repr(stored.get("version"))[:40], f"{VERSION}")
+        prior = structured(stored, Prior)
+        _require_finite("key centre", list(prior.centre.values()))
+        _require_finite("key scale", list(prior.scale.values()))
+        for number, each in enumerate(prior.statements, start=1):
+            where = f"key statements {number}"
+            p, k = len(each.names), len(each.values)
+            lengths = {len(each.dimensions), *map(len, each.rows)}
+            if each.reference is not None:
+                lengths.add(len(each.reference))
+            if not lengths <= {p} or len(each.rows) != k:
+                accepted = f"{k} rows of {p} numbers, one a parameter, and as many dimensions and numbers of reference"
+                raise InputError(where, "parts that do not fit together", accepted)
+            _require_finite(where, [*each.values, *(each.reference or ()), *(v for row in each.rows for v in row)])
     except InputError as error:
         raise error.within(path) from None
+    return prior
 
 
-def _statement(part: StatementPart, number: int) -> Statement:
-    p, k = len(part.names), len(part.values)
-    shapes = {len(part.dimensions), *map(len, part.rows), len(part.reference or part.names)}
-    if shapes != {p} or len(part.rows) != k:
-        accepted = f"{k} rows of {p} numbers, one a parameter"
-        raise InputError(f"key statements {number}", "parts that do not fit together", accepted)
-    reference = None
-    if part.reference is not None:
-        reference = tuple(part.reference)
-    return Statement(
-        names=tuple(part.names),
-        dimensions=tuple(part.dimensions),
-        rows=tuple(tuple(row) for row in part.rows),
-        values=tuple(part.values),
-        reference=reference,
-        whole=part.whole,
-        text=part.text,
-    )
+def _require_finite(where: str, values: Sequence[float]) -> None:
+    if not np.isfinite(values).all():
+        raise InputError(where, "a number that is not finite", "finite numbers")
+
+
+# --- [prior] of a problem file -----------------------------------------------------------------------------------
+
+
+class PriorTable(Table):
+    """The keys of ``[prior]``; tails may be infinite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=True)
+
+    known: list[str] = Field(default_factory=list)
+    earlier: str = Field(default="", alias="from")
+    without: list[str] = Field(default_factory=list)
+    inflate: float | int = 1.0
+    fleet: list[str] = Field(default_factory=list)
+    tails: float | int = 3.0
+    groups: list[str] = Field(default_factory=list)
+    joint_offset: float | int = FACTOR
+    frames: float | int = FRAMES
+    centre: dict[str, float | int] = Field(default_factory=dict)
+    scale: dict[str, float | int] = Field(default_factory=dict)
+
+    def files(self, path: Path) -> dict[str, Path]:
+        """Return the files that the prior is read from, by the names that a problem file has for them.
+
+        Raises
+        ------
+        InputError
+            For one outside the problem's folder.
+        """
+        named = [(file, "key prior.fleet") for file in self.fleet]
+        if self.earlier:
+            named.append((self.earlier, "key prior.from"))
+        return {name: _inside(name, key, path) for name, key in named}
+
+
+def stated_prior(
+    table: PriorTable,
+    scale: Mapping[str, float],
+    parameters: Parameters,
+    path: Path,
+    measurements: Sequence[Measurement],
+) -> Prior:
+    """Return the prior that a problem file states, which fits the problem's parameters.
+
+    Parameters
+    ----------
+    table
+        ``[prior]``.
+    scale
+        ``[scale]``: what it says of joint offsets alone, or of a parameter by its name, is taken at its word.
+    parameters
+        Of the problem.
+    path
+        The file.
+    measurements
+        Models of a script's own that results may name.
+
+    Raises
+    ------
+    InputError
+        Naming the file and the key.
+    """
+    prior = _own(table, _offsets(scale, parameters), path)
+    for i, text in enumerate(table.known, start=1):
+        prior &= _named(f"key prior.known {i}", path, lambda text=text: Prior.known(text))
+    files = table.files(path)
+    if table.earlier:
+        prior &= _named("key prior.from", path, lambda: _earlier(table, files[table.earlier], measurements))
+    if table.fleet:
+        prior &= _named("key prior.fleet", path, lambda: _population(table.fleet, files, measurements))
+    prior.stated(parameters)
+    return prior
+
+
+def _inside(name: str, key: str, path: Path) -> Path:
+    """Return the file that a problem file names, of a folder its result; it must lie in the problem's folder."""
+    try:
+        file = inside(path.parent, name, key, path)
+        if file.is_dir():
+            file = inside(path.parent, str(Path(name) / "result.json"), key, path)
+    except InputError as error:
+        accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
+        raise InputError(key, error.found, accepted, path) from None
+    return file
+
+
+def _own(table: PriorTable, offsets: Mapping[str, float], path: Path) -> Prior:
+    """Return what the table says in its own numbers."""
+    for key in ("inflate", "without"):
+        if key in table.model_fields_set and not table.earlier:
+            raise InputError(f"key prior.{key}", "no key from beside it", "from = 'other/result.json'", path)
+    try:
+        return Prior(
+            centre=table.centre,
+            scale={**offsets, **table.scale},
+            tails=float(table.tails),
+            groups=tuple(tuple(group.split()) for group in table.groups),
+            joint_offset=float(table.joint_offset),
+            frames=float(table.frames),
+        )
+    except InputError as error:
+        raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
+
+
+def _offsets(scale: Mapping[str, float], parameters: Parameters) -> dict[str, float]:
+    """Return what ``[scale]`` says of joint offsets and of nothing else, and of single parameters by their names.
+
+    Somebody has thought of those: a certificate's standard uncertainty of a reflector's place, for instance.
+    """
+    return {key: value for key, value in scale.items() if _is_literal(split_unit(key)[0], parameters)}
+
+
+def _is_literal(stem: str, parameters: Parameters) -> bool:
+    if stem == JOINT_OFFSET or stem in parameters.names:
+        return True
+    matches = [name for name in parameters.names if fits(name, stem)]
+    return bool(matches) and all(map(is_joint_offset, matches))
+
+
+def _named(key: str, path: Path, make: Callable[[], Prior]) -> Prior:
+    """Return what ``make`` returns; an error of it names the key, where it does not name a file."""
+    try:
+        return make()
+    except InputError as error:
+        if error.file:
+            raise
+        raise InputError(key, error.found, error.accepted, path) from None
+
+
+def _earlier(table: PriorTable, file: Path, measurements: Sequence[Measurement]) -> Prior:
+    """Return the prior that a file holds, or the posterior of a result."""
+    from rpim_opt.store.result_file import load_result  # most folders name no earlier result
+
+    stored = read_json(file)
+    if _is_prior(stored):
+        return _prior(stored, file)
+    return Prior.from_result(load_result(file, measurements), table.inflate, table.without)
+
+
+def _population(names: Sequence[str], files: Mapping[str, Path], measurements: Sequence[Measurement]) -> Prior:
+    from rpim_opt.store.result_file import load_result
+
+    return Prior.from_fleet({name: load_result(files[name], measurements) for name in names})

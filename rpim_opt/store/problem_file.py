@@ -25,7 +25,7 @@ from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.named import find, named_formulation, named_weight
-from rpim_opt.store.prior_table import PriorTable
+from rpim_opt.store.prior_file import PriorTable
 from rpim_opt.store.proposal import proposed
 from rpim_opt.store.stated_table import Constraints
 

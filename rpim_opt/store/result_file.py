@@ -1,48 +1,77 @@
-"""Results that last: a calibration goes to one file and comes back, without the problem's folder."""
+"""Result files: a calibration goes to one JSON file and comes back, without the problem's folder."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import read_json, validate, write_json
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices, pick
+from rpim_opt.basics.files import read_json, write_json
+from rpim_opt.basics.statistics import statistics
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held
+from rpim_opt.calibration.learned import Learned
 from rpim_opt.calibration.prices import Price
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
-from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex import constraints
+from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM
+from rpim_opt.convex.believed import believed
+from rpim_opt.convex.formulation import Formulation, huber, lost
 from rpim_opt.convex.posed import Unposed
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.select import SELECTORS, Selector
+from rpim_opt.convex.selection import Selection
+from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.trust import kept_equations
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.models import READY, Measurement
 from rpim_opt.data.record import Record
-from rpim_opt.problem.frames import own_frames
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.scatter import Scatter
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.open_model import Model
-from rpim_opt.store.agreement import agreement
-from rpim_opt.store.content import content, derived, digest
-from rpim_opt.store.definition import formulation_of, quadratic_of
-from rpim_opt.store.figures import sets
-from rpim_opt.store.learned_parts import learned_of, scatter_of
-from rpim_opt.store.parts import data_of, parameters_of, robots_of, selection_of
-from rpim_opt.store.record_part import record_of
-from rpim_opt.store.schema import FORMAT, VERSION, File, RowPart
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.store.serialize import digest, plain, structured
 
+FORMAT = "rpim-opt result"
+VERSION = 2
 Models = Model | Mapping[str, Model]
-AGREEMENT_MM = 1e-6
-"""By how much an error that a file states may differ from the one that its data and parameters give."""
+RELATIVE = 1e-4
+"""Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
+ABSOLUTE = 1e-6
+"""Largest difference [mm] of a stated figure and the one that follows from the data: a nanometre."""
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "sum_squares": SQUARES,
+    "sum": SUM,
+    "max": LARGEST,
+    "norm1": NORM1,
+    "norm2": NORM2,
+    "within_tolerance": constraints.within_tolerance,
+    "by_link": constraints.by_link,
+    "by_kind": constraints.by_kind,
+}
+"""Functions of a formulation that a file names; those that the next ones make are named with their arguments."""
+MAKERS: dict[str, Callable[..., Any]] = {
+    "huber": huber,
+    "believed": believed,
+    "at_nominal": constraints.at_nominal,
+    "signed": constraints.signed,
+    "equal": constraints.equal,
+    "in_ball": constraints.in_ball,
+    "differences": constraints.differences,
+    "parse": constraints.parse,
+}
 
 
 def save_result(result: Calibration, path: str | Path, record: Record | None = None) -> None:
@@ -75,7 +104,7 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
         raise InputError("save_result", "measurements in parts", "measurements in memory, which the file repeats")
     if record is not None:
         result = replace(result, record=record)
-    write_json(_file(path), content(result))
+    write_json(result_path(path), content(result))
 
 
 def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Models | None = None) -> Calibration:
@@ -112,96 +141,424 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     >>> print(f"{1e3 * again.errors(again.record.validation).mean():.3f} mm")
     0.032 mm
     """
-    path = _file(path)
+    path = result_path(path)
     stored = read_json(path)
-    _require_format(stored, path)
-    file = validate(File, stored, path)
-    known = {**READY, **{m.name: m for m in measurements}}
     try:
-        result = _calibration(file, known, model or Model())
-        _compare(file, result)
-        if _same_formulas(file):
-            agreement(stored, derived(result), "key")
+        _require_format(stored)
+        file = structured(stored, Stored)
+        result = _calibration(file, {**READY, **{m.name: m for m in measurements}}, model or Model())
+        _require_errors(file, result)
+        if _same_version(file):
+            require_agreement(stored, derived(result), "key")
         _require_digest(stored)
     except InputError as error:
         raise error.within(path) from None
-    except (
-        TypeError,
-        ValueError,
-        LookupError,
-        ArithmeticError,
-    ) as error:  # well-formed parts that were put together by hand
+    except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
+        # well-formed parts that somebody put together by hand
         found = f"parts that do not fit together ({error})"
         raise InputError("the file", found, "one as it was written", path) from None
     return result
 
 
-def _file(path: str | Path) -> Path:
+def result_path(path: str | Path) -> Path:
+    """Return a result's file, which may be named by its folder."""
     path = Path(path)
     return path / "result.json" if path.is_dir() else path
 
 
-def _require_format(stored: Any, path: Path) -> None:
+# --- what a file holds -------------------------------------------------------------------------------------------
+
+
+class OwnTerm(NamedTuple):
+    """A term of a user's own, whose function only a script has: where it acts, its parameters and columns."""
+
+    at: str
+    parameters: list[str]
+    columns: dict[str, str]
+
+
+class Trust(NamedTuple):
+    """What a loss of a script made of the equations: a factor, and those that it left out."""
+
+    factor: float
+    left_out: list[int]
+
+
+class Forms(NamedTuple):
+    """The quadratics that a script's loss (of the residual) and penalty (of z) are."""
+
+    loss: Quadratic | None
+    penalty: Quadratic | None
+
+
+class RowErrors(NamedTuple):
+    """The errors of one row [mm], before and after; None where it measures no length."""
+
+    label: str
+    nominal_mm: float | None
+    identified_mm: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What everything else in a result file follows from, in SI, by its keys."""
+
+    formulation: str
+    definition: dict[str, Any]
+    forms: Forms | None
+    weight: float
+    selection: Selection | None
+    converged: bool
+    message: str
+    history: tuple[Iteration, ...]
+    x: Array
+    certificate: Certificate
+    trust: Trust | None
+    held: tuple[Held, ...]
+    prices: tuple[Price, ...]
+    robots: dict[str, Robot]
+    terms: dict[str, list[OwnTerm]]
+    model: Parameters
+    data: dict[str, Dataset]
+    scatter: Scatter | None
+    learned: Learned | None
+    record: Record
+    rows: dict[str, list[RowErrors]]
+    digest: str = ""
+
+
+def content(result: Calibration) -> dict[str, Any]:
+    """Return what a file says of a calibration: its figures [mm, deg], what they follow from [SI], and a digest."""
+    from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
+
+    result = replace(result, record=result.record.dated())
+    solvable = is_defined(result.formulation)
+    stored = Stored(
+        formulation=result.formulation.name,
+        definition=definition(result.formulation),
+        forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
+        weight=result.weight,
+        selection=result.selection,
+        converged=result.converged,
+        message=result.message,
+        history=result.history,
+        x=result.x,
+        certificate=result.certificate,
+        trust=None if solvable else _trust(result),
+        held=result.held,
+        prices=result.prices,
+        robots=dict(result.problem.arms),
+        terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
+        model=result.problem.parameters,
+        data=sets(result.problem.data, result.record),
+        scatter=result.problem.scatter,
+        learned=result.learned,
+        record=result.record,
+        rows=_rows(result),
+    )
+    parts = {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": result.record.title,
+        **derived(result),
+        **plain(stored),
+        "acceptance": None if result.record.requirement is None else accept(result).content(),
+    }
+    return {**parts, "digest": digest(parts)}
+
+
+def figures(result: Calibration) -> dict[str, Any]:
+    """Return what a reader looks for first: errors [mm], the weight and where it came from, the parameters."""
+    validation = result.record.validation
+    held_out = result.record.held_out
+    if held_out is not None:
+        before, after = statistics(held_out.nominal), statistics(held_out.error)
+        held_out = {"nominal": before, "identified": after, "used": held_out.used}
+    return {
+        "identification": statistics(result.errors()),
+        "validation": None if validation is None else statistics(result.errors(validation)),
+        "held_out": held_out,
+        "weight": result.weight,
+        "selector": result.selector,
+        "corner": None if result.selection is None else bool(result.selection.interior),
+        "formulation": result.formulation.name,
+        "converged": result.converged,
+        "message": result.message,
+        "iterations": len(result.history),
+        "flagged": result.doubted,
+        "parameters": result.parameter_rows(),
+    }
+
+
+def derived(result: Calibration) -> dict[str, Any]:
+    """Return the figures of a file that follow from its data and parameters: they are computed anew where it is read.
+
+    Those are what a reader looks for first, and the errors before and after, also row by row.
+    """
+    data = sets(result.problem.data, result.record)
+    nominal = {name: statistics(result.nominal_errors(part)) for name, part in data.items()}
+    return {**figures(result), "nominal": nominal, "rows": plain(_rows(result))}
+
+
+def sets(identification: Dataset, record: Record) -> dict[str, Dataset]:
+    """Return the measurements by name: those of the identification, and those of the validation."""
+    data = {"identification": identification}
+    if record.validation is not None:
+        data["validation"] = record.validation
+    return data
+
+
+def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
+    rows = {}
+    for name, data in sets(result.problem.data, result.record).items():
+        before = 1e3 * result.nominal_errors(data)
+        after = 1e3 * result.errors(data)
+        rows[name] = [
+            RowErrors(label, _finite(b), _finite(a)) for label, b, a in zip(data.label, before, after, strict=True)
+        ]
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
+    """Return what a file says of a user's own terms on a robot: all but their functions."""
+    terms = []
+    for term in model.terms:
+        names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
+        terms.append(OwnTerm(term.at, names, dict(term.columns)))
+    return terms
+
+
+def _trust(result: Calibration) -> Trust | None:
+    """Return what a loss of a script made of the rows; a ready one says it again when it is called."""
+    if result.kept is not None:  # an earlier file said it
+        if result.kept.linear is None:
+            return None
+        return Trust(float(np.sqrt(result.kept.factor)), list(result.kept.left_out))
+    try:
+        trust = result.program.trust(result.z)
+    except InputError:  # a loss that no squared one stands for
+        return None
+    if trust is None:
+        return None
+    left_out = np.flatnonzero(~trust.keeps(result.program.model, result.z))
+    return Trust(float(np.sqrt(trust.factor)), left_out.tolist())
+
+
+# --- formulations by the names of ready functions ----------------------------------------------------------------
+
+
+def definition(formulation: Formulation) -> dict[str, Any]:
+    """Return the functions of a formulation by the names of ready ones; None for those of a script."""
+    return {
+        "loss": _name(formulation.loss),
+        "penalty": _name(formulation.penalty),
+        "constraints": [_name(constraint) for constraint in formulation.constraints],
+        "loss_over": formulation.loss_over,
+        "penalty_over": _name(formulation.penalty_over),
+        "largest": _finite(formulation.largest),
+    }
+
+
+def is_defined(formulation: Formulation) -> bool:
+    """Whether a file can hold a formulation: all its functions are ready-made."""
+    return formulation_of("", definition(formulation)).solvable
+
+
+def formulation_of(name: str, stated: Mapping[str, Any]) -> Formulation:
+    """Return the formulation that a file holds; one that cannot be solved where it names functions of a script."""
+    functions = [stated[key] for key in ("loss", "penalty", "penalty_over")]
+    return Formulation(
+        name,
+        loss=_function(stated["loss"], name),
+        penalty=_function(stated["penalty"], name),
+        constraints=tuple(_function(term, name) for term in stated["constraints"]),
+        loss_over=stated["loss_over"],
+        penalty_over=_function(stated["penalty_over"], name),
+        largest=math.inf if stated["largest"] is None else stated["largest"],
+        solvable=None not in (*functions, *stated["constraints"]),
+    )
+
+
+def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:
+    """Return the name of a ready function, or of its maker and the arguments; ``none`` for no function."""
+    if function is None:
+        return "none"
+    for name, ready in FUNCTIONS.items():
+        if ready == function:
+            return name
+    stated = getattr(function, "stated", None)
+    if stated is None or stated[0] != believed.__name__:
+        return stated
+    maker, penalty, *numbers = stated
+    return [maker, _name(penalty), *numbers]
+
+
+def _function(stated: str | list[Any] | None, name: str) -> Any:
+    if stated is None:
+        return lost(name)
+    if stated == "none":
+        return None
+    if isinstance(stated, str):
+        return pick(FUNCTIONS, stated, "key definition")
+    maker, *arguments = stated
+    if maker == believed.__name__:
+        arguments[0] = _function(arguments[0], name)
+    return pick(MAKERS, str(maker), "key definition")(*arguments)
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+def _require_format(stored: Any) -> None:
     """Refuse what another program or another version wrote, before its keys are looked at."""
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        accepted = "a file of `rpim-opt calibrate --out` or save_result()"
-        raise InputError("the file", "no result of rpim-opt", accepted, path)
-    written = stored.get("version")
-    if written != VERSION:
-        raise InputError("key version", repr(written)[:40], f"{VERSION}; a newer rpim-opt may read it", path)
+        raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
+    if stored.get("version") != VERSION:
+        found = repr(stored.get("version"))[:40]
+        raise InputError("key version", found, f"{VERSION}; the rpim-opt that wrote it reads others")
+    if not isinstance(stored.get("digest"), str):
+        raise InputError("key digest", repr(stored.get("digest", "nothing"))[:40].strip("'"), "the digest of the rest")
 
 
-def _calibration(file: File, known: Mapping[str, Measurement], model: Models) -> Calibration:
-    robots = robots_of(file, model)
-    data = data_of(file.data.identification, known)
-    problem = CalibrationProblem(
-        robots.get("", robots),
-        replace(parameters_of(file.model, robots), own_frames=own_frames(data)),
-        data,
-        scatter=scatter_of(file.scatter),
-    )
-    x = np.array(file.x)
-    unknowns = len(problem.parameters.free)
-    if len(x) != unknowns:
-        raise InputError("key x", f"{len(x)} numbers", f"{unknowns}, one an identified parameter")
+def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models) -> Calibration:
+    robots = {name: _robot(name, file, models) for name in file.robots}
+    data = {name: _with_models(part, known, f"key data.{name}") for name, part in file.data.items()}
+    _require_lengths(file.model)
+    problem = CalibrationProblem(robots.get("", robots), file.model, data["identification"], scatter=file.scatter)
+    validation = data.get("validation")
+    if validation is not None:
+        problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
+    unknowns = int(np.count_nonzero(file.model.identified))
+    if len(file.x) != unknowns:
+        raise InputError("key x", f"{len(file.x)} numbers", f"{unknowns}, one an identified parameter")
+    for earlier in file.record.earlier:
+        for name, ranges in earlier.ranges.items():
+            if name not in robots or np.shape(ranges) != (2, robots[name].dof):
+                accepted = "the least and the largest value of every joint, of the file's robots"
+                found = f"ranges of shape {np.shape(ranges)} of robot '{name}'"
+                raise InputError("key record.earlier", found, accepted)
     formulation = formulation_of(file.formulation, file.definition)
-    program = _program(file, formulation, around(problem.linearize(x), x))
+    program = _program(file, formulation, around(problem.linearize(file.x), file.x))
     return Calibration(
         problem,
         formulation,
-        x,
+        file.x,
         weight=file.weight,
-        selection=selection_of(file.selection),
+        selection=file.selection,
         converged=file.converged,
         message=file.message,
-        history=_history(file),
+        history=file.history,
         program=program,
-        certificate=_certificate(file),
+        certificate=file.certificate,
         asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
-        record=record_of(file.title, file.record, _validation(file, problem, known), file.digest, problem.arms),
+        record=replace(file.record, validation=validation, digest=file.digest),
         kept=None if formulation.solvable else _kept(file, program),
-        learned=learned_of(file.learned),
+        learned=file.learned,
     )
 
 
-def _program(file: File, formulation: Formulation, model: LinearModel) -> Program:
+def _robot(name: str, file: Stored, models: Models) -> Robot:
+    """Return a robot of the file with the terms that somebody gives again: by name, or one model for all.
+
+    Raises
+    ------
+    InputError
+        For terms that the file has and nobody gives, and others than it has.
+    """
+    stated = file.terms.get(name, [])
+    if not isinstance(models, Model):
+        if not name:
+            raise InputError("model", "models by name", "a Model, for the one robot of the file")
+        model = models.get(name, Model())
+    elif name and not stated:
+        model = Model()
+    else:
+        model = models
+    robot = file.robots[name]
+    given = _terms(model, robot)
+    if stated != given:
+        wanted = "; ".join(map(_in_words, stated)) or "none"
+        accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
+        raise InputError("key terms", "; ".join(map(_in_words, given)) or "no term given", accepted)
+    return replace(robot, model=model)
+
+
+def _in_words(term: OwnTerm) -> str:
+    what = ", ".join(term.parameters) or "without parameters"
+    seen = "".join(f", column {name} ({dimension or 'no unit'})" for name, dimension in term.columns.items())
+    return f"a term of the {term.at} ({what}{seen})"
+
+
+def _require_lengths(parameters: Parameters) -> None:
+    for key in ("dimensions", "nominal", "scale", "tolerance", "identified"):
+        values = getattr(parameters, key)
+        if np.shape(values) != (len(parameters),):
+            raise InputError(f"key model.{key}", f"shape {np.shape(values)}", f"{len(parameters)} values, one a name")
+
+
+def _with_models(data: Dataset, known: Mapping[str, Measurement], where: str) -> Dataset:
+    """Return measurements with the models that their blocks name, all of one length."""
+    blocks = [_block(block, known, f"{where}.blocks {i}") for i, block in enumerate(data.blocks, start=1)]
+    rows = sorted(row for block in blocks for row in block.row.tolist())
+    if rows != list(range(len(data.label))) or data.configuration.shape != (len(data.label),):
+        raise InputError(where, f"{len(data.label)} labels for other rows", "one label and configuration a row")
+    return replace(data, blocks=tuple(blocks))
+
+
+def _block(block: Block, known: Mapping[str, Measurement], where: str) -> Block:
+    name = str(block.measurement)
+    if name not in known:
+        raise InputError(f"{where}.measurement", f"'{name}'", f"measurements=[...] with it, or {choices(name, known)}")
+    kind = known[name]
+    p, k = kind.points, len(kind.components)
+    if len(block.markers) != p:
+        raise InputError(f"{where}.markers", f"{len(block.markers)} reflectors", f"{p}, one a point")
+    N = len(block.row)
+    shapes = {
+        "q": (N, p, -1),
+        "y": (N, len(kind.columns)),
+        "covariance": (-1, k, k),
+        "torque": (N, p, -1),
+        "payload": (N,),
+        "approach": (N, p, -1),
+        "point": (N, p),
+    }
+    arrays = {key: getattr(block, key) for key in shapes}
+    arrays |= {f"columns.{name}": values for name, values in block.columns.items()}
+    for key, array in arrays.items():
+        shape = shapes.get(key, (N,))
+        fits = array is None or (
+            array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+        )
+        if not fits:
+            raise InputError(f"{where}.{key}", f"shape {array.shape}", f"shape {shape}")
+    session = None if block.session is None else named_sessions(block.session, N)
+    return replace(block, measurement=kind, session=session)
+
+
+def _program(file: Stored, formulation: Formulation, model: LinearModel) -> Program:
     """Return the program at the solution; of a script's functions the file knows the quadratics that they were."""
     if file.forms is None:
         return pose(formulation, model)
-    forms = quadratic_of(file.forms.loss), quadratic_of(file.forms.penalty)
-    return Program(formulation, model, Unposed(formulation, model, *forms))
+    return Program(formulation, model, Unposed(formulation, model, file.forms.loss, file.forms.penalty))
 
 
-def _certificate(file: File) -> Certificate:
-    if file.certificate is None:
-        return Certificate(None, float("inf"), float("inf"))
-    stated = file.certificate.model_dump()
-    if stated["step"] is None:
-        stated["step"] = float("inf")
-    return Certificate(**stated)
+def _kept(file: Stored, program: Program) -> Kept:
+    """Return what the functions of a script said when they were there; nobody can call them again."""
+    if file.trust is None:
+        return Kept(file.held, None, prices=file.prices)
+    keep = np.ones(len(program.model.b), dtype=bool)
+    keep[file.trust.left_out] = False
+    factor = file.trust.factor**2
+    equations = kept_equations(program.model, keep, factor)
+    return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
 
 
-def _rule(file: File) -> float | Selector | None:
+def _rule(file: Stored) -> float | Selector | None:
     """Return the selector that chose the weight, where it is a ready one, and otherwise the weight; None: learned."""
     if file.learned is not None and not file.record.earlier:
         return None
@@ -210,55 +567,86 @@ def _rule(file: File) -> float | Selector | None:
     return SELECTORS.get(file.selection.name, file.weight)
 
 
-def _model(file: File) -> str:
-    """Return whether families were compared."""
+def _model(file: Stored) -> str:
+    """Return whether model extensions were compared."""
     if file.learned is not None and file.learned.trials and not file.record.earlier:
         return "auto"
     return "geometry"
 
 
-def _history(file: File) -> tuple[Iteration, ...]:
-    return tuple(Iteration(each.objective, each.step, each.weight, each.damping) for each in file.history)
+# --- whether a file says what follows from it --------------------------------------------------------------------
 
 
-def _validation(file: File, problem: CalibrationProblem, known: Mapping[str, Measurement]) -> Dataset | None:
-    if file.data.validation is None:
-        return None
-    data = data_of(file.data.validation, known)
-    problem.on(data)  # refuses rows that the problem's robot or reflectors cannot have
-    return data
-
-
-def _kept(file: File, program: Program) -> Kept:
-    """Return what the functions of a script said when they were there; nobody can ask them again."""
-    held = tuple(Held(**held.model_dump()) for held in file.held)
-    prices = tuple(Price(**price.model_dump()) for price in file.prices)
-    if file.trust is None:
-        return Kept(held, None, prices=prices)
-    keep = np.ones(len(program.model.b), dtype=bool)
-    keep[file.trust.left_out] = False
-    factor = file.trust.factor**2
-    return Kept(held, kept_equations(program.model, keep, factor), factor, tuple(file.trust.left_out), prices)
-
-
-def _compare(file: File, result: Calibration) -> None:
-    """Refuse a file whose stated errors do not follow from its data: edited, or read with another measurement model."""
-    for name, data in sets(result.problem.data, result.record).items():
-        stated = _stated(file.rows.get(name, []))
-        errors = 1e3 * result.errors(data)
-        if len(stated) != len(errors):
-            raise InputError(f"key rows.{name}", f"{len(stated)} rows", f"{len(errors)}, as in key data")
-        off = float(np.max(np.abs(np.nan_to_num(stated) - np.nan_to_num(errors)), initial=0.0))
-        if off > AGREEMENT_MM:
+def _require_errors(file: Stored, result: Calibration) -> None:
+    """Refuse errors that do not follow from the data: edited, or read with another measurement model."""
+    for name, rows in _rows(result).items():
+        stated = file.rows.get(name, [])
+        if len(stated) != len(rows):
+            raise InputError(f"key rows.{name}", f"{len(stated)} rows", f"{len(rows)}, as in key data")
+        pairs = [(a.identified_mm or 0.0, b.identified_mm or 0.0) for a, b in zip(stated, rows, strict=True)]
+        off = max((abs(a - b) for a, b in pairs), default=0.0)
+        if off > ABSOLUTE:
             found = f"errors up to {off:.2g} mm off those that the file's data give"
-            raise InputError(
-                f"key rows.{name}", found, "the file as it was written, and the same terms and measurement models"
-            )
+            accepted = "the file as it was written, and the same terms and measurement models"
+            raise InputError(f"key rows.{name}", found, accepted)
 
 
-def _same_formulas(file: File) -> bool:
+def _same_version(file: Stored) -> bool:
     """Whether this version wrote the file; a later one may define a figure differently, and must still read it."""
     return file.record.versions.get("rpim-opt", version("rpim-opt")) == version("rpim-opt")
+
+
+def require_agreement(stated: Any, found: Any, where: str) -> None:
+    """Refuse stated figures that are not the computed ones, to their rounding; other keys of the file do not matter.
+
+    Raises
+    ------
+    InputError
+        Naming the key.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.store.result_file import require_agreement
+    >>> require_agreement({"weight": 1.0, "note": "mine"}, {"weight": 1.0 + 1e-12}, "key")
+    >>> try:
+    ...     require_agreement({"rows": [{"mm": 0.1}]}, {"rows": [{"mm": 0.2}]}, "key")
+    ... except ro.InputError as error:
+    ...     print(error)
+    key rows 1.mm: found 0.1, accepted: 0.2, which follows from the file's data.
+    """
+    known = dict(_leaves(stated, where))
+    for place, value in _leaves(found, where):
+        if place not in known:
+            raise InputError(place, "nothing", "this key, as it was written")
+        if not _same(known[place], value):
+            raise InputError(place, _short(known[place]), f"{_short(value)}, which follows from the file's data")
+
+
+def _leaves(content: Any, where: str) -> Iterator[tuple[str, Any]]:
+    """Yield the places of a content and what stands there; of mappings None, of lists their length."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            yield from _leaves(value, f"{where}{' ' if where == 'key' else '.'}{key}")
+    elif isinstance(content, list | tuple):
+        yield where, range(len(content))
+        for number, value in enumerate(content, start=1):
+            yield from _leaves(value, f"{where} {number}")
+    else:
+        yield where, content
+
+
+def _same(stated: Any, found: Any) -> bool:
+    if isinstance(found, float) and isinstance(stated, int | float) and not isinstance(stated, bool):
+        try:
+            return math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
+        except OverflowError:  # an integer beyond all doubles
+            return False
+    return type(stated) is type(found) and stated == found
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} entries" if isinstance(value, range) else repr(value)[:60]
 
 
 def _require_digest(stored: Mapping[str, Any]) -> None:
@@ -266,7 +654,3 @@ def _require_digest(stored: Mapping[str, Any]) -> None:
     if stored["digest"] != found:
         accepted = "the file as it was written: something in it was changed"
         raise InputError("key digest", f"'{stored['digest'][:12]}...' for a content of '{found[:12]}...'", accepted)
-
-
-def _stated(rows: Sequence[RowPart]) -> np.ndarray:
-    return np.array([np.nan if row.identified_mm is None else row.identified_mm for row in rows])

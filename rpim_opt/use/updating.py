@@ -15,7 +15,7 @@ from rpim_opt.convex.structure import identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Record
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.store.content import content
+from rpim_opt.store.result_file import content
 from rpim_opt.use.carried import Carried
 from rpim_opt.use.changes import Cause, Fit, Reading, most_believed, possible, weighed
 from rpim_opt.use.updated import Moved, Update

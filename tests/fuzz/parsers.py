@@ -25,10 +25,11 @@ from rpim_opt.data.understanding import Asked
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.content import digest
 from rpim_opt.store.named import named_formulation, named_weight, problems_folder
 from rpim_opt.store.prior_file import load_prior, save_prior
 from rpim_opt.store.raw import understand_of
+from rpim_opt.store.serialize import digest
+from rpim_opt.store.serialize import digest
 from rpim_opt.store.starting import NOISE
 from rpim_opt.study.journal import Journal
 

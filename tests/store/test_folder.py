@@ -80,6 +80,28 @@ def test_names_that_lead_out_of_the_folder_are_refused(monkeypatch, capsys, rece
     assert everything(received.parent) == before
 
 
+@pytest.mark.parametrize("how", [*HOW, "a link in a folder"])
+@pytest.mark.parametrize("key", ["from", "fleet"])
+def test_priors_come_from_the_folder_alone(monkeypatch, capsys, received, key, how) -> None:
+    """Also where an honest result lies elsewhere: what is read there would show in the answer."""
+    if (key, how) == ("from", "empty"):
+        pytest.skip("that is how a variant has none")
+    if how == "a link in a folder":
+        (received / "march").mkdir()
+        (received / "march" / "result.json").symlink_to(received.parent / "secret.csv")
+        name = "march"
+    else:
+        name = names_elsewhere(received, how)
+    value = f'"{name}"'
+    if key == "fleet":
+        value = f'["{name}"]'
+    with (received / "problem.toml").open("a") as stream:
+        stream.write(f"\n[prior]\n{key} = {value}\n")
+    said = refused(monkeypatch, capsys, "inspect", str(received))
+    assert f"key prior.{key}: found" in said
+    assert "the name of a file in the folder; a copy there" in said
+
+
 @pytest.mark.parametrize("name", ["problem.toml", "robot.toml", "table.xlsx", "noending", "./validation.csv"])
 def test_simulated_tables_replace_no_other_file(monkeypatch, capsys, received, name) -> None:
     edit(received / "problem.toml", 'identification = "identification.csv"', f'identification = "{name}"')

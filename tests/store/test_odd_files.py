@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.agreement import agreement
-from rpim_opt.store.content import digest
 from rpim_opt.store.named import find
+from rpim_opt.store.result_file import require_agreement
 from rpim_opt.store.seen_target import seen_target
+from rpim_opt.store.serialize import digest
 from tests import ROOT
 from tests.simulate import simulated
 
@@ -105,13 +105,13 @@ BLOCK = ("data", "identification", "blocks", 0)
 @pytest.mark.parametrize(
     ("at", "value", "said"),
     [
-        (("robot",), None, "key robot: found no robot, accepted: robot, or robots"),
+        (("robots",), None, "key robots: found nothing, accepted: this key is required"),
         ((*BLOCK, "markers"), ["", ""], "2 reflectors, accepted: 1, one a point"),
         ((*BLOCK, "q"), [[[0.0] * 6]], "shape (1, 1, 6), accepted: shape (9, 1, -1)"),
         ((*BLOCK, "q"), [[[0.0] * 6], [[0.0]]], "rows of different lengths"),
         ((*BLOCK, "y"), [[0.0] * 3], "shape (1, 3), accepted: shape (9, 3)"),
         ((*BLOCK, "measurement"), "smell", "found 'smell', accepted: measurements=[...] with it"),
-        ((*BLOCK, "point"), [["A"]], "1 rows of names, accepted: 9 rows of 1"),
+        ((*BLOCK, "point"), [["A"]], "shape (1, 1), accepted: shape (9, 1)"),
         (("rows", "identification"), [], "key rows.identification: found 0 rows, accepted: 9, as in key data"),
     ],
 )
@@ -150,15 +150,15 @@ def test_models_by_name_are_of_files_with_several_robots(tmp_path: Path, text: s
 )
 def test_what_a_file_states_is_what_follows(stated: Any, found: Any, said: str) -> None:
     with pytest.raises(ro.InputError) as error:
-        agreement(stated, found, "key")
+        require_agreement(stated, found, "key")
     assert said in str(error.value)
 
 
 def test_figures_agree_to_what_processors_do_alike() -> None:
-    agreement({"a": 1.0 + 5e-5, "b": 0, "mine": 3}, {"a": 1.0, "b": 0.0}, "key")
+    require_agreement({"a": 1.0 + 5e-5, "b": 0, "mine": 3}, {"a": 1.0, "b": 0.0}, "key")
     for other in (1.0 + 2e-4, np.nan):
         with pytest.raises(ro.InputError):
-            agreement({"a": other}, {"a": 1.0}, "key")
+            require_agreement({"a": other}, {"a": 1.0}, "key")
 
 
 # --- several robots ------------------------------------------------------------------------------------------------

@@ -80,13 +80,17 @@ def test_a_file_that_is_no_prior_is_refused(tmp_path: Path, change: dict[str, ob
     assert says in str(error.value)
 
 
-def test_statements_of_other_lengths_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("rows", [[1.0, 2.0, 3.0]]), ("reference", []), ("dimensions", ["length"]), ("values", []), ("values", ["nan"])],
+)
+def test_statements_that_do_not_fit_together_are_refused(tmp_path: Path, key: str, value: list[object]) -> None:
     path = tmp_path / "prior.json"
     ro.store.save_prior(a_prior(), path)
     content = json.loads(path.read_text())
-    content["statements"][0]["rows"][0].append(1.0)
+    content["statements"][0][key] = value
     path.write_text(json.dumps(content))
-    with pytest.raises(ro.InputError, match="key statements 1"):
+    with pytest.raises(ro.InputError, match=r"prior\.json, key statements 1: found (parts that|a number that is not)"):
         ro.store.load_prior(path)
 
 
@@ -168,23 +172,23 @@ def test_joint_offsets_are_three_times_the_angle_scale_unless_said(folder: Path,
 
 def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: Path) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
-    ro.store.save_result(result, tmp_path / "earlier.json")
-    ro.store.save_prior(a_prior(), tmp_path / "prior.json")
-    found = with_prior(folder, '[prior]\nfrom = "../earlier.json"\ninflate = 2\nwithout = ["base_*"]')
+    ro.store.save_result(result, folder / "earlier.json")
+    ro.store.save_prior(a_prior(), folder / "prior.json")
+    found = with_prior(folder, '[prior]\nfrom = "earlier.json"\ninflate = 2\nwithout = ["base_*"]')
     assert found.prior == Prior.from_result(result, 2.0, ("base_*",))
-    assert "../earlier.json" in found.files
-    assert with_prior(folder, '[prior]\nfrom = "../prior.json"').prior == a_prior()
+    assert "earlier.json" in found.files
+    assert with_prior(folder, '[prior]\nfrom = "prior.json"').prior == a_prior()
 
 
-def test_a_folder_learns_from_a_fleet(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
     problem = ro.load("position").problem
     results = {}
     for k in range(2):
         part = problem.on(problem.data.take(np.arange(k, len(problem.data), 2)))
-        results[f"../arm{k}"] = ro.calibrate(part, ro.tikhonov, 1.0)
-        (tmp_path / f"arm{k}").mkdir()
-        ro.store.save_result(results[f"../arm{k}"], tmp_path / f"arm{k}")
-    found = with_prior(folder, '[prior]\nfleet = ["../arm0", "../arm1"]').prior
+        results[f"arm{k}"] = ro.calibrate(part, ro.tikhonov, 1.0)
+        (folder / f"arm{k}").mkdir()
+        ro.store.save_result(results[f"arm{k}"], folder / f"arm{k}")
+    found = with_prior(folder, '[prior]\nfleet = ["arm0", "arm1"]').prior
     wanted = Prior.from_fleet(results)
     assert found.centre == pytest.approx(wanted.centre, rel=1e-6, abs=1e-12)
     assert found.scale == pytest.approx(wanted.scale, rel=1e-6)

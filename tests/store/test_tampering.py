@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.content import digest
+from rpim_opt.store.serialize import digest
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +89,8 @@ NAMED = {
     "message": (("message",), "Converged."),
     "weight": (("weight",), 1e-3),
     "a covariance": (("data", "identification", "blocks", 0, "covariance", 0, 0, 0), 1e-12),
-    "a nominal parameter": (("model", 4, "nominal"), 0.1070000001),
-    "whether a parameter is identified": (("model", 8, "identified"), False),
+    "a nominal parameter": (("model", "nominal", 4), 0.1070000001),
+    "whether a parameter is identified": (("model", "identified", 8), False),
     "a digest of an input file": (("record", "files", "identification.csv"), "0" * 64),
     "why a row is left out": (("record", "excluded", "T8-7"), "bumped"),
     "whether it is simulated": (("record", "simulated"), True),

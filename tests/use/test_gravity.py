@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.data.models import position
-from rpim_opt.store.content import digest
 from rpim_opt.store.simulation import write_simulation
 from rpim_opt.use.cell import Cell
 from tests.simulate import ARM
@@ -254,28 +252,6 @@ def test_a_result_keeps_its_gravity_and_an_older_one_loads(tmp_path: Path) -> No
     assert np.array_equal(kept.approach, side)
     q = np.random.default_rng(3).uniform(-2, 2, (10, 6))
     assert np.abs(again.forward(q, payload=2.0) - result.forward(q, payload=2.0)).max() == 0
-
-
-def test_a_result_of_an_older_package_loads(tmp_path: Path) -> None:
-    """It states no gravity, no payloads, no sides, and a table with fewer parameters."""
-    result, *_ = calibrated(arm())
-    stiff = result.problem.with_parameters(result.problem.parameters.identify(GEOMETRY))
-    geometry = ro.calibrate(stiff, ro.tikhonov, 1.0)
-    path = tmp_path / "result.json"
-    ro.store.save_result(geometry, path)
-    stored = json.loads(path.read_text())
-    del stored["robot"]["gravity"]
-    for block in stored["data"]["identification"]["blocks"]:
-        del block["payload"], block["approach"]
-    young = ("bend", "ecc2", "backlash")
-    stored["model"] = [row for row in stored["model"] if not row["name"].startswith(young)]
-    stored["digest"] = digest(stored)
-    path.write_text(json.dumps(stored))
-    old = ro.load_result(path)
-    assert old.problem.robot.gravity == ro.robot.Gravity()
-    assert old.problem.data.blocks[0].payload is None
-    q = np.random.default_rng(3).uniform(-2, 2, (10, 6))
-    assert np.abs(old.forward(q) - geometry.forward(q)).max() == 0
 
 
 def test_gravity_is_stated_in_a_problems_folder(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.store.content import digest
+from rpim_opt.store.serialize import digest
 from tests.simulate import simulated
 from tests.test_cli import run
 

@@ -1,0 +1,170 @@
+"""Values as JSON and back, by the annotations of their classes: dataclasses, named tuples, arrays, mappings."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from functools import cache
+from hashlib import sha256
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.record import Record
+from rpim_opt.robot.mdh import Robot
+
+if TYPE_CHECKING:
+    from cattrs import Converter
+
+T = TypeVar("T")
+NOT_FINITE = ("inf", "-inf", "nan")
+"""How a file spells the numbers that JSON does not have."""
+LARGEST = sys.float_info.max
+KINDS = {bool: "truth value", int: "integer", str: "text"}
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers with the fewest digits that read back to the same bits."""
+    return _converter().unstructure(value)
+
+
+def structured(content: Any, kind: type[T]) -> T:
+    """Return the instance of a class that `plain` wrote; of a robot without its terms, of blocks with names of models.
+
+    Raises
+    ------
+    InputError
+        Naming the first key that does not fit.
+    """
+    from cattrs import BaseValidationError
+
+    try:
+        return _converter().structure(content, kind)
+    except BaseValidationError as error:
+        raise _refusal(error) from None
+
+
+def digest(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a file's content without its digest, however it is laid out and ordered."""
+    rest = {key: value for key, value in content.items() if key != "digest"}
+    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return sha256(text.encode()).hexdigest()
+
+
+@cache
+def _converter() -> Converter:
+    """Return what converts all classes; nothing is prepared before a file is written or read."""
+    from cattrs import Converter
+    from cattrs.cols import is_namedtuple, namedtuple_dict_structure_factory, namedtuple_dict_unstructure_factory
+    from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
+
+    made = Converter()
+    for kind in (bool, int, float, str):
+        made.register_structure_hook(kind, _scalar)
+    for kind in (bool, int, str):
+        made.register_unstructure_hook(kind, kind)
+    made.register_unstructure_hook(float, _spelled)
+    made.register_structure_hook_factory(is_namedtuple, namedtuple_dict_structure_factory)
+    made.register_unstructure_hook_factory(is_namedtuple, namedtuple_dict_unstructure_factory)
+    made.register_structure_hook_func(_is_array, _array)
+    made.register_unstructure_hook_func(_is_array, _listed)
+    elsewhere = override(omit=True)
+    by_name = override(unstruct_hook=lambda kind: kind.name, struct_hook=lambda name, _: _scalar(name, str))
+    fields = {
+        Record: {"validation": elsewhere, "digest": elsewhere},  # among the data; of the file itself
+        Robot: {"model": elsewhere},  # functions of a script, who gives them again
+        Block: {"measurement": by_name},
+        Dataset: {"configuration": override(unstruct_hook=_listed, struct_hook=lambda v, _: _array(v, np.ndarray))},
+    }
+    for kind, changes in fields.items():
+        made.register_unstructure_hook(kind, make_dict_unstructure_fn(kind, made, **changes))
+        made.register_structure_hook(kind, make_dict_structure_fn(kind, made, **changes))
+    return made
+
+
+# --- texts, numbers, arrays --------------------------------------------------------------------------------------
+
+
+def _scalar(value: Any, kind: type) -> Any:
+    """Return a text, a number or a truth value of exactly that kind; a float may be written as an integer."""
+    if kind is float:
+        return _number(value)
+    if type(value) is not kind:
+        raise _unfit(value, f"a valid {KINDS[kind]}")
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str) and value in NOT_FINITE:
+        return float(value)
+    if type(value) not in (int, float) or not abs(value) <= LARGEST:
+        raise _unfit(value, "a valid number")
+    return float(value)
+
+
+def _spelled(value: float) -> float | str:
+    return float(value) if math.isfinite(value) else str(float(value))
+
+
+def _is_array(kind: Any) -> bool:
+    return kind is np.ndarray or get_origin(kind) is np.ndarray
+
+
+def _listed(array: np.ndarray) -> Any:
+    """Return an array as lists."""
+    if array.dtype.kind != "f" or np.isfinite(array).all():
+        return array.tolist()
+    return [_listed(each) if array.ndim > 1 else _spelled(each) for each in array]
+
+
+def _array(values: Any, kind: Any) -> np.ndarray:
+    """Return lists as an array: of floats where the class says so, otherwise of integers, truth values or texts."""
+    if not isinstance(values, list):
+        raise _unfit(values, "a list")
+    try:
+        array = np.array(values)
+    except (ValueError, OverflowError):
+        raise InputError("", "rows of different lengths", "rows of the same length") from None
+    if kind is not np.ndarray:
+        return _floats(values, array)
+    if not array.size:
+        return array.astype(int)
+    if array.dtype.kind not in "biU":
+        raise _unfit(values, "integers, truth values or texts")
+    return array.astype(object) if array.dtype.kind == "U" else array
+
+
+def _floats(values: Any, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind in "if" and np.isfinite(array).all():
+        return array.astype(float)
+    spelled = np.array(values, dtype=object)
+    return np.array([_number(value) for value in spelled.ravel().tolist()], dtype=float).reshape(spelled.shape)
+
+
+# --- errors ------------------------------------------------------------------------------------------------------
+
+
+def _unfit(value: Any, accepted: str) -> InputError:
+    """Return an error without its place, which those who look into the content know."""
+    return InputError("", repr(value)[:60], accepted)
+
+
+def _refusal(error: BaseException, place: str = "") -> InputError:
+    """Return the first error of a content, with the place as a person counts: ``data.blocks 1.q``."""
+    for note in getattr(error, "__notes__", ()):
+        if hasattr(note, "index") and isinstance(note.index, int):
+            place += f" {note.index + 1}"
+        elif hasattr(note, "index") or hasattr(note, "name"):
+            place = f"{place}.{getattr(note, 'name', '') or note.index}".removeprefix(".")
+    if isinstance(error, BaseExceptionGroup):
+        return _refusal(error.exceptions[0], place)
+    where = f"key {place}"
+    if isinstance(error, InputError):
+        return InputError(f"{where}, {error.where}" if error.where else where, error.found, error.accepted)
+    if isinstance(error, KeyError):
+        return InputError(where, "nothing", "this key is required")
+    return InputError(where, f"another kind of value ({error})", "what was written")
