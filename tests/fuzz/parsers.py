@@ -29,7 +29,6 @@ from rpim_opt.store.named import named_formulation, named_weight, problems_folde
 from rpim_opt.store.prior_file import load_prior, save_prior
 from rpim_opt.store.raw import understand_of
 from rpim_opt.store.serialize import digest
-from rpim_opt.store.serialize import digest
 from rpim_opt.store.starting import NOISE
 from rpim_opt.study.journal import Journal
 
