@@ -588,9 +588,10 @@ def compensate(
 ) -> None:
     """Correct joint commands so that the real robot goes where the nominal one would."""
     with progress() as say:
-        from rpim_opt.basics.layouts import read_raw
         from rpim_opt.data.models import pose
-        from rpim_opt.data.naming import parse_units, rename
+        from rpim_opt.data.tables.layout import read_raw
+        from rpim_opt.data.tables.naming import rename
+        from rpim_opt.data.tables.units import parse_units
         from rpim_opt.store.result_file import load_result
         from rpim_opt.use.compensation import compensate
         from rpim_opt.use.targets import read_targets

@@ -20,7 +20,8 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
 from rpim_opt.convex.interior import Found
 from rpim_opt.data.models import pose, position
-from rpim_opt.data.naming import parse_units, rename
+from rpim_opt.data.tables.naming import rename
+from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.chain import link_of
 from rpim_opt.robot.kinematics import frame_numbers
 from rpim_opt.robot.mdh import MDH

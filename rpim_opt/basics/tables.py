@@ -1,38 +1,78 @@
-"""Tables at the border: CSV, Parquet, Excel files and data frames become named columns of cells."""
+"""Cells of tables: text, Excel and Parquet files and data frames, as rows or as named columns.
+
+What the cells mean is decided in `data.tables`. Small files can say more than memory holds, so that sizes are bounded
+before and while they are read. Measured against: python-calamine reads a workbook 5 times as fast as openpyxl, and ends
+the process where a file of 5 kB has a cell in its last row (it allocates the whole sheet); charset-normalizer reads
+``J1 [°]`` in Windows-1252 as Chinese in UTF-16.
+"""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.inputs import LARGEST_DATA, require_file
-from rpim_opt.basics.packed import read_excel, read_parquet
-from rpim_opt.basics.shape import Columns, narrow, rectangle, require_names
-from rpim_opt.basics.units import joint_columns
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, read_text, require_file
 
+WIDEST = 1000
+"""Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
+MOST_CELLS = 2**27
+"""Cells that a Parquet file may have: ten million rows of a dozen columns."""
+LARGEST_WORKBOOK = 2**27
+"""Bytes that a workbook may unpack to: some three hundred thousand rows."""
+EXCEL_ROWS = 2**20
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
+"""What may stand between cells, by name; a space stands for any number of them."""
+SAMPLE = 200
+"""Lines from which the separator is found."""
+LONGEST = 2**16
+"""Characters of these lines; a line of a hundred thousand cells is not looked at whole."""
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
+EXCEL = (".xlsx", ".xlsm")
+NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")
 """What a spreadsheet computes, be it behind apostrophes that keep it from that."""
-MARKERS = [chr(65 + i) for i in range(26)] + [f"M{i}" for i in range(1, 1000)]
+BYTE_ORDER_MARKS = (  # that of UTF-32 begins as UTF-16's does
+    (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
+)  # fmt: skip
+Columns = Mapping[str, Sequence[Any]]
+"""Column name to its cells: text from a text or Excel file, whatever the table holds elsewhere."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The rows of a file: texts of those that are not blank, their line in the file (from 1), how it was read."""
+
+    rows: list[list[str]]
+    lines: list[int]
+    notes: tuple[str, ...] = ()
+
+
+# --- what has the shape that problem folders have ------------------------------------------------------------------
 
 
 def read_columns(source: Any) -> Columns:
-    """Return the columns of a table.
+    """Return the columns of a table whose first row is its header.
 
     Parameters
     ----------
     source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas, polars or similar data frame, or a mapping from
-        column names to cells.
+        A path (``.csv`` in UTF-8 with commas, ``.parquet``, ``.xlsx``), a pandas, polars or similar data frame, or a
+        mapping from column names to cells.
 
     Raises
     ------
@@ -40,10 +80,7 @@ def read_columns(source: Any) -> Columns:
         If there is no such file, it cannot be read as what its name says, or the table has no rows, a column
         twice, or rows of different lengths.
     """
-    if isinstance(source, str | Path):
-        columns = _file(Path(source))
-    else:
-        columns = _frame(source)
+    columns = _file(Path(source)) if isinstance(source, str | Path) else _frame(source)
     if not columns:
         raise InputError("the table", "an empty table", "at least one row")
     if not len(next(iter(columns.values()))):
@@ -52,7 +89,7 @@ def read_columns(source: Any) -> Columns:
 
 
 def _file(path: Path) -> Columns:
-    readers = {".csv": _csv, ".parquet": read_parquet, ".xlsx": read_excel}
+    readers = {".csv": _csv, ".parquet": read_parquet, ".xlsx": lambda file: _rectangle(_excel(file).rows)}
     kind = path.suffix.lower()
     if kind not in readers:
         raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(readers), path)
@@ -66,106 +103,264 @@ def _frame(source: Any) -> Columns:
     for name in names:
         if not isinstance(name, str):
             raise InputError("the header", f"column {name!r}", "texts as names, every one once")
-    require_names(names)
+    _require_names(names)
     return {name.strip(): source[name] for name in names}
 
 
 def _csv(path: Path) -> Columns:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = (narrow(row) for row in csv.reader(stream, strict=True) if any(cell.strip() for cell in row))
-            lines = [[_as_written(cell) for cell in row] for row in rows]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError("the file", str(error), "a readable UTF-8 CSV file") from None
-    if lines:
-        lines[0][0] = lines[0][0].lstrip("\ufeff")  # files put together have more than one mark
-    if lines and len(lines[0]) == 1 and any(mark in lines[0][0] for mark in ";\t"):
+    text = read_text(path, LARGEST_DATA).lstrip("\ufeff")  # files put together have more than one mark
+    rows, _ = _split(text, ",")
+    rows = [[_without_apostrophe(cell) for cell in row] for row in rows]
+    if rows and len(rows[0]) == 1 and any(mark in rows[0][0] for mark in ";\t"):
         raise InputError("the header", "one column with semicolons or tabs", "columns separated by commas")
-    return rectangle(lines)
+    return _rectangle(rows)
 
 
-def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, list[float]]) -> Columns:
-    """Return the columns of the CSV file that RoboDK exports after calibration measurements.
+def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
+    """Return the columns of rows of text; the first row is the header."""
+    if not rows:
+        raise InputError("the table", "an empty file", "a header and at least one row")
+    header, *body = rows
+    _require_names(header)
+    for number, row in enumerate(body, start=1):
+        if len(row) != len(header):
+            accepted = f"{len(header)} cells as in the header"
+            raise InputError(f"row {number} ({row[0][:40]})", f"{len(row)} cells", accepted)
+    return {name: [row[i] for row in body] for i, name in enumerate(header)}
 
-    Its columns count, not their names: the joints [deg or mm], the measured point x, y, z [mm], and the
-    reflector in the flange frame x, y, z [mm] (RoboDK's macro library reads it so). Every reflector gets a
-    marker A, B, ...
+
+def _require_names(header: Sequence[str]) -> None:
+    """Refuse a header that is too wide, or has a column without a name or twice."""
+    accepted = "every column once, with its name"
+    if len(header) > WIDEST:
+        raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
+    for name in header:
+        if not name:
+            raise InputError("the header", "a column without a name", accepted)
+        if header.count(name) > 1:
+            raise InputError("the header", f"column '{name[:40]}' twice", accepted)
+
+
+def read_parquet(path: Path) -> Columns:
+    """Return the columns of a Parquet file."""
+    parquet = _library("pyarrow.parquet", "Parquet files")
+    try:
+        with parquet.ParquetFile(path) as file:
+            metadata, names = file.metadata, file.schema_arrow.names
+            size = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
+            _require_names(names)
+            if metadata.num_rows * len(names) > MOST_CELLS or size > LARGEST_DATA:
+                found = f"{metadata.num_rows} rows of {len(names)} columns, {size} bytes unpacked"
+                raise InputError("the table", found, f"at most {MOST_CELLS} cells and {LARGEST_DATA} bytes")
+            table = file.read()
+            return {name: _parquet_cells(table.column(name)) for name in table.column_names}
+    except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's derive from these
+        raise InputError("the file", _first_line(error), "a readable Parquet file") from None
+
+
+def _parquet_cells(column: Any) -> Sequence[Any]:
+    """Return a column of numbers without gaps as an array, any other as a list."""
+    numeric = str(column.type).startswith(("float", "double", "int", "uint"))
+    return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
+
+
+# --- files as people have them -------------------------------------------------------------------------------------
+
+
+def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
+    r"""Return the rows of a text or Excel file.
+
+    A byte order mark tells the encoding, else zeros in every other byte (UTF-16), else whether the bytes are UTF-8,
+    which other encodings practically never are; else it is Windows-1252, which has Latin-1's letters. The separator is
+    the one that parts most numbers from each other in the first lines.
 
     Parameters
     ----------
     path
-        The file.
-    joints
-        ``"angle"`` or ``"length"`` for every joint.
-    tools
-        Reflectors that are known, marker to x, y, z [mm]; new ones are added.
+        The file; its ending decides how it is read.
+    sheet
+        An Excel sheet's name, or its number from 1; by default the first one that has cells.
+    encoding, separator
+        Of a text file, where stated: ``"cp1252"``; a name of `SEPARATORS`, or the sign itself.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, a sheet that is not there, an unknown separator, a quote that does not end.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rpim_opt.basics.tables import read_grid
+    >>> _ = Path("points.txt").write_text("// Point X Y Z\nP1 1.5 2.5 3.5\nP2 4 5 6\n")
+    >>> grid = read_grid(Path("points.txt"))
+    >>> grid.rows[1], grid.notes
+    (['P1', '1.5', '2.5', '3.5'], ('cells are separated by space: it parts most numbers.',))
     """
-    path = Path(path)
+    known = (*TEXTS, *EXCEL, ".parquet")
+    require_file(path, LARGEST_DATA, known)
+    if path.suffix.lower() in EXCEL:
+        return _excel(path, sheet)
+    if sheet:
+        raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
+    if path.suffix.lower() not in TEXTS:
+        raise InputError("the file's name", f"'{path.name}'", f"a name ending in {', '.join(known)}")
+    return _text(path, encoding, separator)
+
+
+def _text(path: Path, encoding: str, separator: str) -> Grid:
+    data = read_bytes(path, LARGEST_DATA)
+    name, why = (encoding, "as stated") if encoding else _encoding(data)
     try:
-        columns, tcp = _robodk(path, joints)
-    except InputError as error:
-        raise error.within(path) from None
-    markers = [_marker(place, tools) for place in tcp]
-    return columns | {"marker": markers}
+        text = data.decode(name)
+    except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
+        raise InputError("the text", str(error), "an encoding that fits: --encoding utf-8, cp1252, utf-16") from None
+    if "\x00" in text:
+        raise InputError("the text", "bytes that are zero", "a text file, not a binary one")
+    text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
+    mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
+    if len(mark) != 1:
+        raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
+    notes = [f"read as {name}: {why}."] if name != "utf-8" else []
+    if mark != ",":
+        spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
+        notes.append(f"cells are separated by {spelled}: {'as stated' if separator else 'it parts most numbers'}.")
+    return Grid(*_split(text, mark), tuple(notes))
 
 
-def _robodk(path: Path, joints: Sequence[str]) -> tuple[dict[str, Sequence[Any]], np.ndarray]:
-    """Return joints and measured point under our names, and the reflector's place (N, 3) [mm]."""
-    require_file(path, LARGEST_DATA, [".csv"])
-    table = list(_csv(path).values())
-    if len(table) < len(joints) + 6:
-        accepted = f"{len(joints)} joints, 3 measured and 3 of the tool"
-        raise InputError("the header", f"{len(table)} columns", accepted)
-    names = [*joint_columns(joints), "x_mm", "y_mm", "z_mm"]
-    columns = dict(zip(names, table, strict=False))
-    rows = [str(i) for i in range(1, len(table[0]) + 1)]
-    first = len(names)
-    tcp = [numbers(table[i], rows, f"{i + 1}") for i in range(first, first + 3)]
-    return columns, np.column_stack(tcp)
+def _encoding(data: bytes) -> tuple[str, str]:
+    """Return the encoding of a file, and why it is that one."""
+    for mark, name in BYTE_ORDER_MARKS:
+        if data.startswith(mark):
+            return name, "byte order mark"
+    sample = data[:4096]
+    zeros = sample[::2].count(0), sample[1::2].count(0)
+    if len(sample) > 3 and min(zeros) == 0 and max(zeros) > 0.3 * len(sample):
+        return "utf-16-le" if zeros[1] else "utf-16-be", "every other byte is zero"
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252", "not UTF-8"
+    return "utf-8", "valid UTF-8"
 
 
-def _marker(place: np.ndarray, tools: dict[str, list[float]]) -> str:
-    """Return the name of the reflector there [mm]; a new one is added to those that are known."""
-    for name, known in tools.items():
-        if np.allclose(known, place, atol=1e-6):
-            return name
-    name = next(marker for marker in MARKERS if marker not in tools)
-    tools[name] = place.tolist()
-    return name
+def is_numeral(cell: str) -> bool:
+    """Return whether a cell is a number, with whatever decimal mark.
 
-
-def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Return a table as CSV text, one line a row.
-
-    A text that a spreadsheet would compute, ``=1+1``, gets an apostrophe before it, which `read_columns` takes away.
+    >>> from rpim_opt.basics.tables import is_numeral
+    >>> [is_numeral(cell) for cell in ("1.5", "-1,5", "1.234,5", "2e-3", "P1", "nan")]
+    [True, True, True, True, False, False]
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(_harmless(name) for name in header)
-    writer.writerows([_harmless(cell) for cell in row] for row in rows)
-    return stream.getvalue()
+    return NUMERAL.fullmatch(cell) is not None
 
 
-def _harmless(cell: Any) -> Any:
-    """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
-    if not isinstance(cell, str) or not FORMULA.match(cell) or _is_number(cell):
-        return cell
-    return f"'{cell}"
+def _separator(text: str) -> str:
+    """Return the separator that parts most numbers; a comma where none does."""
+    lines = (line for line in io.StringIO(text[: SAMPLE * LONGEST]) if line.strip())
+    sample = "".join(islice(lines, SAMPLE))[:LONGEST]
+    best, most = ",", (0, 0)
+    for mark in SEPARATORS.values():
+        rows = _split(sample, mark, strict=False)[0]
+        count = (sum(is_numeral(cell) for row in rows for cell in row), 0)
+        if not count[0] and mark != " ":  # a header so wide that no row is seen
+            count = (0, sum(map(len, rows)))
+        if count > most:
+            best, most = mark, count
+    return best
 
 
-def _is_number(text: str) -> bool:
+def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], list[int]]:
+    """Return the rows that are not blank, and their lines."""
+    kept: list[list[str]] = []
+    lines: list[int] = []
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, strict=strict, skipinitialspace=True)
+    spaced = enumerate(map(_words, text.split("\n")), start=1)
+    numbered = spaced if mark == " " else ((reader.line_num, row) for row in reader)
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        for number, cells in numbered:
+            row = [cell.strip() for cell in cells]
+            if strict and len(row) > WIDEST and any(row):
+                raise InputError("the table", f"a row of {len(row)} cells", f"at most {WIDEST} columns")
+            if any(row):
+                kept.append(row)
+                lines.append(number)
+    except csv.Error as error:
+        if strict:
+            raise InputError(f"line {reader.line_num}", str(error), "short cells whose quotes end") from None
+    return kept, lines
 
 
-def _as_written(cell: str) -> str:
-    """Return what `_harmless` was given."""
-    if cell.startswith("'") and FORMULA.match(cell):
-        return cell[1:]
-    return cell
+def _words(line: str) -> list[str]:
+    """Return the words of a line; a header's names may hold single spaces where wider gaps part them."""
+    words = line.split()
+    if any(map(is_numeral, words)):
+        return words
+    wide = re.split(r"\s{2,}", line.strip())
+    return wide if len(wide) > 2 else words
+
+
+def _excel(path: Path, sheet: str = "") -> Grid:
+    """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has cells."""
+    openpyxl = _library("openpyxl", "Excel files")
+    rows: list[tuple[int, list[str]]] = []
+    try:
+        with path.open("rb") as stream:
+            with ZipFile(stream) as archive:  # what it says of itself is what is read of it
+                size = sum(entry.file_size for entry in archive.infolist())
+            if size > LARGEST_WORKBOOK:
+                accepted = f"at most {LARGEST_WORKBOOK} bytes; more as .csv or .parquet"
+                raise InputError("the file", f"{size} bytes unpacked", accepted)
+            book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
+            names = [each.title for each in book.worksheets]
+            for chosen in [_sheet(names, sheet)] if sheet else names:
+                rows = list(_filled(book[chosen]))
+                if rows:
+                    break
+    except InputError:
+        raise
+    except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
+        raise InputError("the file", _first_line(error), "a readable Excel workbook (.xlsx)") from None
+    how = "as stated" if sheet else "the first with cells; another one by --sheet"
+    notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
+    return Grid([row for _, row in rows], [number for number, _ in rows], notes)
+
+
+def _sheet(names: Sequence[str], stated: str) -> str:
+    if stated in names:
+        return stated
+    if stated.isdigit() and 0 < int(stated) <= len(names):
+        return names[int(stated) - 1]
+    raise InputError("--sheet", f"'{stated}'", choices(stated, names))
+
+
+def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a sheet that are not empty with their numbers; a sheet of few bytes may have cells anywhere."""
+    sheet.reset_dimensions()  # what the file says of them would fill every row up
+    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+        if number > EXCEL_ROWS:
+            raise InputError("the sheet", f"more than {EXCEL_ROWS} rows", "as many as Excel has")
+        cells = ["" if value is None else str(value).strip() for value in row]
+        while cells and not cells[-1]:
+            cells.pop()
+        if len(cells) > WIDEST:
+            raise InputError("the table", f"a row of {len(cells)} cells", f"at most {WIDEST} columns")
+        if cells:
+            yield number, cells
+
+
+def _library(name: str, what: str) -> Any:
+    """Return a package that only some tables need, or say how to get it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(what, f"no package {name.split('.')[0]}", "pip install 'rpim-opt[tables]'") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+# --- cells ---------------------------------------------------------------------------------------------------------
 
 
 def numbers(cells: Sequence[Any], labels: Sequence[str], column: str) -> np.ndarray:
@@ -197,6 +392,37 @@ def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:
         if not text.isprintable():
             raise InputError(f"row {number}, column {column}", repr(text[:40]), "printable text")
     return result
+
+
+# --- out -----------------------------------------------------------------------------------------------------------
+
+
+def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Return a table as CSV text, one line a row.
+
+    A text that a spreadsheet would compute, ``=1+1``, gets an apostrophe before it, which `read_columns` takes away.
+    """
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(_with_apostrophe(name) for name in header)
+    writer.writerows([_with_apostrophe(cell) for cell in row] for row in rows)
+    return stream.getvalue()
+
+
+def _with_apostrophe(cell: Any) -> Any:
+    """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
+    if not isinstance(cell, str) or not FORMULA.match(cell):
+        return cell
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}"
+
+
+def _without_apostrophe(cell: str) -> str:
+    if cell.startswith("'") and FORMULA.match(cell):
+        return cell[1:].strip()
+    return cell
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:

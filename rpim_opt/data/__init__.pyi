@@ -8,8 +8,8 @@ from .contact import with_known as with_known
 from .dataset import Dataset as Dataset
 from .held_out import HeldOut as HeldOut
 from .models import Measurement as Measurement
-from .reading import read_data as read_data
 from .record import Record as Record
 from .requirement import Requirement as Requirement
+from .tables.reading import read_data as read_data
+from .tables.understanding import Asked as Asked
 from .tracker import LaserTracker as LaserTracker
-from .understanding import Asked as Asked

@@ -13,10 +13,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split_unit
-from rpim_opt.data.columns import quantities_of, require_unique
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import CAMERAS
 from rpim_opt.data.projection import TARGET
+from rpim_opt.data.tables.columns import quantities_of, require_unique
 
 Board = Mapping[str, Sequence[float] | Array]
 """Where points are on their board, (3,) each [m], by name."""

@@ -10,8 +10,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, with_unit
-from rpim_opt.data.columns import Numbers
 from rpim_opt.data.models import Measurement
+from rpim_opt.data.tables.columns import Numbers
 
 if TYPE_CHECKING:
     from rpim_opt.data.tracker import LaserTracker

@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.models import Measurement, position
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter

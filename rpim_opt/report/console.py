@@ -17,7 +17,7 @@ from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
     from rpim_opt.data.requirement import Requirement
-    from rpim_opt.data.understanding import Asked
+    from rpim_opt.data.tables.understanding import Asked
 
 # --- output ------------------------------------------------------------------------------------------------
 
@@ -199,9 +199,9 @@ def asked_of(
     **layout: str,
 ) -> Asked:
     """Return what the options of a command state of its raw tables."""
-    from rpim_opt.basics.layouts import Layout
-    from rpim_opt.data.spelling import parse_units
-    from rpim_opt.data.understanding import Asked
+    from rpim_opt.data.tables.layout import Layout
+    from rpim_opt.data.tables.understanding import Asked
+    from rpim_opt.data.tables.units import parse_units
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
     return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key, within)

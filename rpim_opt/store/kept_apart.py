@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import Described
 from rpim_opt.store.raw import Understanding, understand_of
 from rpim_opt.store.seen_target import SeenTarget

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.tables import Columns, read_columns, robodk_columns
+from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.data.board import Board, on_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import CAMERAS
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.robodk import robodk_columns
 from rpim_opt.store.known import with_stated
 from rpim_opt.store.problem_file import Observation, Stated
 

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, pick
-from rpim_opt.basics.layouts import RawTable, read_raw
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.models import MEASUREMENTS, Measurement, eye_in_hand, pose, position, revisit
-from rpim_opt.data.naming import TOUCHED
-from rpim_opt.data.orientations import ORDERS
-from rpim_opt.data.reading import read_data
-from rpim_opt.data.several import together
-from rpim_opt.data.spelling import split
-from rpim_opt.data.understanding import Asked, Understood, meant_rows, understand
+from rpim_opt.data.tables.joining import together
+from rpim_opt.data.tables.layout import RawTable, read_raw
+from rpim_opt.data.tables.naming import TOUCHED
+from rpim_opt.data.tables.orientations import ORDERS
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.understanding import Asked, Understood, understand
+from rpim_opt.data.tables.units import split
 from rpim_opt.problem.orientation import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import read_arm
@@ -120,8 +120,8 @@ class Understanding:
         """
         said = [f"{each.file}: {note}" for each in self.tables for note in each.notes]
         count = len(next(iter(self.columns.values())))
-        return {"columns": meant_rows(self.tables), "measurement": self.kind.name, "rows": count,
-                "notes": [*said, *self.notes]}  # fmt: skip
+        columns = [{"file": each.file, **meant._asdict()} for each in self.tables for meant in each.meant]
+        return {"columns": columns, "measurement": self.kind.name, "rows": count, "notes": [*said, *self.notes]}
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -185,36 +185,18 @@ def understand_of(
     """Return what raw tables of an arm say, as `understand_tables` does."""
     asked = asked or Asked()
     paths = [Path(each) for each in data]
-    known = None
-    if measurement is not None:
-        known = pick(MEASUREMENTS, measurement, "measurement")
+    known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
     files = [(path, read_raw(path, asked.layout)) for path in paths]
-    kind, tables = _told(files, arm, known or _known_kind([table.columns for _, table in files]), asked)
+    known = known or _kind_of_columns([table.columns for _, table in files])
+    kind = known or pose
+    tables = _understood(files, arm, kind, asked)
+    if known is None:
+        kind = _kind_of_names(tables, paths[0])
+        if kind is not pose:
+            tables = _understood(files, arm, kind, asked)
     if kind is pose and any(each.numbered for each in tables):
-        return _ordered(files, arm, kind, asked)
+        return _ordered(files, arm, asked)
     return _whole(paths, arm, kind, asked, tables)
-
-
-def _told(
-    files: Files, arm: Described, known: Measurement | None, asked: Asked
-) -> tuple[Measurement, tuple[Understood, ...]]:
-    """Return what was measured, by the names of columns where that is not known, and the tables understood so."""
-    tables = _understood(files, arm, known or pose, asked)
-    if known is not None:
-        return known, tables
-    kind = _kind(tables, [path for path, _ in files])
-    if kind is not pose:
-        tables = _understood(files, arm, kind, asked)
-    return kind, tables
-
-
-def _known_kind(tables: Sequence[Columns]) -> Measurement | None:
-    """Return the kind that columns of pixels or touches tell; None where names have to be read."""
-    if any(map(_seeing, tables)):
-        return eye_in_hand
-    if _touching(tables):
-        return revisit
-    return None
 
 
 def _understood(files: Files, arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:
@@ -231,56 +213,47 @@ def _whole(
     return Understanding(kind, whole.columns, tuple(tables), whole.notes, asked, str(paths[0]))
 
 
-def _kind(tables: Sequence[Understood], paths: Sequence[Path]) -> Measurement:
+def _kind_of_columns(tables: Sequence[Columns]) -> Measurement | None:
+    """Return what was measured where columns of pixels or touches tell it; None where names have to be read."""
+    names = [name.strip().lower() for raw in tables for name in raw]
+    if any({"u", "v"} <= {split(name)[0].strip().lower() for name in raw} for raw in tables):
+        return eye_in_hand
+    cells = [column for raw in tables for name, column in raw.items() if name.strip().lower() in TOUCHED]
+    repeated = any(len({str(cell) for cell in column}) < len(column) for column in cells)  # labels are unique
+    if repeated and not any(map(COORDINATE.search, names)):
+        return revisit
+    return None
+
+
+def _kind_of_names(tables: Sequence[Understood], path: Path) -> Measurement:
     """Return poses where the tables have orientations, else positions."""
     stems = {stem for each in tables for stem in each.stems}
     if not stems & {"x", "y", "z"}:
         names = ", ".join(name for each in tables for name in each.raw)
         accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
-        raise InputError("the header", f"no positions among {names}", accepted, paths[0])
+        raise InputError("the header", f"no positions among {names}", accepted, path)
     forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
     return pose if any(form <= stems for form in forms) else position
 
 
-def _seeing(raw: Columns) -> bool:
-    """Return whether a table has columns u and v: pixels."""
-    return {"u", "v"} <= {split(name)[0].strip().lower() for name in raw}
-
-
-def _touching(tables: Sequence[Columns]) -> bool:
-    """Return whether a table says what was touched, and none has a measured coordinate."""
-    measured = any(COORDINATE.search(name.lower()) for raw in tables for name in raw)
-    return not measured and any(map(_touched, tables))
-
-
-def _touched(raw: Columns) -> bool:
-    """Return whether a column ``point`` or ``plane`` names something twice: labels, which it may hold, are unique."""
-    cells = [column for name, column in raw.items() if name.strip().lower() in TOUCHED]
-    return any(len({str(cell) for cell in column}) < len(column) for column in cells)
-
-
-def _ordered(files: Files, arm: Described, kind: Measurement, asked: Asked) -> Understanding:
-    """Return the tables with a quaternion in the order that fits the nominal robot, and say both figures."""
+def _ordered(files: Files, arm: Described, asked: Asked) -> Understanding:
+    """Return poses with a quaternion in the order that fits the nominal robot, and say both figures."""
     paths = [path for path, _ in files]
     found: dict[str, Understanding] = {}
+    misfit: dict[str, float] = {}
     for order in ORDERS:
         stated = replace(asked, quaternion=order)
-        found[order] = _whole(paths, arm, kind, stated, _understood(files, arm, kind, stated))
-    misfit = {order: _misfit(each, arm) for order, each in found.items()}
+        found[order] = _whole(paths, arm, pose, stated, _understood(files, arm, pose, stated))
+        data = read_data(found[order].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, pose)
+        misfit[order] = float(np.degrees(pose_misfit(arm.robot, data)))
     best, other = sorted(ORDERS, key=lambda order: misfit[order])
     if not misfit[other] > CLEARLY * misfit[best]:
-        figures = ", ".join(f"{order} {np.degrees(misfit[order]):.2f} deg" for order in ORDERS)
+        figures = ", ".join(f"{order} {misfit[order]:.2f} deg" for order in ORDERS)
         raise InputError(
             "the order of the quaternion", f"no clear one ({figures})", "--quaternion wxyz or xyzw", paths[0]
         )
     note = (
-        f"the quaternion's order is {best}: on the nominal robot it leaves {np.degrees(misfit[best]):.2f} deg, "
-        f"{other} {np.degrees(misfit[other]):.1f} deg."
+        f"the quaternion's order is {best}: on the nominal robot it leaves {misfit[best]:.2f} deg, "
+        f"{other} {misfit[other]:.1f} deg."
     )
     return replace(found[best], notes=(*found[best].notes, note))
-
-
-def _misfit(found: Understanding, arm: Described) -> float:
-    """Return how badly poses fit the nominal robot [rad]."""
-    data = read_data(found.columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, found.kind)
-    return pose_misfit(arm.robot, data)

@@ -11,7 +11,7 @@ from rpim_opt.basics.units import joint_columns
 from rpim_opt.data.board import on_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.sight import postures_in_sight
 from rpim_opt.store.problem_file import Stated

@@ -12,7 +12,7 @@ from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.units import UNITS
 from rpim_opt.data.board import Board, grid_board, on_board, read_board
 from rpim_opt.data.models import CAMERAS, Measurement
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.frames import starting_cameras
 from rpim_opt.problem.located import locate
 from rpim_opt.problem.views import posed

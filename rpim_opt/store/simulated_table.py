@@ -11,7 +11,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.problem_file import Stated

@@ -12,9 +12,9 @@ from rpim_opt.basics.inputs import read_text
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.naming import TOUCHED
-from rpim_opt.data.spelling import parse_units
-from rpim_opt.data.understanding import Asked
+from rpim_opt.data.tables.naming import TOUCHED
+from rpim_opt.data.tables.understanding import Asked
+from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.plain import toml, write_robot

@@ -11,7 +11,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.data.contact import touches
 from rpim_opt.data.models import revisit
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.postures import postures_at
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot

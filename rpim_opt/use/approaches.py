@@ -10,12 +10,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.layouts import read_raw
 from rpim_opt.basics.tables import numbers, read_columns, texts
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import UNITS
-from rpim_opt.data.naming import recognised
-from rpim_opt.data.spelling import FOREIGN, dimension_of, parse_units, split
+from rpim_opt.data.tables.layout import read_raw
+from rpim_opt.data.tables.names import recognize
+from rpim_opt.data.tables.units import FOREIGN, dimension_of, parse_units, split
 from rpim_opt.use.iso9283 import Performance, iso9283
 
 PLACE = ("x", "y", "z")
@@ -94,7 +94,7 @@ def _recognised(columns: Iterable[str], units: Mapping[str, str]) -> tuple[str, 
     of_kind = {"": attained, "measured": attained, "wanted": commanded}
     for name in columns:
         stem, unit = split(name)
-        found = recognised(stem, ())
+        found = recognize(stem)
         into = of_kind.get(found.kind)
         if found.stem in NAMES:
             names.setdefault(found.stem, name)

@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.times import seconds, time_column
+from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.use.carried import Carried
 from rpim_opt.use.cusum import cumulative, limit
 from rpim_opt.use.drifts import likeliest

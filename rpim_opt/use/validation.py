@@ -23,10 +23,10 @@ from rpim_opt.calibration.unseen import judged
 from rpim_opt.data.board import board_of, on_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import KNOWN, Measurement
-from rpim_opt.data.naming import rename
-from rpim_opt.data.reading import read_data
-from rpim_opt.data.spelling import parse_units
-from rpim_opt.data.understanding import Asked, understand
+from rpim_opt.data.tables.naming import rename
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.understanding import Asked, understand
+from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.mdh import Robot
 
 

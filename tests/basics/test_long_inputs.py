@@ -15,7 +15,7 @@ from rpim_opt.basics.tables import read_columns
 from rpim_opt.basics.units import split_unit
 from rpim_opt.convex.combination import combination
 from rpim_opt.convex.sentence import sentence
-from rpim_opt.data.spelling import split
+from rpim_opt.data.tables.units import split
 from rpim_opt.store.seen_target import seen_target
 
 MANY = 19_000

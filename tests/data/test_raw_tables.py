@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.grids import text_grid
-from rpim_opt.basics.layouts import Layout
+from rpim_opt.basics.tables import read_grid
 from rpim_opt.data.models import pose, position
-from rpim_opt.data.several import together
-from rpim_opt.data.spelling import parse_units
-from rpim_opt.data.understanding import Understood, understand
+from rpim_opt.data.tables.joining import together
+from rpim_opt.data.tables.layout import Layout
+from rpim_opt.data.tables.understanding import Understood, understand
+from rpim_opt.data.tables.units import parse_units
 
 ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
 ROWS = "P1,1,2,401,5,6\nP2,3,4,402,6,7\n"
@@ -183,8 +183,8 @@ def test_units_of_others_are_lengths_and_are_converted(tmp_path: Path, unit: str
 
 
 def test_two_bytes_and_fewer_than_four_are_read_as_text(tmp_path: Path) -> None:
-    assert text_grid(write(tmp_path, b"a,b")).rows == [["a", "b"]]
-    assert text_grid(write(tmp_path, "x,y\n1,2\n".encode("utf-16"))).rows == [["x", "y"], ["1", "2"]]
+    assert read_grid(write(tmp_path, b"a,b")).rows == [["a", "b"]]
+    assert read_grid(write(tmp_path, "x,y\n1,2\n".encode("utf-16"))).rows == [["x", "y"], ["1", "2"]]
 
 
 JOINTS = "name,J1 [deg],J2 [deg]\na,1,2\nb,3,4\n"

@@ -70,7 +70,7 @@ HOSTILE = {
     "Latin-1": (GOOD.replace("a,1", "\xe4,1").encode("latin-1"), "the file: found"),
     "binary": (bytes(range(256)) * 4, "data.csv"),
     "null byte in a number": (GOOD.replace("a,1", "a,\x001"), "data.csv, row a, column q1_deg: found"),
-    "unclosed quote": (GOOD + '"c,1,2,3,4,5', "the file: found"),
+    "unclosed quote": (GOOD + '"c,1,2,3,4,5', "line 4: found"),
     "semicolons": (GOOD.replace(",", ";"), "the header: found one column with semicolons"),
     "tabs": (GOOD.replace(",", "\t"), "the header: found one column with semicolons or tabs"),
     "decimal commas": (GOOD.replace("a,1,", 'a,"1,5",'), "row a, column q1_deg: found '1,5'"),

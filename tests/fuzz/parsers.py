@@ -19,9 +19,9 @@ import rpim_opt as ro
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.convex.sentence import sentence
 from rpim_opt.data.models import MEASUREMENTS, Measurement
-from rpim_opt.data.reading import read_data
-from rpim_opt.data.spelling import parse_units
-from rpim_opt.data.understanding import Asked
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.understanding import Asked
+from rpim_opt.data.tables.units import parse_units
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.data.times import seconds, time_column
+from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.use.cusum import cumulative, limit, passing
 from tests.simulate import simulated
 from tests.test_cli import run

@@ -6,18 +6,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.layouts import Layout, RawTable, missing_rows, read_raw
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import UNITS, split_unit
-from rpim_opt.data.dialects import Reading
 from rpim_opt.data.models import Measurement
-from rpim_opt.data.naming import Renamed, rename
-from rpim_opt.data.orientations import from_vectors, quaternion_columns
-from rpim_opt.data.spelling import split
+from rpim_opt.data.tables.layout import Layout, RawTable, missing_rows, read_raw
+from rpim_opt.data.tables.names import Reading
+from rpim_opt.data.tables.naming import Renamed, rename
+from rpim_opt.data.tables.orientations import from_vectors, quaternion_columns
+from rpim_opt.data.tables.units import split
 from rpim_opt.robot.mdh import Robot
 
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
@@ -143,7 +143,7 @@ def understand(
     >>> from pathlib import Path
     >>> import numpy as np
     >>> from rpim_opt.data.models import position
-    >>> from rpim_opt.data.understanding import understand
+    >>> from rpim_opt.data.tables.understanding import understand
     >>> from rpim_opt.robot import Robot
     >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
     >>> text = "Point;J1 [deg];J2 [deg];X [mm];Y [mm];Z [mm]\nP1;1,5;2;401;0,5;0\nP2;3;4;-;-;-\n"
@@ -155,32 +155,25 @@ def understand(
     asked = asked or Asked()
     raw = table or read_raw(path, asked.layout)
     try:
-        raw, vectors = _turned(raw, asked)
-        found = rename(
-            raw.columns, robot, kind, asked.units or {}, joints, raw.heads, quaternion=asked.quaternion or "wxyz"
-        )
+        raw, vectors = _with_quaternions(raw, asked)
+        found = rename(raw.columns, robot, kind, asked.units or {}, joints, raw.heads, asked.quaternion or "wxyz")
     except InputError as error:
         raise error.within(path) from None
     columns, kept, notes = _with_values(found.columns, robot, kind)
     columns, more = _labelled(columns)
-    known = {name: Reading(split_unit(new)[0]) for new, name in _origins(found).items()}
-    plain = {name: known.get(name, Reading("")) for name in raw.columns}
+    ours = {found.was.get(name, name): name for name in found.columns}
+    read = {name: Reading(split_unit(ours[name])[0] if name in ours else "") for name in raw.columns}
     return Understood(
         path.name,
         columns,
         {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
-        _meant(raw, found, vectors),
+        _meant(raw, found, ours, vectors),
         (*raw.notes, *notes, *more),
-        not asked.quaternion and bool(quaternion_columns(plain, robot.dof)),
+        not asked.quaternion and bool(quaternion_columns(read, robot.dof)),
     )
 
 
-def _origins(found: Renamed) -> dict[str, str]:
-    """Return the files' names of our columns."""
-    return {name: found.was.get(name, name) for name in found.columns}
-
-
-def _turned(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
+def _with_quaternions(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
     """Return the table with quaternions for rotation vectors, and the columns that these were."""
     if not asked.rotation:
         return raw, ()
@@ -194,46 +187,31 @@ def _turned(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
     if not unit:
         raise InputError("the header", f"columns without a unit ({', '.join(names)})", "--units with it, such as rad")
     others = {name: cells for name, cells in raw.columns.items() if name not in names}
-    turns = from_vectors(raw.columns, names, UNITS[unit].si)
-    return replace(raw, columns={**others, **turns}), tuple(names)
+    vectors = from_vectors(raw.columns, names, UNITS[unit].si)
+    return replace(raw, columns={**others, **vectors}), tuple(names)
+
+
+def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
+    """Return the names of measured and of joint values without units: a row needs both."""
+    forms = [stem for form, _ in kind.forms for stem in form]
+    return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
 def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Columns, list[int], list[str]]:
     """Return the columns without rows that have no values, the rows that are left, and what was left out."""
     out: set[int] = set()
     notes = []
+    count = len(next(iter(columns.values()), ()))
+    labels = columns.get("label", range(1, count + 1))
     for what, stems in row_stems(robot, kind).items():
         rows = missing_rows(columns, [name for name in columns if split_unit(name)[0] in stems])
-        notes += _without(columns, rows, what)
+        if rows:
+            notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
         out |= set(rows)
-    count = len(next(iter(columns.values()), ()))
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
     return {name: [cells[i] for i in kept] for name, cells in columns.items()}, kept, notes
-
-
-def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
-    """Return the names of measured and of joint values without units: a row needs both.
-
-    >>> import numpy as np
-    >>> from rpim_opt.data.models import position
-    >>> from rpim_opt.data.understanding import row_stems
-    >>> from rpim_opt.robot import Robot
-    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
-    >>> {what: sorted(stems) for what, stems in row_stems(arm, position).items()}
-    {'measured': ['x', 'y', 'z'], 'joint': ['q1', 'q2']}
-    """
-    forms = [stem for form, _ in kind.forms for stem in form]
-    return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
-
-
-def _without(columns: Columns, rows: Sequence[int], what: str) -> list[str]:
-    """Say which rows have no values of a kind."""
-    if not rows:
-        return []
-    labels = columns.get("label", [str(i + 1) for i in range(max(rows) + 1)])
-    return [f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}."]
 
 
 def _labelled(columns: Columns) -> tuple[Columns, list[str]]:
@@ -254,26 +232,25 @@ def _unique(labels: Sequence[str]) -> bool:
     return all(labels) and len(set(labels)) == len(labels)
 
 
-def _meant(raw: RawTable, found: Renamed, vectors: Sequence[str]) -> tuple[Meant, ...]:
+def _meant(raw: RawTable, found: Renamed, ours: Mapping[str, str], vectors: Sequence[str]) -> tuple[Meant, ...]:
     """Return what every column of the file means."""
-    new = {was: name for name, was in _origins(found).items()}
     meant = [Meant(name, "rotation vector", "qw, qx, qy, qz", "", "--rotation vector") for name in vectors]
     for name in raw.columns:
-        if name not in new:
+        if name not in ours:
             meant.append(Meant(name, "left out", "", "", found.left_why[name]))
         elif not (vectors and name in ("qw", "qx", "qy", "qz")):
-            of, unit_why = found.why[new[name]]
-            why = of if not unit_why else f"{of}; unit {unit_why}"
-            stem, unit = split_unit(new[name])
-            shown = new[name].removeprefix(f"{stem}_") if unit else ""
-            meant.append(Meant(name, meaning(stem), new[name], shown, why))
+            new = ours[name]
+            why, unit_why = found.why[new]
+            stem, unit = split_unit(new)
+            shown = new.removeprefix(f"{stem}_") if unit else ""
+            meant.append(Meant(name, meaning(stem), new, shown, f"{why}; unit {unit_why}" if unit_why else why))
     return tuple(meant)
 
 
 def meaning(stem: str) -> str:
     """Return what a column of ours is, in words.
 
-    >>> from rpim_opt.data.understanding import meaning
+    >>> from rpim_opt.data.tables.understanding import meaning
     >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
     ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
     """
@@ -289,8 +266,3 @@ def meaning(stem: str) -> str:
         if match:
             return words.format(*match.groups())
     return f"measured {stem}"
-
-
-def meant_rows(tables: Sequence[Understood]) -> list[dict[str, Any]]:
-    """Return what all columns mean, as a document."""
-    return [{"file": table.file, **each._asdict()} for table in tables for each in table.meant]

@@ -1,20 +1,18 @@
-"""Where a table's header and rows are among the cells of a file, and numbers without decimal commas and thousands."""
+"""Where a table's header and rows are among the cells of a file, and its numbers without commas, thousands, units."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.grids import Grid, read_grid
-from rpim_opt.basics.numerals import decimal_mark, is_missing, is_numeral, plain, with_units
-from rpim_opt.basics.shape import Columns
-from rpim_opt.basics.tables import read_columns
+from rpim_opt.basics.tables import Columns, Grid, is_numeral, read_columns, read_grid
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import UNITS
+from rpim_opt.data.tables.units import UNIT_SIGNS
 
 FULL = 0.6
 """A row belongs to the data if it has this part of the numbers of the fullest row."""
@@ -30,11 +28,12 @@ SUMMARIES = frozenset({
 """What a row begins with that is no measurement."""
 COMMENT = ("//", "#", "%", "!", "*")
 """What a line begins with that other programs skip."""
-UNIT_SIGNS = frozenset({
-    *UNITS, "°", "grad", "degree", "degrees", "radian", "radians", "inch", "in", "cm", "gon", "µm", "μm", "nm", "n.m",
-    "n·m", "-", "s", "1",
-})  # fmt: skip
-"""What stands in a line of units."""
+MISSING = frozenset({"", "-", "--", "n/a", "na", "nan", "none", "null", "#n/a"})
+"""How tables say that there is no value."""
+GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:[.,]\d{3})+")
+"""What may be a whole number with its thousands apart, or one with three decimals."""
+WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
+"""A number with its unit in the cell."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Layout:
 
     Examples
     --------
-    >>> from rpim_opt.basics.layouts import Layout
+    >>> from rpim_opt.data.tables.layout import Layout
     >>> Layout(columns=("label", "q1_deg", "x_mm")).columns[1]
     'q1_deg'
     """
@@ -107,7 +106,7 @@ def read_raw(path: Path, layout: Layout | None = None) -> RawTable:
     Examples
     --------
     >>> from pathlib import Path
-    >>> from rpim_opt.basics.layouts import read_raw
+    >>> from rpim_opt.data.tables.layout import read_raw
     >>> text = "Cell 7;;;\nJoints;;Position;\nJ1;J2;X;Y\n[deg];[deg];[mm];[mm]\n1,5;2;3;4\n"
     >>> _ = Path("raw.csv").write_text(text)
     >>> raw = read_raw(Path("raw.csv"))
@@ -118,13 +117,20 @@ def read_raw(path: Path, layout: Layout | None = None) -> RawTable:
     try:
         if path.suffix.lower() == ".parquet":
             return RawTable(read_columns(path))
-        grid = read_grid(path, layout.sheet, layout.encoding, layout.separator)
-        return raw_table(grid, layout)
+        return _table(read_grid(path, layout.sheet, layout.encoding, layout.separator), layout)
     except InputError as error:
         raise error.within(path) from None
 
 
-def raw_table(grid: Grid, layout: Layout) -> RawTable:
+def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
+    """Return the rows (from 0) in which all of some columns have no value."""
+    if not names:  # nor columns, perhaps
+        return []
+    rows = zip(*(columns[name] for name in names), strict=True)
+    return [i for i, row in enumerate(rows) if all(_is_missing(str(cell)) for cell in row)]
+
+
+def _table(grid: Grid, layout: Layout) -> RawTable:
     """Return the table among the rows of a file."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
@@ -134,39 +140,41 @@ def raw_table(grid: Grid, layout: Layout) -> RawTable:
         raise InputError("the table", "a header and no rows", "at least one row of numbers")
     full = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, full, layout)
-    rows, notes = _data(grid, full, above)
-    _require_width(rows, len(heads), grid, layout)
+    summing = [i for i in full if _first(grid.rows[i]).lower().rstrip(":") in SUMMARIES]
+    rows = [grid.rows[i] for i in sorted(set(full) - set(summing))]
+    _require_width(rows, len(heads), layout)
     columns, heads = _columns(rows, heads)
     columns, mark = _plain(columns, layout.decimal)
     columns, heads = _without_units(columns, heads)
+    notes = [*grid.notes, *_about_header(grid, above, layout), *_about_rows(grid, full, above)]
+    notes += [f"line {grid.lines[i]} sums others up: left out '{_first(grid.rows[i])}'." for i in summing]
     if mark == ",":
-        how = "as stated" if layout.decimal else "no comma can part thousands"
-        notes.append(f"decimal commas: {how}.")
-    return RawTable(columns, heads, (*grid.notes, *_about_header(grid, above, layout), *notes))
+        notes.append(f"decimal commas: {'as stated' if layout.decimal else 'no comma can part thousands'}.")
+    return RawTable(columns, heads, tuple(notes))
+
+
+def _first(row: Sequence[str]) -> str:
+    return next(cell for cell in row if cell)
+
+
+def _is_missing(cell: str) -> bool:
+    return cell.strip().lower() in MISSING
 
 
 def _count(row: Sequence[str]) -> int:
     """Return how many cells of a row are numbers, or say that there is none where one could be."""
-    numbers = sum(map(_has_number, row))
-    if not numbers:
-        return 0
-    return numbers + sum(bool(cell) and is_missing(cell) for cell in row)
+    numbers = sum(is_numeral(cell) or _unit_of([cell]) != "" for cell in row)
+    return numbers and numbers + sum(cell != "" and _is_missing(cell) for cell in row)
 
 
-def _has_number(cell: str) -> bool:
-    """Return whether a cell is a number, perhaps with its unit."""
-    if is_numeral(cell):
-        return True
-    found = with_units([cell])
-    return found is not None and found[1].lower() in UNIT_SIGNS
+# --- header --------------------------------------------------------------------------------------------------------
 
 
 def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> list[int]:
     """Return the rows of numbers without a header that numbers its joints, 1 2 3 4 5 6 X Y Z."""
     while len(full) > 1:
         pairs = zip(rows[full[0]], rows[full[1]], strict=False)
-        words = sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs)
-        if words < 2:
+        if sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs) < 2:
             break
         full = full[1:]
     return full
@@ -183,7 +191,15 @@ def _heads(grid: Grid, full: Sequence[int], layout: Layout) -> tuple[list[Head],
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     header = [_uncommented(grid.rows[i], width) for i in above]
-    return _named(header, max(map(len, header))), above
+    width = max(map(len, header))
+    lines = [[*row, *[""] * (width - len(row))] for row in header]
+    units = [""] * width
+    if len(lines) > 1 and _is_units(lines[-1]):
+        units = [cell.strip("[]()") for cell in lines.pop()]
+    names = lines.pop()
+    groups = [" ".join(filter(None, parts)) for parts in zip(*map(_unmerged, lines), strict=True)] or [""] * width
+    units = ["" if unit in ("-", "1") else unit for unit in units]
+    return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
 
 
 def _header_rows(rows: Sequence[Sequence[str]], first: int, width: int) -> list[int]:
@@ -212,85 +228,62 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
     return cells
 
 
-def _named(header: Sequence[Sequence[str]], width: int) -> list[Head]:
-    """Return the heads of columns from up to four lines: groups, names, units."""
-    lines = [[*row, *[""] * (width - len(row))] for row in header]
-    units = [""] * width
-    if len(lines) > 1 and _is_units(lines[-1]):
-        units = [cell.strip("[]()") for cell in lines.pop()]
-    names = lines.pop()
-    groups = [_spread(line) for line in lines]
-    heads = []
-    for j, name in enumerate(names):
-        group = " ".join(line[j] for line in groups if line[j])
-        unit = units[j] if units[j] not in ("-", "1") else ""
-        heads.append(Head(name, group, unit))
-    return heads
-
-
 def _is_units(row: Sequence[str]) -> bool:
     cells = [cell.strip("[]()").lower() for cell in row if cell]
     return bool(cells) and all(cell in UNIT_SIGNS for cell in cells)
 
 
-def _spread(line: Sequence[str]) -> list[str]:
+def _unmerged(line: Sequence[str]) -> list[str]:
     """Return a line in which merged cells have the text of their first."""
-    spread: list[str] = []
+    cells: list[str] = []
     for cell in line:
-        spread.append(cell or (spread[-1] if spread else ""))
-    return spread
+        cells.append(cell or (cells[-1] if cells else ""))
+    return cells
 
 
-def _data(grid: Grid, full: Sequence[int], above: Sequence[int]) -> tuple[list[list[str]], list[str]]:
-    """Return the rows of data, and what was left out below the header."""
-    summing = [i for i in full if _first(grid.rows[i]).lower().rstrip(":") in SUMMARIES]
-    notes = _between(grid, full, above)
-    notes += [f"line {grid.lines[i]} sums others up: left out '{_first(grid.rows[i])}'." for i in summing]
-    kept = sorted(set(full) - set(summing))
-    return [grid.rows[i] for i in kept], notes
+def _about_header(grid: Grid, above: Sequence[int], layout: Layout) -> Iterator[str]:
+    """Say where the header is, unless it is the first line alone."""
+    if layout.columns:
+        yield "names of columns as stated" + (f", instead of {_lines(grid, above)}." if above else ".")
+    elif len(above) > 1:
+        yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
+    if above and above[0]:
+        yield f"{above[0]} lines above the header are left out ('{' '.join(grid.rows[0])[:50]}' ...)."
 
 
-def _first(row: Sequence[str]) -> str:
-    return next(cell for cell in row if cell)
-
-
-def _between(grid: Grid, full: Sequence[int], above: Sequence[int]) -> list[str]:
+def _about_rows(grid: Grid, full: Sequence[int], above: Sequence[int]) -> Iterator[str]:
     """Say which lines below the header are no rows of data: the header once more, and others."""
     header = [grid.rows[i] for i in above]
     below = sorted(set(range(full[0], len(grid.rows))) - set(full))
     again = [i for i in below if grid.rows[i] in header]
     others = [i for i in below if grid.rows[i] not in header]
-    notes = []
     if again:
-        notes.append(f"the header stands there again in {_lines(grid, again)}: left out.")
+        yield f"the header stands there again in {_lines(grid, again)}: left out."
     for i in others[:MOST_NAMED]:
         text = ", ".join(cell for cell in grid.rows[i] if cell)
-        notes.append(f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'.")
+        yield f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'."
     if len(others) > MOST_NAMED:
-        notes.append(f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out.")
-    return notes
+        yield f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out."
 
 
 def _lines(grid: Grid, rows: Sequence[int]) -> str:
     return "line " + listed([str(grid.lines[i]) for i in rows])
 
 
-def _require_width(rows: Sequence[list[str]], width: int, grid: Grid, layout: Layout) -> None:
+# --- columns and their numbers -------------------------------------------------------------------------------------
+
+
+def _require_width(rows: Sequence[list[str]], width: int, layout: Layout) -> None:
     """Refuse rows that are longer than the header; blank cells at the end may be missing or too many."""
-    for row in rows:
+    for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()
-        if len(row) != width and not (len(row) < width and layout.separator == "" and _short(row, width)):
-            where = f"row {rows.index(row) + 1} ({row[0]})"
+        lacks_remark = len(row) == width - 1 and width > 2 and not layout.separator
+        if len(row) != width and not lacks_remark:
             what = "--columns" if layout.columns else "the header"
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
-            raise InputError(where, f"{len(row)} cells", f"{width} cells as in {what}{hint}")
+            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))
-
-
-def _short(row: Sequence[str], width: int) -> bool:
-    """Return whether a row may lack its last cells: a remark that is not there, not a value."""
-    return len(row) == width - 1 and width > 2
 
 
 def _columns(rows: Sequence[Sequence[str]], heads: Sequence[Head]) -> tuple[dict[str, list[str]], dict[str, Head]]:
@@ -312,52 +305,78 @@ def _columns(rows: Sequence[Sequence[str]], heads: Sequence[Head]) -> tuple[dict
 def _plain(columns: dict[str, list[str]], decimal: str) -> tuple[dict[str, list[str]], str]:
     """Return the columns with decimal points, and the mark that they had."""
     numeric = {name: cells for name, cells in columns.items() if _is_numeric(cells)}
-    if decimal and decimal not in (",", "."):
+    if decimal not in ("", ",", "."):
         raise InputError("--decimal", f"'{decimal}'", "a comma or a point")
-    mark = decimal_mark(numeric.values(), decimal)
-    changed = {name: [plain(cell, mark) for cell in cells] for name, cells in numeric.items()}
-    return {**columns, **changed}, mark
+    mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), decimal)
+    return columns | {name: [_as_python(cell, mark) for cell in cells] for name, cells in numeric.items()}, mark
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
     numbers = sum(map(is_numeral, cells))
-    return numbers > 0 and numbers >= MOSTLY * sum(not is_missing(cell) for cell in cells)
+    return numbers > 0 and numbers >= MOSTLY * sum(not _is_missing(cell) for cell in cells)
+
+
+def _decimal_mark(cells: Iterable[str], stated: str) -> str:
+    """Return the decimal mark of a table, a comma or a point.
+
+    Where both stand in a number, the last one is the decimal mark. Where commas alone do, one that cannot part
+    thousands decides. A stated mark holds unless a number contradicts it.
+    """
+    found: dict[str, str] = {}
+    doubtful = ""
+    for cell in cells:
+        mark = _mark(cell)
+        if mark == "?":
+            doubtful = doubtful or cell
+        elif mark and GROUPED.fullmatch(found.get(mark, "1.000")):
+            found[mark] = cell
+    if stated:
+        cell = found.get("." if stated == "," else ",", "")
+        if cell and not GROUPED.fullmatch(cell):
+            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
+        return stated
+    if len(found) > 1:
+        raise InputError("the numbers", f"'{found[',']}' and '{found['.']}'", "one decimal mark, or --decimal with it")
+    if not found and doubtful:
+        raise InputError("the numbers", f"'{doubtful}', of thousands or of decimals", "--decimal , or --decimal .")
+    return next(iter(found), ".")
+
+
+def _mark(cell: str) -> str:
+    """Return the decimal mark that a cell shows, a question mark where it may part thousands, or nothing."""
+    last = max(cell.rfind(","), cell.rfind("."))
+    if last < 0 or not is_numeral(cell):
+        return ""
+    mark = cell[last]
+    other = "," if mark == "." else "."
+    if other in cell:
+        return mark
+    if cell.count(mark) > 1:  # 1.234.567
+        return other
+    return "?" if mark == "," and GROUPED.fullmatch(cell) else mark
+
+
+def _as_python(cell: str, mark: str) -> str:
+    """Return a numeral as Python writes it; other texts stay."""
+    if not is_numeral(cell):
+        return cell
+    return cell.replace("," if mark == "." else ".", "").replace(mark, ".")
+
+
+def _unit_of(cells: Sequence[str]) -> str:
+    """Return the unit that stands behind all numbers; nothing where it is not so."""
+    matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not _is_missing(cell)]
+    units = {match[2] if match else "" for match in matches}
+    unit = units.pop() if len(units) == 1 else ""
+    return unit if unit.lower() in UNIT_SIGNS else ""
 
 
 def _without_units(
     columns: dict[str, list[str]], heads: dict[str, Head]
 ) -> tuple[dict[str, list[str]], dict[str, Head]]:
     """Return columns whose cells carry a unit as numbers with the unit in the head."""
-    bare = dict(columns)
-    named = dict(heads)
-    for name, cells in columns.items():
-        found = with_units(cells) if not _is_numeric(cells) else None
-        if found is not None and found[1].lower() in UNIT_SIGNS:
-            bare[name] = [plain(cell, ".") for cell in found[0]]
-            named[name] = heads[name]._replace(unit=found[1])
-    return bare, named
-
-
-def _about_header(grid: Grid, above: Sequence[int], layout: Layout) -> Iterator[str]:
-    """Say where the header is, unless it is the first line alone."""
-    if layout.columns:
-        yield "names of columns as stated" + (f", instead of {_lines(grid, above)}." if above else ".")
-    elif len(above) > 1:
-        yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
-    skipped = list(range(above[0])) if above else []
-    if skipped:
-        text = " ".join(grid.rows[0])[:50]
-        yield f"{len(skipped)} lines above the header are left out ('{text}' ...)."
-
-
-def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
-    """Return the rows (from 0) in which all of some columns have no value.
-
-    >>> from rpim_opt.basics.layouts import missing_rows
-    >>> missing_rows({"x": ["1", "-"], "y": ["2", ""]}, ["x", "y"])
-    [1]
-    """
-    if not names:  # nor columns, perhaps
-        return []
-    count = len(columns[names[0]])
-    return [i for i in range(count) if all(is_missing(str(columns[name][i])) for name in names)]
+    units = {name: _unit_of(cells) for name, cells in columns.items() if not _is_numeric(cells)}
+    units = {name: unit for name, unit in units.items() if unit}
+    bare = {name: [_as_python(cell.removesuffix(unit).strip(), ".") for cell in columns[name]]
+            for name, unit in units.items()}  # fmt: skip
+    return columns | bare, heads | {name: heads[name]._replace(unit=unit) for name, unit in units.items()}

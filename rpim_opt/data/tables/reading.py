@@ -13,11 +13,11 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
-from rpim_opt.data.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.models import Measurement, position, revisit, revisit_plane
 from rpim_opt.data.spread import covariances, declared_noise
+from rpim_opt.data.tables.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.robot.mdh import Robot
 
 

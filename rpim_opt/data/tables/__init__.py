@@ -1,0 +1,1 @@
+"""Tables of measurements: how they are written, what their columns mean, and how they become a dataset."""

@@ -1,0 +1,358 @@
+"""Several raw tables become one: below each other where each is whole, else joined by a key or the nearest time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import Columns
+from rpim_opt.basics.text import listed
+from rpim_opt.basics.units import split_unit
+from rpim_opt.data.models import Measurement
+from rpim_opt.data.tables.understanding import Understood, row_stems
+from rpim_opt.robot.mdh import Robot
+
+TIME = re.compile(r"[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|zeit|zeitstempel|date|datum|t)", re.IGNORECASE)
+UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
+SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
+           "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
+"""What a unit is in lower case (`str.casefold`)."""
+SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
+
+
+class Whole(NamedTuple):
+    """One table, and how it was put together, a sentence each."""
+
+    columns: Columns
+    notes: tuple[str, ...]
+
+
+class Keys(NamedTuple):
+    """What a key is called, and the keys of the rows with joints and of those with measured values."""
+
+    how: str
+    joints: list[str]
+    values: list[str]
+
+
+class Pairs(NamedTuple):
+    """Rows of one table with rows of another one, and by how much their times differ [s]."""
+
+    left: np.ndarray
+    right: np.ndarray
+    apart: Array
+
+
+def together(
+    tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
+) -> Whole:
+    """Return several tables as one.
+
+    Tables that have joint and measured values each are stacked. Where some have the one and some the other, rows of
+    equal keys, or of the nearest times, are one row.
+
+    Parameters
+    ----------
+    tables
+        What was understood of every file.
+    robot, kind
+        Decide which columns are joint and which are measured values.
+    key
+        The column of the key, as the files or we call it; ``"row"`` for the number of the row. By default the label,
+        else the only name that both have.
+    within
+        Tolerance [s]: rows are joined by the nearest time, in columns called time or by the key, of clocks that agree.
+
+    Raises
+    ------
+    InputError
+        For columns that one table lacks, keys that are there twice, and tables without a common key.
+    """
+    stems = row_stems(robot, kind)
+    moving = [table for table in tables if table.stems & stems["joint"]]
+    seen = [table for table in tables if table.stems & stems["measured"]]
+    if len(tables) == 1 or (len(moving) == len(seen) == len(tables)):
+        return _stacked(tables)
+    if not moving or not seen or len(moving) + len(seen) != len(tables):
+        lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
+        found = f"{lost or 'some tables'} with only part of joint and measured values"
+        raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
+    if within is not None:
+        return _by_time(moving, seen, key, within)
+    return _by_key(moving, seen, key)
+
+
+# --- below each other ----------------------------------------------------------------------------------------------
+
+
+def _stacked(tables: Sequence[Understood]) -> Whole:
+    """Return the rows of several tables below each other, in the units of the first."""
+    first = tables[0]
+    if len(tables) == 1:
+        return Whole(first.columns, ())
+    matched = [_matched(table, first) for table in tables]
+    whole = {name: [cell for columns in matched for cell in columns[name]] for name in matched[0]}
+    counts = ", ".join(f"{table.file} {_count(table.columns)}" for table in tables)
+    notes = [f"rows of the files below each other: {counts}."]
+    names = [name for table in tables for name in _labels(table.columns)]
+    if len(set(names)) < len(names):
+        files = [Path(table.file).stem for table in tables]
+        if len(set(files)) < len(files):
+            files = [str(i) for i in range(1, len(files) + 1)]
+        names = [f"{file}:{name}" for file, table in zip(files, tables, strict=True) for name in _labels(table.columns)]
+        notes.append("labels are there in several files: the file's name is put before them.")
+    return Whole({"label": names, **whole}, tuple(notes))
+
+
+def _count(columns: Columns) -> int:
+    return len(next(iter(columns.values())))
+
+
+def _labels(columns: Columns) -> list[str]:
+    """Return the labels of a table's rows; their numbers where it has none."""
+    return [str(label) for label in columns.get("label", range(1, _count(columns) + 1))]
+
+
+def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
+    """Return a table's columns but for labels under the first one's names, in its units."""
+    own, wanted = ({split_unit(name)[0]: name for name in each.columns if name != "label"} for each in (table, first))
+    lacking = own.keys() ^ wanted.keys()
+    if lacking:
+        found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
+        raise InputError("the header", found, "the same columns in all files, or one file of joints and one of values")
+    return {name: _in_unit(table.columns[own[stem]], own[stem], name) for stem, name in wanted.items()}
+
+
+def _in_unit(cells: Sequence[Any], name: str, wanted: str) -> Sequence[Any]:
+    """Return a column's cells in the unit of another name."""
+    old = split_unit(name)[1]
+    new = split_unit(wanted)[1]
+    if old is None or new is None or old.si == new.si:
+        return cells
+    return [repr(float(cell) * old.si / new.si) for cell in cells]
+
+
+def _beside(joints: Columns, left: Sequence[int], values: Columns, right: Sequence[int], names: list[str]) -> Columns:
+    """Return rows of joints beside rows of measured values, whose columns go before, and their names.
+
+    These are labels where each is another, otherwise configurations.
+    """
+    own = {name: cells for name, cells in joints.items() if name not in values}
+    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
+    whole |= {name: [cells[i] for i in right] for name, cells in values.items()}
+    whole.pop("label", None)
+    if len(set(names)) == len(names):
+        return {"label": names, **whole}
+    return {**whole, "configuration": whole.get("configuration", names)}
+
+
+# --- by a key ------------------------------------------------------------------------------------------------------
+
+
+def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) -> Whole:
+    """Return rows of joints with the measured values of the same key."""
+    joints = _stacked(moving)
+    values = _stacked(seen)
+    keys = _keys(moving, seen, joints.columns, values.columns, key)
+    place: dict[str, int] = {}
+    for i, name in enumerate(keys.joints):
+        if place.setdefault(name, i) != i:
+            raise InputError(f"the key {keys.how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
+    rows = [i for i, name in enumerate(keys.values) if name in place]
+    if not rows:
+        found = f"none that {moving[0].file} and {seen[0].file} share"
+        accepted = "--key with a column that both have, --key row, or --within for the nearest time"
+        raise InputError(f"the key {keys.how}", found, accepted)
+    names = [keys.values[i] for i in rows]
+    whole = _beside(joints.columns, [place[name] for name in names], values.columns, rows, names)
+    notes = [*joints.notes, *values.notes]
+    notes.append(
+        f"joined by {keys.how}: {len(rows)} rows of {len(keys.joints)} with joints and {len(keys.values)} measured."
+    )
+    known = set(keys.values)
+    lonely = [name for name in keys.joints if name not in known] + [name for name in keys.values if name not in place]
+    if lonely:
+        notes.append(f"without a partner, left out: {listed(lonely)}.")
+    return Whole(whole, tuple(notes))
+
+
+def _keys(moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str) -> Keys:
+    """Return what the key is, and those of both tables."""
+    if key == "row":
+        if _count(joints) != _count(values):
+            found = f"{_count(joints)} rows of joints and {_count(values)} measured"
+            raise InputError("--key row", found, "as many of both, or a column that both have")
+        numbers = [str(i) for i in range(1, _count(joints) + 1)]
+        return Keys("the number of the row", numbers, numbers)
+    if "label" in joints and key in ("", "label"):
+        labels = _normal(joints["label"])
+        for column in ("label", "configuration"):
+            others = _normal(values.get(column, ()))
+            if set(labels) & set(others):
+                return Keys("label", labels, others)
+    left, right = _raw(moving), _raw(seen)
+    common = [name for name in left if name in right]
+    name = key.lower()
+    if not key and len(common) == 1:
+        name = common[0]
+    if name not in common:
+        files = f"{moving[0].file} and {seen[0].file}"
+        found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {files}"
+        accepted = "a column that both have, --key row for rows in the same order, or --within for the nearest time"
+        raise InputError("--key", found, accepted)
+    return Keys(f"column '{name}'", _normal(left[name]), _normal(right[name]))
+
+
+def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:
+    """Return the columns that all files have, below each other, by names in lower case."""
+    lower = [{name.lower(): cells for name, cells in table.raw.items()} for table in tables]
+    common = [name for name in lower[0] if all(name in table for table in lower)]
+    return {name: [cell for table in lower for cell in table[name]] for name in common}
+
+
+def _normal(cells: Sequence[Any]) -> list[str]:
+    """Return keys as texts, numbers without zeros before or behind them."""
+    keys = [str(cell).strip() for cell in cells]
+    return [str(int(key.partition(".")[0])) if re.fullmatch(r"\d+(?:\.0*)?", key) else key for key in keys]
+
+
+# --- by the nearest time -------------------------------------------------------------------------------------------
+
+
+def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str, within: float) -> Whole:
+    """Return rows of joints beside the measured values of the nearest time.
+
+    Every row of the shorter table looks for its partner in the longer one, where a row is the partner of the nearest
+    alone (of readings of one time, of all).
+    """
+    if not (np.isfinite(within) and within >= 0):
+        raise InputError("--within", f"{within:g}", "a time [s], zero or more")
+    joints = _stacked(moving)
+    values = _stacked(seen)
+    there = _times(moving, key)
+    then = _times(seen, key)
+    pairs = partners(there, then, within)
+    if not len(pairs.left):
+        apart = float(np.abs(there[:, None] - then[:1]).min())
+        found = f"no two within {within:g} s; the first measured row is {apart:.4g} s from the nearest with joints"
+        raise InputError("times", found, "clocks that agree, or a larger --within")
+    labels = _labels(values.columns)
+    right = pairs.right.tolist()
+    whole = _beside(joints.columns, pairs.left.tolist(), values.columns, right, [labels[i] for i in right])
+    note = (
+        f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
+        f"times differ by {np.abs(pairs.apart).max():.3g} s at most, {pairs.apart.mean():+.3g} s on average."
+    )
+    notes = [*joints.notes, *values.notes, note]
+    lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right))]
+    if lonely:
+        notes.append(f"{len(lonely)} measured rows without a partner within {within:g} s, left out: {listed(lonely)}.")
+    return Whole(whole, tuple(notes))
+
+
+def partners(left: Array, right: Array, within: float) -> Pairs:
+    """Return which times (N,) and (M,) [s] belong together: each of the fewer with the nearest of the others.
+
+    >>> import numpy as np
+    >>> from rpim_opt.data.tables.joining import partners
+    >>> pairs = partners(np.arange(0.0, 1.0, 0.01), np.array([0.104, 0.501, 7.0]), within=0.005)
+    >>> pairs.left.tolist(), pairs.right.tolist(), pairs.apart.round(3).tolist()
+    ([10, 50], [0, 1], [0.004, 0.001])
+    """
+    if len(left) < len(right):
+        turned = partners(right, left, within)
+        order = np.argsort(turned.right, kind="stable")
+        return Pairs(turned.right[order], turned.left[order], -turned.apart[order])
+    order = np.argsort(left, kind="stable")
+    ordered = left[order]
+    after = np.clip(np.searchsorted(ordered, right), 1, max(len(left) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(left) - 1)
+    nearer = np.where(np.abs(ordered[after] - right) < np.abs(ordered[before] - right), after, before)
+    partner = order[nearer]
+    apart = right - left[partner]
+    least = np.full(len(left), np.inf)
+    np.minimum.at(least, partner, np.abs(apart))
+    kept = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
+    return Pairs(partner[kept], kept, apart[kept])
+
+
+def _times(tables: Sequence[Understood], key: str) -> Array:
+    """Return the times [s] of all rows of some tables."""
+    found = []
+    for table in tables:
+        name = time_column(table.raw)
+        if key and key.lower() != "time":
+            name = next((column for column in table.raw if column.lower() == key.lower()), None)
+        if name is None:
+            what = f"no column '{key}'" if key else "no column of times"
+            columns = ", ".join(table.raw)
+            raise InputError(f"--within, {table.file}", f"{what} among {columns}", "one called time, or --key with it")
+        found.append(seconds(name, table.raw[name]))
+    return np.concatenate(found)
+
+
+def time_column(names: Iterable[str]) -> str | None:
+    """Return the first column that is called a time; None where there is none.
+
+    >>> from rpim_opt.data.tables.joining import time_column
+    >>> [time_column(names) for names in (["q1", "Time [ms]"], ["header.stamp", "x"], ["x_mm"])]
+    ['Time [ms]', 'header.stamp', None]
+    """
+    return next((name for name in names if TIME.fullmatch(_split_time(name)[0].replace("_", " "))), None)
+
+
+def seconds(name: str, cells: Sequence[Any]) -> Array:
+    """Return times (N,) [s] of a column's numbers, in the unit of its name, or of its dates (ISO 8601).
+
+    Numbers without a unit are seconds, or, where that would be after the year 5000, what since 1970 is in our time.
+    Dates without a zone are UTC.
+
+    Raises
+    ------
+    InputError
+        For a cell that is neither.
+
+    Examples
+    --------
+    >>> from rpim_opt.data.tables.joining import seconds
+    >>> seconds("time_ms", ["0", "250"]).tolist(), seconds("date", ["1970-01-01T00:01", "1970-01-02"]).tolist()
+    ([0.0, 0.25], [60.0, 86400.0])
+    """
+    read = [_time(cell) for cell in cells]
+    for i, (cell, time) in enumerate(zip(cells, read, strict=True), start=1):
+        if time is None or type(time) is not type(read[0]):
+            raise InputError(f"column '{name}', row {i}", f"'{cell}'", "numbers, or dates as 2026-05-31T12:00:00")
+    if read and isinstance(read[0], datetime):
+        return np.array([date.replace(tzinfo=date.tzinfo or UTC).timestamp() for date in read])  # type: ignore[union-attr]
+    found = np.array(read, dtype=float)
+    size = np.abs(found).max(initial=0.0)
+    guessed = next((unit for least, unit in SINCE_1970 if size >= least), "s")
+    return SECONDS[_split_time(name)[1].casefold() or guessed] * found
+
+
+def _split_time(name: str) -> tuple[str, str]:
+    match = UNIT.fullmatch(name.strip().replace("_", " "))
+    return (match[1].strip(), match[2]) if match else (name.strip(), "")
+
+
+def _time(cell: Any) -> float | datetime | None:
+    """Return a cell's finite number or date; None where it is neither."""
+    if isinstance(cell, datetime):
+        return cell
+    try:
+        value = float(cell)
+    except (TypeError, ValueError):
+        try:
+            return datetime.fromisoformat(str(cell).strip())
+        except ValueError:
+            return None
+    return value if np.isfinite(value) else None

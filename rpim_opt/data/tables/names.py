@@ -1,0 +1,144 @@
+"""Names of columns that programs and people use: what each can only mean, and why.
+
+Headers as they are exported, each read as it stands:
+
+- SpatialAnalyzer: ``Point Name, X [mm], Y [mm], Z [mm], U(95) X [mm], U(95) Y [mm], U(95) Z [mm]``; its ASCII files
+  begin with comments ``//`` and part ``Collection Group Target X Y Z`` by spaces or commas.
+- Leica: ``Point ID;X [mm];Y [mm];Z [mm];Std X [mm];Std Y [mm];Std Z [mm]``.
+- RoboDK: ``J1, ..., J6, X, Y, Z``; the file of calibration measurements is read with ``layout = "robodk"`` instead.
+- ROS, ``rostopic echo -p``: ``%time, field.header.seq, field.name0, ..., field.position0, ...``;
+  ``field.pose.position.x, ..., field.pose.orientation.w``; a bag by path, ``/joint_states/elbow_joint/position``.
+- Universal Robots, RTDE: ``timestamp, actual_q_0, ..., actual_q_5, target_q_0, ...``.
+- KUKA: ``A1 [deg], ..., A6 [deg]`` and ``X, Y, Z, A, B, C``; FANUC: ``J1, ...`` and ``X, Y, Z, W, P, R``.
+- ABB: ``rax_1, ..., rax_6`` and ``x, y, z, q1, q2, q3, q4``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+
+class Reading(NamedTuple):
+    """What a column holds, its unit, why, and whether it was measured, wanted or derived from others."""
+
+    stem: str
+    unit: str = ""
+    why: str = ""
+    kind: str = ""
+
+
+class Name(NamedTuple):
+    """A pattern of names, what they mean, and why."""
+
+    pattern: str
+    meaning: str
+    why: str = "a usual name"
+
+
+class Dialect(NamedTuple):
+    """Whose names these are, and the units that it counts in."""
+
+    pattern: str
+    angle: str
+    length: str
+    why: str
+
+
+_WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|coords?|coordinates?|cartesian|cart|tcp)_?)*"
+_SPREAD = r"(?:std|stdev|stddev|std_?dev|sigma|sd)"
+NAMES = (
+    Name(r"(to_)?(?:q|j|jt|joint|axis|a|theta|rax|achse|gelenk|axe|eje)_?(\d+)(?:_?(?:pos|position|angle|value))?",
+         r"\1q\2"),
+    Name(r"(?:joints?|axes|axis|achsen|gelenke)(?:_(?:angles?|positions?|values?|pos))?_(?:q|j|a|joint|axis)?_?(\d+)",
+         r"q\1"),
+    Name(r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
+    Name(r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
+    Name(rf"{_WHERE}([xyz])(?:_?1)?", r"\1"),
+    Name(r"(?:(?:field|pose|transform)_)*(?:q|quat|quaternion|orientation|rotation|rot)_?([wxyz])", r"q\1"),
+    Name(r"roll", "rx"),
+    Name(r"pitch", "ry"),
+    Name(r"yaw", "rz"),
+    Name(r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
+    Name(r"u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
+    Name(rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
+    Name(r"distance|dist|cable|cable_length", "distance"),
+    Name(r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
+         r"|punkt_?nr", "label"),
+    Name(r"configuration|config|pose|pose_id", "configuration"),
+    Name(r"marker|reflector|smr", "marker"),
+    Name(r"temp(?:erature|eratur)?", "temperature"),
+    Name(r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
+)  # fmt: skip
+"""What else a column may be called, in lower case and with underscores: unambiguous names alone."""
+DIALECTS = (
+    Dialect(r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w", "rad", "m", "ROS: SI units (REP 103)"),
+    Dialect(r"(?:actual|target)_q_\d", "rad", "m", "Universal Robots' RTDE: SI units"),
+)
+KINDS = {
+    "derived": frozenset({"deviation", "dev", "delta", "diff", "difference", "error", "err", "residual", "velocity",
+                          "vel", "speed", "acceleration"}),
+    "wanted": frozenset({"nominal", "nom", "target", "soll", "theoretical", "programmed", "commanded", "command", "cmd",
+                         "desired", "setpoint", "reference", "ref"}),
+    "measured": frozenset({"measured", "meas", "measurement", "actual", "act", "ist", "tracker", "leica", "observed"}),
+}  # fmt: skip
+"""Words of a name that say whether it was measured, wanted or computed from others."""
+TURNS = (
+    (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x"),
+    (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z"),
+)
+"""Three letters that are angles where all of them are there."""
+UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+"""Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
+VALUE = frozenset({"position", "pos", "angle", "value"})
+"""What may stand behind the name of a joint for its value."""
+
+
+def dialect(name: str) -> Dialect | None:
+    """Return the dialect that a column's name belongs to, where that says its unit."""
+    return next((each for each in DIALECTS if re.fullmatch(each.pattern, name)), None)
+
+
+def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
+    """Return what a name means, with why; without where it is not known.
+
+    >>> from rpim_opt.data.tables.names import recognize
+    >>> [recognize(name).stem for name in ("Measured X", "Joint 3", "quat_w", "Std y")]
+    ['x', 'q3', 'qw', 'sigma_y']
+    """
+    path = [part for part in re.split(r"[/.]", stem.strip().strip("%")) if part]
+    plain = re.sub(r"[\s.\-/:\[\]()]+", "_", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower())).strip("_% ")
+    words = plain.split("_")
+    kind = next((name for name, signs in KINDS.items() if len(words) > 1 and signs & set(words)), "")
+    rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)
+    number, why = _joint_in(path, joints)
+    if number and path[-1] in VALUE | {"effort"}:
+        return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
+    for each in NAMES:
+        match = re.fullmatch(each.pattern, rest)
+        if match:
+            meaning = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(each.meaning))
+            return Reading(meaning, "", each.why, kind)
+    # u(x) is a standard uncertainty, U(x) an expanded one whose coverage factor nobody knows
+    match = re.fullmatch(r"u[\s_(]*([xyzXYZ])\)?", stem.strip())
+    if match:
+        return Reading(f"sigma_{match[1].lower()}", "", "u: standard uncertainty", kind)
+    return Reading(plain, "", "", kind)
+
+
+def _joint_in(path: Sequence[str], joints: Sequence[str]) -> tuple[int, str]:
+    """Return the number of the joint that a path names, and whose name it is; 0 where it names none."""
+    for part in path[:-1]:
+        if part in joints:
+            return joints.index(part) + 1, "a joint of the robot's file"
+        number = ur_joint(part)
+        if number:
+            return number, "a joint of Universal Robots"
+    return 0, ""
+
+
+def ur_joint(name: str) -> int:
+    """Return the number of a joint of Universal Robots, 0 for another name."""
+    name = name.removesuffix("_joint")
+    return UR_JOINTS.index(name) + 1 if name in UR_JOINTS else 0

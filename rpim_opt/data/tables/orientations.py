@@ -1,0 +1,118 @@
+"""Orientations whose columns are numbered: quaternions, matrices row by row, and rotation vectors."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.late import transform
+from rpim_opt.basics.tables import Columns, numbers
+from rpim_opt.data.tables.names import Reading
+
+ORDERS = ("wxyz", "xyzw")
+QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
+MATRIX = re.compile(r"(?:m|t|h|r|mat|matrix|tf|pose)[_ \[(]*([0-4])[_ ,\]\[]*([0-4])[\])]?")
+ENTRIES = re.compile(r"(?:m|t|h|mat|matrix|tf|pose)[_ \[]*(\d{1,2})\]?")
+SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
+"""Rows and columns of a matrix by its number of entries."""
+ROUNDED = 1e-6
+"""The last row of a matrix is 0 0 0 1 within this."""
+Place = tuple[int, int]
+
+
+def numbered(read: dict[str, Reading], table: Columns, dof: int, order: str) -> dict[str, Reading]:
+    """Return readings in which the columns of quaternions (in that order) and matrices have their names."""
+    if order not in ORDERS:
+        raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
+    for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
+        why = f"component {i} of a quaternion, order {order}"
+        read = {**read, name: read[name]._replace(stem=f"q{letter}", why=why)}
+    return {**read, **_matrix(read, table)}
+
+
+def quaternion_columns(read: dict[str, Reading], dof: int) -> list[str]:
+    """Return the four columns of a quaternion whose components are numbered, in order; none where there is none.
+
+    ``q0 ... q3`` are one where other columns are the joints.
+    """
+    found: dict[str, dict[int, str]] = {}
+    for name in read:
+        match = QUATERNION.fullmatch(name.strip().lower())
+        if match:
+            found.setdefault(match[1], {})[int(match[2])] = name
+    for prefix, columns in found.items():
+        if sorted(columns) in ([0, 1, 2, 3], [1, 2, 3, 4]):
+            others = {each.stem for name, each in read.items() if name not in columns.values()}
+            counted = any(all(f"q{i + first}" in others for i in range(dof)) for first in (0, 1))
+            if prefix != "q" or counted:
+                return [columns[i] for i in sorted(columns)]
+    return []
+
+
+def _matrix(read: dict[str, Reading], table: Columns) -> dict[str, Reading]:
+    """Return the readings of a matrix: rotation, position, and its last row, which is checked."""
+    places = _places(read)
+    why = "a matrix, row by row"
+    if len(places) == 16:
+        why = "a matrix, row by row: its last row is 0 0 0 1"
+        if _is_transposed(places, table):
+            places = {name: (j, i) for name, (i, j) in places.items()}
+            why = "a matrix, column by column: its last column is 0 0 0 1"
+    entries = {}
+    for name, (row, column) in places.items():
+        stem = "the last row of a matrix"
+        if row < 3:
+            stem = "xyz"[row] if column == 3 else f"r{row + 1}{column + 1}"
+        entries[name] = read[name]._replace(stem=stem, why=why)
+    return entries
+
+
+def _places(read: dict[str, Reading]) -> dict[str, Place]:
+    """Return the columns of a matrix with their row and column from 0; nothing where there is none."""
+    pairs: dict[str, Place] = {}
+    single: dict[str, int] = {}
+    for name in read:
+        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
+        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
+        if pair:
+            pairs[name] = (int(pair[1]), int(pair[2]))
+        elif alone:
+            single[name] = int(alone[1])
+    first = min((i for i, _ in pairs.values()), default=0)
+    shifted = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
+    if len(pairs) in SHAPES and set(shifted.values()) == set(product(*map(range, SHAPES[len(pairs)]))):
+        return shifted
+    single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
+    ordered = sorted(single, key=lambda name: single[name])
+    if len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1:
+        return {name: divmod(k, 4) for k, name in enumerate(ordered)}
+    return {}
+
+
+def _is_transposed(places: dict[str, Place], table: Columns) -> bool:
+    by_place = {place: name for name, place in places.items()}
+
+    def is_last(last: Sequence[Place]) -> bool:
+        cells = [_numbers(table, by_place[place]) for place in last]
+        return bool(np.abs(np.stack(cells, axis=1) - [0, 0, 0, 1]).max() < ROUNDED)
+
+    if is_last([(3, j) for j in range(4)]):
+        return False
+    if is_last([(i, 3) for i in range(4)]):
+        return True
+    raise InputError("the matrices", "neither a last row nor a last column 0 0 0 1", "4 x 4 transforms")
+
+
+def _numbers(table: Columns, name: str) -> np.ndarray:
+    return numbers(table[name], [str(i) for i in range(1, len(table[name]) + 1)], name)
+
+
+def from_vectors(table: Columns, names: Sequence[str], si: float) -> dict[str, list[str]]:
+    """Return the quaternions ``qw, qx, qy, qz`` of rotation vectors in three columns, whose unit is si [rad]."""
+    vectors = np.column_stack([_numbers(table, name) for name in names])
+    xyzw = transform.Rotation.from_rotvec(si * vectors).as_quat()
+    return {f"q{letter}": [repr(float(v)) for v in xyzw[:, "xyzw".index(letter)]] for letter in "wxyz"}
