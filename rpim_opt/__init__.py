@@ -14,7 +14,7 @@ import lazy_loader
 __version__ = "0.1.0"
 
 _attach, _, _names = lazy_loader.attach_stub(__name__, __file__)
-_FOLDERS = ("basics", "robot", "data", "problem", "convex", "calibration", "store", "use", "report", "study")
+_FOLDERS = ("basics", "robot", "data", "problem", "convex", "bayes", "calibration", "store", "use", "report", "study")
 _NAMESPACES = (*_FOLDERS, "baselines", "constraints", "plot", "select")
 __all__ = sorted(set(_names) - set(_NAMESPACES))
 

@@ -1,4 +1,5 @@
 from . import basics as basics
+from . import bayes as bayes
 from . import calibration as calibration
 from . import convex as convex
 from . import data as data

@@ -1,4 +1,4 @@
-"""Ten folders, in the order of the data flow: each imports those before it, and heavy libraries wait until needed."""
+"""Eleven folders, in the order of the data flow: each imports those before it, heavy libraries wait until needed."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ FLOORS: dict[str, set[str]] = {
     # clarabel, cvxpy: where a problem starts is the optimum of a relaxation, of which the programs above know nothing
     "problem": {"casadi", "clarabel", "cvxpy"},
     "convex": {"clarabel", "cvxpy"},
+    "bayes": set(),
     # casadi: a reflector's transform is a measurement, too; pandas: a data frame, where one is asked for
     "calibration": {"casadi", "pandas"},
     # cattrs: values as JSON and back; pydantic: the schema of problem.toml
@@ -154,7 +155,7 @@ ELSEWHERE = {
     "rpim_opt.calibration.group_weights",
     "rpim_opt.convex.by_rows",
     "rpim_opt.convex.conflict",
-    "rpim_opt.convex.fleet",
+    "rpim_opt.bayes.population",
     "rpim_opt.convex.sentence",
     "rpim_opt.data.tracker",
     "rpim_opt.problem.observability",

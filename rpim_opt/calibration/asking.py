@@ -10,14 +10,14 @@ from typing import Any
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.calibration.learning import learn, with_families
-from rpim_opt.calibration.loop import require_finite
+from rpim_opt.bayes.learning import learn, with_families
+from rpim_opt.bayes.prior import Prior
+from rpim_opt.calibration.loop import nearby, require_finite, require_start
 from rpim_opt.calibration.outcome import Iteration
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.weighed import calibrated, require_passes
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.convex.named import formulation_of, weight_of
-from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.select import Selector
 from rpim_opt.problem.frames import relocated
 from rpim_opt.problem.source import Source
@@ -31,6 +31,8 @@ NOISE = {
 """Parts of the noise that are learned: the robot's beside the instrument as declared, that at a level of its own, one
 level for all, or none."""
 MODELS = ("geometry", "auto")
+ROUGHLY = 1e-3
+"""Tolerance of fits between two estimates of hyperparameters: the last fit is exact."""
 ELSEWHERE = " Frames were stated far from where the data put them; their deviations count from there."
 
 
@@ -137,20 +139,22 @@ def calibrate(
     require_passes(max_iterations)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
-    if start is None:
+    if start is not None:
+        start = require_start(start, len(problem.parameters.free))
+    else:
         elsewhere = relocated(problem)
     problem = elsewhere or problem
     if weight is None and formulation.penalty is None:
         weight = 0.0
     believed = prior or Prior()
     if weight is None:
-        found = learn(problem, believed, model, start, kinds)
+        found = learn(problem, believed, model, start, kinds, _refit)
         formulation = believed.penalized(formulation, found.stated)
         result = calibrated(found.problem, formulation, 1.0, start=found.x, **how)
         result = replace(result, learned=found.learned)
     else:
         if model == "auto":
-            problem = with_families(problem, learn(problem, believed, model, start, kinds))
+            problem = with_families(problem, learn(problem, believed, model, start, kinds, _refit))
         if prior is not None:
             formulation = prior.penalized(formulation, prior.stated(problem.parameters, widened=False))
         result = calibrated(problem, formulation, weight, start=start, **how)
@@ -158,6 +162,11 @@ def calibrate(
     if elsewhere is not None:
         message += ELSEWHERE
     return replace(result, message=message, asked=asked)
+
+
+def _refit(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:
+    """Return deviations (n,) [SI] near a minimum at weight 1: what hyperparameters need between two linearizations."""
+    return nearby(problem, formulation, 1.0, start, ROUGHLY, steps)
 
 
 def _noise(noise: str, model: str) -> tuple[str, ...]:

@@ -13,7 +13,6 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.trust import RARE, Trusted, outlying, trusted_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
-from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.source import Source
 
 
@@ -94,17 +93,3 @@ def held(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
         gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
         found.append(Held(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
     return tuple(sorted(found, key=lambda h: -h.gain))
-
-
-def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
-    """Return measured minus modelled position of every row (N, 3) [m] at deviations x (n,); NaN where none was."""
-    start = 0
-    vectors = np.full((len(problem.data), 3), np.nan)
-    residual = problem.residual(x)
-    for block in problem.data.blocks:
-        names = list(block.measurement.components)
-        part = residual[start : start + len(block.row) * len(names)].reshape(-1, len(names))
-        start += part.size
-        if {"x", "y", "z"} <= set(names):
-            vectors[block.row] = part[:, [names.index(axis) for axis in "xyz"]]
-    return vectors

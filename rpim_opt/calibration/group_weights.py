@@ -11,15 +11,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.bayes.group_weights import Grouped, GroupSelector, Members, members, rule_of
+from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.weighed import calibrated
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.groups import Grouped, Members, members
-from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.program import pose
-from rpim_opt.convex.select_groups import GroupSelector, rule_of
 from rpim_opt.convex.selection import Selection
-from rpim_opt.convex.stated import Stated
 from rpim_opt.problem.frames import relocated
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.source import Source

@@ -10,11 +10,11 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.bayes.comparison import Comparison
+from rpim_opt.bayes.learning import sampled
 from rpim_opt.calibration.asking import calibrate
-from rpim_opt.calibration.compared import Comparison
 from rpim_opt.calibration.lack_numbers import LeftOver
 from rpim_opt.calibration.lack_words import UNITS, sentences
-from rpim_opt.calibration.learning import sampled
 from rpim_opt.calibration.left_over import (
     FEWEST,
     PATTERNS,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rpim_opt.basics.text import joined
-from rpim_opt.calibration.learned import Learned, Size
-from rpim_opt.convex.prior import BASE, SESSIONS
+from rpim_opt.bayes.hyperparameters import Learned, Size
+from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.robot.family import EXPECTED
 from rpim_opt.robot.overlay import is_joint_offset
 from rpim_opt.robot.parameter_names import EXPANSION, of_session, own_name

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.comparison import OWNED, SPEAK, Comparison, Judged
+from rpim_opt.bayes.model_selection import SESSIONS, TURNED, WARMTH
+from rpim_opt.bayes.prior import family_of
 from rpim_opt.calibration.alike import Alike, alike
-from rpim_opt.calibration.compared import OWNED, SPEAK, Comparison, Judged
-from rpim_opt.calibration.families import SESSIONS, TURNED, WARMTH
-from rpim_opt.convex.prior import family_of
 from rpim_opt.problem.loads import measured_torques, repeatable
 from rpim_opt.problem.problem import CalibrationProblem
 

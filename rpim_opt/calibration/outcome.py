@@ -12,9 +12,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
+from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
+from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration import diagnosis
-from rpim_opt.calibration.accused import contradicted
-from rpim_opt.calibration.blunders import coherent
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
 from rpim_opt.calibration.intervals import (
@@ -27,7 +28,6 @@ from rpim_opt.calibration.intervals import (
     row_freedom,
     scattered,
 )
-from rpim_opt.calibration.learned import Learned, sessions_spread
 from rpim_opt.calibration.prices import Price, prices
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
 from rpim_opt.calibration.spread import Spread
@@ -36,7 +36,6 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.select import Selection
-from rpim_opt.convex.stated import default_widths
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, position
@@ -370,7 +369,7 @@ class Outcome:
             source, x = self._nominal
         if data is not None:
             source = source.on(data)
-        return np.concatenate([diagnosis.error_vectors(part, x) for part in source.rows()])
+        return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
         """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.learned import Size
+from rpim_opt.bayes.hyperparameters import Size
 from rpim_opt.calibration.learned_words import VAGUE
 from rpim_opt.calibration.region import Region
 from rpim_opt.calibration.result import Calibration

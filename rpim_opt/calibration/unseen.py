@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.hyperparameters import sessions_spread
 from rpim_opt.calibration.intervals import coverage_factors, row_freedom, scattered
-from rpim_opt.calibration.learned import sessions_spread
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset

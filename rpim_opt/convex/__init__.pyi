@@ -2,7 +2,6 @@ from . import constraints as constraints
 from . import select as select
 from .constraints import in_ball as in_ball
 from .constraints import within_tolerance as within_tolerance
-from .fleet import Fleet as Fleet
 from .formulation import Formulation as Formulation
 from .formulation import bounded as bounded
 from .formulation import group_lasso as group_lasso
@@ -15,7 +14,6 @@ from .formulation import sum_of_norms as sum_of_norms
 from .formulation import tikhonov as tikhonov
 from .given import Given as Given
 from .given import given as given
-from .prior import Prior as Prior
 from .program import Estimate as Estimate
 from .program import Program as Program
 from .program import pose as pose
@@ -30,5 +28,4 @@ from .select_scores import ncp as ncp
 from .select_scores import quasi_optimality as quasi_optimality
 from .select_scores import reml as reml
 from .select_scores import robust_gcv as robust_gcv
-from .stated import Stated as Stated
 from .unknown import Unknown as Unknown

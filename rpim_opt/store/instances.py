@@ -14,13 +14,13 @@ from rpim_opt.basics.files import sha256_of
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.shown import Tabled, shortened
 from rpim_opt.basics.units import UNITS
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import asking
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import Box, Constraint
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
-from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement

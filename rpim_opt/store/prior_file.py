@@ -14,9 +14,9 @@ from rpim_opt.basics.files import Table, read_json, write_json
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.patterns import fits
 from rpim_opt.basics.units import split_unit
-from rpim_opt.convex.prior import Prior
-from rpim_opt.convex.stated import FRAMES
-from rpim_opt.convex.stated import JOINT_OFFSET as FACTOR
+from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import FRAMES
+from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.data.models import Measurement
 from rpim_opt.robot.overlay import JOINT_OFFSET, is_joint_offset
 from rpim_opt.robot.parameters import Parameters
@@ -38,7 +38,7 @@ def save_prior(prior: Prior, path: str | Path) -> None:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> prior = ro.convex.Prior(tails=5.0) & ro.convex.Prior.known("a2 + a3 +- 0.05 mm")
+    >>> prior = ro.bayes.Prior(tails=5.0) & ro.bayes.Prior.known("a2 + a3 +- 0.05 mm")
     >>> ro.store.save_prior(prior, "prior.json")
     >>> ro.store.load_prior("prior.json") == prior
     True
@@ -65,7 +65,7 @@ def load_prior(path: str | Path) -> Prior:
     --------
     >>> import numpy as np
     >>> import rpim_opt as ro
-    >>> ro.store.save_prior(ro.convex.Prior(tails=np.inf, scale={"theta?_mrad": 8.0}), "prior.json")
+    >>> ro.store.save_prior(ro.bayes.Prior(tails=np.inf, scale={"theta?_mrad": 8.0}), "prior.json")
     >>> ro.store.load_prior("prior.json").tails
     inf
     """

@@ -16,15 +16,15 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.basics.statistics import statistics
+from rpim_opt.bayes.hyperparameters import Learned
+from rpim_opt.bayes.prior_terms import believed
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held
-from rpim_opt.calibration.learned import Learned
 from rpim_opt.calibration.prices import Price
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
 from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM
-from rpim_opt.convex.believed import believed
 from rpim_opt.convex.formulation import Formulation, huber, lost
 from rpim_opt.convex.posed import Unposed
 from rpim_opt.convex.program import Program, pose

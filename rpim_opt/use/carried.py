@@ -11,11 +11,11 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.prior import Prior
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import fdtrc, logsumexp
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.stated import default_widths
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.robot.overlay import is_joint_offset

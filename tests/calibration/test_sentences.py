@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import learned_words
 from rpim_opt.calibration.acceptance import Acceptance, _wide
 from rpim_opt.calibration.alike import Alike, alike
@@ -17,7 +18,6 @@ from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.checked import Checked
 from rpim_opt.calibration.intervals import checked as interval
 from rpim_opt.calibration.lack_of_fit import LackOfFit
-from rpim_opt.calibration.learned import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration.left_over import Effect
 from rpim_opt.calibration.reaching import Share, share
 from rpim_opt.data.requirement import Requirement

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes.prior import Prior, family_of
 from rpim_opt.convex.combination import combination
-from rpim_opt.convex.prior import Prior, family_of
 from tests.convex.test_formulation import model
 
 MODEL = model()

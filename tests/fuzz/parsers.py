@@ -222,7 +222,7 @@ def _parameters() -> Any:
 
 def stated(data: bytes, folder: Path) -> None:
     """Read what is known of parameters."""
-    prior = ro.convex.Prior.known(_sentence(data))
+    prior = ro.bayes.Prior.known(_sentence(data))
     found = prior.stated(_parameters())
     require(bool(np.isfinite(found.rows).all()) and bool(np.isfinite(found.values).all()), "finite rows")
     path = folder / "prior.json"

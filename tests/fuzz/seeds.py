@@ -124,7 +124,7 @@ def _results() -> list[str]:
 
 
 def _priors() -> list[str]:
-    prior = ro.convex.Prior(tails=5.0, scale={"theta?_mrad": 8.0}) & ro.convex.Prior.known("a2 + a3 +- 0.05 mm")
+    prior = ro.bayes.Prior(tails=5.0, scale={"theta?_mrad": 8.0}) & ro.bayes.Prior.known("a2 + a3 +- 0.05 mm")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "prior.json"
         ro.store.save_prior(prior, path)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.blunders import clustered, ratios
-from rpim_opt.calibration.sizing import Learning
-from rpim_opt.convex.prior import Prior
+from rpim_opt.bayes.hyperparameters import Learning
+from rpim_opt.bayes.outliers import clustered, ratios
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.contact import KnownAngle, KnownDistance, touches, with_known
 from rpim_opt.problem.scatter import Scatter, stacked
 from rpim_opt.problem.touched import Plane

@@ -201,7 +201,7 @@ def test_sessions_are_a_component_of_their_own_size() -> None:
         for name in names
     ]
     apart = instance.problem.on(data).with_model(ro.Model(terms))
-    with_sessions = ro.calibrate(apart, prior=ro.convex.Prior(groups=["noon_* evening_* night_*"]))
+    with_sessions = ro.calibrate(apart, prior=ro.bayes.Prior(groups=["noon_* evening_* night_*"]))
     without = ro.calibrate(instance.problem.on(data))
     first = dict.fromkeys(names, np.zeros(len(instance.validation)))
     y = instance.validation.blocks[0].y

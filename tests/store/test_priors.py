@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import Prior
+from rpim_opt.bayes import Prior
 from tests import ROOT
 
 FOLDER = ROOT / "problems" / "position"

@@ -1,24 +1,24 @@
-"""The evidence of families at a result, whatever its weight: with what it identifies, without, and with more."""
+"""Evidence of model extensions at a result, whatever its weight: without them, and with more."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
+from typing import Protocol
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.blunders import clustered
-from rpim_opt.calibration.families import SESSIONS, WARMTH, members
-from rpim_opt.calibration.learned import Learned
-from rpim_opt.calibration.learning import sampled
-from rpim_opt.calibration.models import compared, extended, restricted, size_names
-from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.sizing import Learning, sides
-from rpim_opt.convex.evidence import CENTRES, Evidence, Point
-from rpim_opt.convex.prior import Prior, family_of
+from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
+from rpim_opt.bayes.hyperparameters import Learned, Learning, sides
+from rpim_opt.bayes.learning import sampled
+from rpim_opt.bayes.model_selection import SESSIONS, WARMTH, compared, extended, members, restricted, size_names
+from rpim_opt.bayes.outliers import clustered
+from rpim_opt.bayes.prior import Prior, family_of
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
 
 SPEAK = 10.0
 """By how much -2 ln L must fall for a family to be spoken of: 4 is what a false pick gains, 10 none in many."""
@@ -34,6 +34,39 @@ OWNED = {
 """Families whose worth is asked, and what stands for them."""
 KNOWN = Prior(joint_offset=1.0, frames=1.0)
 """What is believed once scales were learned: they are as the problem says."""
+
+
+class Flagged(Protocol):
+    """A row that a fit distrusts."""
+
+    @property
+    def label(self) -> str:
+        """Of the row."""
+        ...
+
+
+class Outcome(Protocol):
+    """What is asked of a result: a `Calibration` has it."""
+
+    @property
+    def problem(self) -> Source:
+        """What was asked."""
+        ...
+
+    @property
+    def x(self) -> Array:
+        """(n,) deviations [SI]."""
+        ...
+
+    @property
+    def learned(self) -> Learned | None:
+        """The hyperparameters, where they were estimated."""
+        ...
+
+    @cached_property
+    def flagged(self) -> Sequence[Flagged]:
+        """Rows that the fit distrusts."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

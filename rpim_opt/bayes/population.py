@@ -1,4 +1,4 @@
-"""What several arms of one type tell of the next: offsets that they share, and how far each parameter spreads."""
+"""Population prior: what several robots of one type have in common, by empirical Bayes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,96 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.convex.posterior import Result, of_data
-from rpim_opt.convex.shared import Arm, Learned, learned
-from rpim_opt.convex.stated import default_widths
-from rpim_opt.convex.statement import FAR
+from rpim_opt.bayes.prior_terms import default_widths
+from rpim_opt.bayes.statements import FAR, Result, of_data
 from rpim_opt.robot.parameters import Parameters
+
+SHRUNKEN = 3.0
+"""As many arms the spread that all parameters have in common counts for."""
+EVEN = 1.0
+"""Where nothing is known: the mean square of what arms share, over that of what is their own."""
+HELD = 2.0
+"""As many parameters that counts for."""
+PASSES, SETTLED = 1000, 1e-6
+"""Of expectation and maximization; relative change of the variances that ends them."""
+SIZES = np.geomspace(0.03, 30.0, 41)
+"""By which a prior may be too narrow or too wide, when arms are held against it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """What the data of one arm say: ``rows u - values ~ N(0, I)`` of deviations u in generic widths.
+
+    ``rows`` (p, p), ``values`` (p,).
+    """
+
+    label: str
+    rows: Array
+    values: Array
+
+    def evidence(self, centre: Array, width: Array) -> float:
+        """Return -2 ln likelihood of a prior of that centre and width (p,), at the size that fits best."""
+        residual = self.values - self.rows @ centre
+        spread = (self.rows * width**2) @ self.rows.T
+        d, Q = np.linalg.eigh(spread)
+        r2 = (Q.T @ residual) ** 2
+        total = 1 + SIZES[:, None] ** 2 * np.maximum(d, 0)
+        return float(np.min(np.sum(np.log(total) + r2 / total, axis=1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Centre and width (p,) of another arm, in generic widths, and the part of the mean square that arms share."""
+
+    centre: Array
+    width: Array
+    share: float
+
+
+def learned(arms: Sequence[Arm]) -> Learned:
+    """Return what arms tell of another one, by expectation and maximization.
+
+    >>> import numpy as np
+    >>> from rpim_opt.bayes.population import Arm, learned
+    >>> rng = np.random.default_rng(0)
+    >>> deviations = np.array([1.0, -1.0]) + 0.1 * rng.standard_normal((50, 2))
+    >>> found = learned([Arm("", 1e3 * np.eye(2), 1e3 * each) for each in deviations])
+    >>> found.centre.round(1), found.width.round(1), round(found.share, 2)
+    (array([ 1., -1.]), array([0.1, 0.1]), 0.98)
+    """
+    P = np.array([arm.rows.T @ arm.rows for arm in arms])
+    q = np.array([arm.rows.T @ arm.values for arm in arms])
+    K, n = q.shape
+    s2 = np.full(n, 1 / (1 + EVEN))
+    tau2, ratio = 1 / (1 + EVEN), EVEN
+    for _ in range(PASSES):
+        m, C_m, d2 = _expected(P, q, s2, ratio)
+        m2 = m**2 + np.diag(C_m)
+        before = np.append(s2, ratio)
+        s2 = (SHRUNKEN * tau2 + d2.sum(axis=0) + m2 / ratio) / (SHRUNKEN + K + 1)
+        tau2 = (n + HELD) / (np.sum(1 / s2) + HELD * (1 + EVEN))
+        ratio = (float(np.sum(m2 / s2)) + HELD * EVEN) / (n + HELD)
+        if np.max(np.abs(np.append(s2, ratio) / before - 1)) <= SETTLED:
+            break
+    m, C_m, _ = _expected(P, q, s2, ratio)
+    return Learned(m, np.sqrt(s2 + np.diag(C_m)), ratio / (1 + ratio))
+
+
+def _expected(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Array, Array]:
+    """Return mean (n,) and covariance (n, n) of what arms share, and mean squares (K, n) of what is their own."""
+    n = len(s2)
+    s = np.sqrt(s2)
+    eye = np.eye(n)
+    left = np.linalg.inv(eye + s[:, None] * P * s)  # in units of s: what the data leave open of an arm's own part
+    H = (eye - left) / np.outer(s, s)
+    h = np.einsum("kij,kj->ki", left, s * q) / s
+    C_m = np.linalg.inv(H.sum(axis=0) + np.diag(1 / (ratio * s2)))
+    m = C_m @ h.sum(axis=0)
+    C = left * np.outer(s, s)
+    own = np.einsum("kij,kj->ki", C, q + m / s2) - m
+    turned = C / s2 - eye
+    variance = np.einsum("kii->ki", C) + np.einsum("kij,jl,kil->ki", turned, C_m, turned)
+    return m, C_m, own**2 + variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +132,7 @@ class Fleet:
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> halves = [problem.on(problem.data.take(rows)) for rows in (np.arange(20), np.arange(20, 40))]
-    >>> fleet = ro.convex.Fleet.of([ro.calibrate(half, ro.tikhonov, ro.reml) for half in halves])  # the same arm twice
+    >>> fleet = ro.bayes.Fleet.of([ro.calibrate(half, ro.tikhonov, ro.reml) for half in halves])  # the same arm twice
     >>> fleet.share > 0.9, fleet.centre.shape, fleet.width.shape, bool((fleet.gain > 0).all())
     (True, (25,), (25,), True)
     """
@@ -76,7 +161,7 @@ class Fleet:
         --------
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> print(str(ro.convex.Fleet.of({"left": result, "right": result})).splitlines()[0])
+        >>> print(str(ro.bayes.Fleet.of({"left": result, "right": result})).splitlines()[0])
         2 arms share 100 % of their mean square deviation.
         """
         named = _named(results)
@@ -131,7 +216,7 @@ class Fleet:
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> centre, width = ro.convex.Fleet.of([result, result]).tables()
+        >>> centre, width = ro.bayes.Fleet.of([result, result]).tables()
         >>> list(centre)[:2], centre.keys() == width.keys()
         (['alpha1_rad', 'a1_m'], True)
         """

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.groups import Grouped, members
-from rpim_opt.convex.select_groups import (
+from rpim_opt.bayes.group_weights import (
+    Grouped,
     distance,
     held_out,
     k_fold_groups,
+    members,
     minimum_distance,
     reml_groups,
     restricted_likelihood,

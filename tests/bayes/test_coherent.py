@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.blunders import coherent
+from rpim_opt.bayes.outliers import coherent
 from tests.simulate import simulated
 
 SIGMA = 5e-5

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes import Prior
+from rpim_opt.bayes.group_weights import Grouped, members, reml_groups
 from rpim_opt.calibration.group_weights import grouped
-from rpim_opt.convex import Prior
-from rpim_opt.convex.groups import Grouped, members
-from rpim_opt.convex.select_groups import reml_groups
 
 POSITION = ro.load("position")
 PROBLEM = POSITION.problem

@@ -1,4 +1,4 @@
-"""What the data say of sizes, noise, families and blunders, laid into an ordinary problem."""
+"""Empirical Bayes: hyperparameters, model extensions and outliers of one problem."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.blunders import beyond, suspected, unbelievable
-from rpim_opt.calibration.doubts import doubts
-from rpim_opt.calibration.learned import Learned, LeftOut, Size, Trial
-from rpim_opt.calibration.loop import require_start
-from rpim_opt.calibration.models import modelled
-from rpim_opt.calibration.sizing import Fit, Learning
-from rpim_opt.convex.evidence import Evidence, Point
-from rpim_opt.convex.prior import Prior
-from rpim_opt.convex.stated import Stated
+from rpim_opt.bayes.evidence import Evidence, Point
+from rpim_opt.bayes.hyperparameters import Fit, Learned, Learning, LeftOut, Refit, Size, Trial, doubts
+from rpim_opt.bayes.model_selection import modelled
+from rpim_opt.bayes.outliers import beyond, suspected, unbelievable
+from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.frames import settled
 from rpim_opt.problem.problem import CalibrationProblem
@@ -59,7 +56,7 @@ class Found:
     x: Array
 
 
-def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise: Sequence[str]) -> Found:
+def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise: Sequence[str], refit: Refit) -> Found:
     """Return what the data say of sizes, noise, families and blunders.
 
     Parameters
@@ -74,17 +71,19 @@ def learn(problem: Source, prior: Prior, model: str, start: Array | None, noise:
         (n,) where to begin [SI], or None.
     noise
         Parts of the scatter that are looked for.
+    refit
+        As for `Learning`.
     """
     try:
-        return _found(problem, prior, model, start, tuple(noise))
+        return _found(problem, Learning(prior, tuple(noise), refit), model, start)
     except np.linalg.LinAlgError:
         found = "equations, scales and noise too far apart for sizes to be learned"
         raise InputError("data", found, "their units looked at, or a weight") from None
 
 
-def _found(problem: Source, prior: Prior, model: str, start: Array | None, noise: tuple[str, ...]) -> Found:
+def _found(problem: Source, learning: Learning, model: str, start: Array | None) -> Found:
     every = sampled(problem)
-    learning, whole, doubt = _believed(every, prior, noise, _begin(every, start))
+    learning, whole, doubt = _believed(every, learning, _begin(every, start))
     fit, trials, blunders = _without_blunders(every, learning, whole, model)
     laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
@@ -120,15 +119,13 @@ def _without_blunders(
     return fit, trials, blunders
 
 
-def _believed(
-    every: CalibrationProblem, prior: Prior, noise: tuple[str, ...], x: Array
-) -> tuple[Learning, Fit, tuple[str, ...]]:
+def _believed(every: CalibrationProblem, learning: Learning, x: Array) -> tuple[Learning, Fit, tuple[str, ...]]:
     """Return how sizes are found and what they are; a doubted prior is left out where the evidence is against it."""
-    learning = Learning(prior, noise)
+    prior = learning.prior
     whole = learning.fitted(every, x, None, ROUNDS)
     if not prior.doubted:
         return learning, whole, ()
-    plain = Learning(prior.without_centre(), noise)
+    plain = replace(learning, prior=prior.without_centre())
     without = plain.fitted(every, x, None, ROUNDS)
     fall = without.point.value - whole.point.value
     if fall >= ASKED:
@@ -161,7 +158,7 @@ def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
     """Return where to linearize first: frames where the data put them, the robot as on its drawing."""
     p = problem.parameters
     if start is not None:
-        return require_start(start, len(p.free))
+        return start
     x = np.zeros(len(p.free))
     frames = p.placed & p.identified
     if frames.any():  # those stated far from there count from there already

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import Prior
-from rpim_opt.convex.posterior import of_data
+from rpim_opt.bayes import Prior
+from rpim_opt.bayes.statements import of_data
 from rpim_opt.problem.linear import LinearModel
 
 PROBLEM = ro.load("position").problem

@@ -1,4 +1,4 @@
-"""A prior: what is believed of the deviations before the data are seen."""
+"""The prior: what is assumed of the deviations before the data are seen."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.patterns import fits
-from rpim_opt.convex import statement
-from rpim_opt.convex.believed import penalized
+from rpim_opt.bayes import statements
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths, penalized
+from rpim_opt.bayes.statements import Result, Statement, posterior
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.posterior import Result, posterior
-from rpim_opt.convex.stated import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths
-from rpim_opt.convex.statement import Statement
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.overlay import Overlay, is_joint_offset
 from rpim_opt.robot.parameter_names import MDH_DIMENSION, of_session, own_name
@@ -76,7 +74,7 @@ class Prior:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> Prior = ro.convex.Prior
+    >>> Prior = ro.bayes.Prior
     >>> prior = Prior(scale={"theta?_mrad": 10.0}) & Prior.known("a2 + a3 +- 0.05 mm")
     >>> stated = prior.stated(ro.load("position").problem.parameters)
     >>> float(stated.scale.max()), len(stated.values), stated.names  # frames, statements, groups
@@ -125,11 +123,11 @@ class Prior:
         Examples
         --------
         >>> import rpim_opt as ro
-        >>> one = ro.convex.Prior.known("a2 + a3 = nominal +- 0.05 mm")
+        >>> one = ro.bayes.Prior.known("a2 + a3 = nominal +- 0.05 mm")
         >>> float(one.stated(ro.load("position").problem.parameters).rows.max())  # scale 0.5 mm
         10.0
         """
-        return cls(statements=(statement.known(text, value, sd),))
+        return cls(statements=(statements.known(text, value, sd),))
 
     @classmethod
     def gaussian(
@@ -159,12 +157,12 @@ class Prior:
         Examples
         --------
         >>> import rpim_opt as ro
-        >>> prior = ro.convex.Prior.gaussian({"a2_mm": 0.3, "a3_mm": 0.0}, [[0.04, 0.03], [0.03, 0.04]])
+        >>> prior = ro.bayes.Prior.gaussian({"a2_mm": 0.3, "a3_mm": 0.0}, [[0.04, 0.03], [0.03, 0.04]])
         >>> stated = prior.stated(ro.load("position").problem.parameters)
         >>> int(stated.replaced.sum()), stated.rows.shape
         (2, (2, 34))
         """
-        return cls(statements=(statement.gaussian(dict(mean), covariance, precision, sd),))
+        return cls(statements=(statements.gaussian(dict(mean), covariance, precision, sd),))
 
     @classmethod
     def from_result(
@@ -204,7 +202,7 @@ class Prior:
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
         >>> first, second = (problem.on(problem.data.take(rows)) for rows in (np.arange(30), np.arange(30, 40)))
-        >>> prior = ro.convex.Prior.from_result(ro.calibrate(first, ro.tikhonov, ro.reml), without=("base_*",))
+        >>> prior = ro.bayes.Prior.from_result(ro.calibrate(first, ro.tikhonov, ro.reml), without=("base_*",))
         >>> stated = prior.stated(problem.parameters)
         >>> int(stated.replaced.sum()), stated.rows.shape
         (28, (28, 34))
@@ -233,12 +231,12 @@ class Prior:
         --------
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> prior = ro.convex.Prior.from_fleet([result, result, result])
+        >>> prior = ro.bayes.Prior.from_fleet([result, result, result])
         >>> stated = prior.stated(result.problem.parameters)
         >>> bool(stated.centre.any()), bool(stated.heavy.any()), len(stated.rows)
         (True, True, 0)
         """
-        from rpim_opt.convex.fleet import Fleet
+        from rpim_opt.bayes.population import Fleet
 
         centre, width = Fleet.of(results).tables()
         return cls(centre=centre, scale=width, doubted=True)
@@ -265,8 +263,8 @@ class Prior:
         """Return the same without centre and scale.
 
         >>> import rpim_opt as ro
-        >>> prior = ro.convex.Prior(centre={"d5_mm": 0.5}, tails=5.0)
-        >>> prior.without_centre() == ro.convex.Prior(tails=5.0)
+        >>> prior = ro.bayes.Prior(centre={"d5_mm": 0.5}, tails=5.0)
+        >>> prior.without_centre() == ro.bayes.Prior(tails=5.0)
         True
         """
         return replace(self, centre={}, scale={}, doubted=False)
@@ -292,7 +290,7 @@ class Prior:
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters
-        >>> stated = ro.convex.Prior(centre={"d5_mm": 0.5}).stated(parameters)
+        >>> stated = ro.bayes.Prior(centre={"d5_mm": 0.5}).stated(parameters)
         >>> stated.centre[stated.centre != 0], sorted(set(stated.scale.tolist()))  # joints, joint offsets, frames
         (array([1.]), [1.0, 3.0, 10.0])
         """
@@ -342,7 +340,7 @@ class Prior:
         --------
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
-        >>> prior = ro.convex.Prior.known("a2 + a3 = nominal + 0.3 +- 0.001 mm")
+        >>> prior = ro.bayes.Prior.known("a2 + a3 = nominal + 0.3 +- 0.001 mm")
         >>> mine = prior.penalized(ro.tikhonov, prior.stated(problem.parameters))
         >>> result = ro.calibrate(problem, mine, weight=1.0)
         >>> names = problem.parameters.free.names
@@ -397,7 +395,7 @@ class Prior:
 def family_of(name: str) -> str:
     """Return the family of a term of a joint that is not its geometry: ``ecc`` of ``ecc_cos3``.
 
-    >>> from rpim_opt.convex.prior import family_of
+    >>> from rpim_opt.bayes.prior import family_of
     >>> [family_of(name) for name in ("compliance2", "ecc_sin3", "ecc2_cos1", "ratio6")]
     ['compliance', 'ecc', 'ecc2', 'ratio']
     """

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.tails import WIDEST, added
+from rpim_opt.bayes.evidence import WIDEST, added
 
 
 def field(H: Array, h: Array, size: Array, tails: float) -> tuple[Array, Array, Array]:

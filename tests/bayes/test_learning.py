@@ -9,9 +9,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.blunders import clustered, ratios, resistant, suspected, unbelievable
-from rpim_opt.calibration.learning import MOST, sampled
-from rpim_opt.calibration.sizing import Learning
+from rpim_opt.bayes.hyperparameters import Learning
+from rpim_opt.bayes.learning import MOST, sampled
+from rpim_opt.bayes.outliers import clustered, ratios, resistant, suspected, unbelievable
 
 POSITION = ro.load("position").problem
 
@@ -35,7 +35,7 @@ def measured(
 def drawn(seed: int, size: float = 0.5) -> Array:
     """Return deviations as they are expected, frames as the problem has them."""
     free = POSITION.parameters.free
-    stated = ro.convex.Prior().stated(POSITION.parameters)
+    stated = ro.bayes.Prior().stated(POSITION.parameters)
     z = size * np.random.default_rng(seed).normal(size=len(free)) * stated.scale
     return np.where(stated.heavy, z, 0.1 * z) * free.scale
 
@@ -210,7 +210,7 @@ def test_fewer_equations_than_parameters_are_said() -> None:
 
 def test_a_known_combination_holds() -> None:
     names = POSITION.parameters.free.names
-    known = ro.convex.Prior.known("a2 + a3 = nominal + 0.4 +- 0.0001 mm")
+    known = ro.bayes.Prior.known("a2 + a3 = nominal + 0.4 +- 0.0001 mm")
     result = ro.calibrate(POSITION, prior=known)
     total = result.x[names.index("a2")] + result.x[names.index("a3")]
     assert 1e3 * total == pytest.approx(0.4, abs=1e-3)
@@ -224,12 +224,12 @@ def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> N
     free = POSITION.parameters.free
     robot = ~free.of_frames
 
-    def told(deviations: Array) -> ro.convex.Prior:
+    def told(deviations: Array) -> ro.bayes.Prior:
         unit = {"length": ("_m", 1.0), "angle": ("_rad", 1.0)}
         names = [name + unit[d][0] for name, d in zip(free.names, free.dimensions, strict=True)]
         centre = {name: float(v) for name, v, own in zip(names, deviations, robot, strict=True) if own}
         width = {name: 0.2 * float(v) for name, v, own in zip(names, free.scale, robot, strict=True) if own}
-        return ro.convex.Prior(centre=centre, scale=width, doubted=True)
+        return ro.bayes.Prior(centre=centre, scale=width, doubted=True)
 
     right, wrong = (ro.calibrate(few, prior=told(each)) for each in (x, -3 * x))
     plain = ro.calibrate(few)
@@ -378,7 +378,7 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
     result = ro.calibrate(few)
     learned = result.learned
     assert learned is not None
-    learning = Learning(ro.convex.Prior(), tuple(learned.noise))
+    learning = Learning(ro.bayes.Prior(), tuple(learned.noise))
     fit = learning.fitted(
         few, result.x, np.log([s.value for s in (*learned.sizes.values(), *learned.noise.values())]), 1
     )
@@ -401,7 +401,7 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
 
 
 def test_sizes_agree_with_the_deviations_that_they_lead_to() -> None:
-    learning = Learning(ro.convex.Prior(), ("position",))
+    learning = Learning(ro.bayes.Prior(), ("position",))
     fit = learning.fitted(POSITION, np.zeros(len(POSITION.parameters.free)), None, 8)
     again = learning.fitted(POSITION, fit.x, fit.point.logs, 1)
     assert np.abs(again.point.logs - fit.point.logs).max() < 0.02

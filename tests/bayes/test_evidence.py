@@ -13,8 +13,7 @@ from scipy.stats import multivariate_normal
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.sizing import Learning
-from rpim_opt.convex.evidence import (
+from rpim_opt.bayes.evidence import (
     APART,
     BASE_SD,
     CENTRES,
@@ -27,7 +26,8 @@ from rpim_opt.convex.evidence import (
     Point,
     alike,
 )
-from rpim_opt.convex.prior import Prior
+from rpim_opt.bayes.hyperparameters import Learning
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.problem.scatter import Stack
 
 NOISE = ("position", "orientation", "joint")
@@ -360,7 +360,7 @@ def test_a_gibbs_sampler_agrees() -> None:
     few = problem.on(problem.data.configurations(15, 0))
     result = ro.calibrate(few)
     free = few.parameters.free
-    stated = ro.convex.Prior().stated(few.parameters)
+    stated = ro.bayes.Prior().stated(few.parameters)
     unit = free.scale * stated.scale
     J = result.problem.jacobian(result.x) * unit
     y = few.residual(result.x) + result.problem.jacobian(result.x) @ result.x

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 POSITION = ro.load("position").problem
 FREE = POSITION.parameters.free
-STATED = ro.convex.Prior().stated(POSITION.parameters)
+STATED = ro.bayes.Prior().stated(POSITION.parameters)
 DECLARED, SCATTER = 3e-5, 1e-4
 SHARED, FRAMES = 0.8, 0.02
 FLEETS, ARMS, NEXT = 8, 6, 2
@@ -57,7 +57,7 @@ def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
             own = np.where(STATED.heavy, common + np.sqrt(1 - SHARED) * own, own)
         return own * unit
 
-    fleet = ro.convex.Prior.from_fleet([ro.calibrate(measured(arm(True), 25, SCATTER, (seed, k))) for k in range(ARMS)])
+    fleet = ro.bayes.Prior.from_fleet([ro.calibrate(measured(arm(True), 25, SCATTER, (seed, k))) for k in range(ARMS)])
     for kind, alike in OTHERS.items():
         for k in range(NEXT):
             truth = arm(alike)

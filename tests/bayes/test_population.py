@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import rpim_opt as ro
-from rpim_opt.convex import Fleet, Prior
-from rpim_opt.convex.shared import EVEN, SIZES, Arm, _expected, learned
+from rpim_opt.bayes import Fleet, Prior
+from rpim_opt.bayes.population import EVEN, SIZES, Arm, _expected, learned
 
 n = 12
 

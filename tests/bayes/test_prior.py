@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import Prior
+from rpim_opt.bayes import Prior
+from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.convex.combination import combination
-from rpim_opt.convex.stated import FIXED
 from rpim_opt.convex.structure import quadratic
 
 PROBLEM = ro.load("position").problem

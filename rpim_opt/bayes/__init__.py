@@ -1,0 +1,5 @@
+"""Priors and hyperparameters: marginal likelihood, variance components, model selection, outliers."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
