@@ -72,7 +72,8 @@ class Grouped:
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> model = problem.linearize(np.zeros(34))
-    >>> kinds = ro.convex.groups.Grouped.of(model, {"alpha theta": None, "a d": None, "tool": 2.0})
+    >>> from rpim_opt.bayes.group_weights import Grouped
+    >>> kinds = Grouped.of(model, {"alpha theta": None, "a d": None, "tool": 2.0})
     >>> kinds.names, kinds.penalty(np.log([0.1, 10.0])).round(1)[:5], kinds.at(np.zeros(2)).z.shape
     (('alpha theta', 'a d'), array([ 0.1, 10. ,  0.1, 10. ,  0.1]), (34,))
     """
