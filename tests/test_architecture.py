@@ -173,7 +173,7 @@ UNUSED = {
     # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
     SMALL: {*HEAVY, "rpim_opt.convex.active_set", *ELSEWHERE},
     f"{SMALL} --variant bounded": {*HEAVY, *ELSEWHERE},
-    f"{SMALL} --select learned": {*HEAVY, *ELSEWHERE},
+    f"{SMALL} --selector learned": {*HEAVY, *ELSEWHERE},
     "inspect paper_arm": HEAVY,
 }
 """What a command may not import: tables, plots and workers besides these, always."""

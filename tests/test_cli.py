@@ -54,7 +54,7 @@ def test_calibrate_prints_the_tables_and_writes_the_result(monkeypatch, capsys, 
 
 
 def test_a_weight_can_be_given(monkeypatch, capsys) -> None:
-    assert run(monkeypatch, "calibrate", "paper_arm", "--select", "0.5") == 0
+    assert run(monkeypatch, "calibrate", "paper_arm", "--selector", "0.5") == 0
     assert "Weight 0.5 (given)" in capsys.readouterr().out
 
 
@@ -178,7 +178,7 @@ def test_unknown_names_on_the_command_line(monkeypatch, capsys) -> None:
     assert "paper_arm" in capsys.readouterr().err
     assert run(monkeypatch, "calibrate", "paper_arm", "--variant", "swapp") == 2
     assert "did you mean swap?" in capsys.readouterr().err
-    assert run(monkeypatch, "calibrate", "paper_arm", "--select", "-1") == 2
+    assert run(monkeypatch, "calibrate", "paper_arm", "--selector", "-1") == 2
     assert "zero or more" in capsys.readouterr().err
 
 
@@ -186,7 +186,7 @@ def test_fewer_equations_than_needed(monkeypatch, capsys, folder) -> None:
     lines = (folder / CSV).read_text().splitlines()
     (folder / CSV).write_text("\n".join(lines[:5]))
     edit(folder / TOML, 'formulation = "tikhonov"', 'formulation = "least_squares"')
-    assert run(monkeypatch, "calibrate", str(folder), "--select", "0") == 2
+    assert run(monkeypatch, "calibrate", str(folder), "--selector", "0") == 2
     assert "12 equations for 26 parameters" in capsys.readouterr().err
 
 

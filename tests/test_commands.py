@@ -159,7 +159,7 @@ def test_four_commands_on_the_peers_benchmark(monkeypatch, tmp_path) -> None:
     assert left == pytest.approx(own, abs=1e-9)
     assert left == pytest.approx(0.0309, abs=1e-4)
     # simulated with one size for all deviations: one weight over scales that say so is better here
-    assert run(monkeypatch, "calibrate", str(tmp_path / "arm"), "--select", "reml", "--out", str(results)) == 0
+    assert run(monkeypatch, "calibrate", str(tmp_path / "arm"), "--selector", "reml", "--out", str(results)) == 0
     assert json.loads((results / "result.json").read_text())["validation"]["rms_mm"] == pytest.approx(0.0261, abs=1e-4)
 
 

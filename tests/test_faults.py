@@ -19,8 +19,8 @@ COMMANDS = {
     "new": ["new", "deep/made", "--robot", "robot.toml", "--data", "table.csv", "--hold-out", "0.25"],
     "simulate": ["simulate", "sim"],
     "simulate elsewhere": ["simulate", "sim", "--out", "deep/er"],
-    "calibrate": ["calibrate", "cell", "--select", "1", "--model", "geometry", "--out", "deep/er"],
-    "calibrate again": ["calibrate", "cell", "--select", "2", "--model", "geometry", "--out", "."],
+    "calibrate": ["calibrate", "cell", "--selector", "1", "--model", "geometry", "--out", "deep/er"],
+    "calibrate again": ["calibrate", "cell", "--selector", "2", "--model", "geometry", "--out", "."],
     "export": ["export", "result.json", "--mdh", "out.toml", "--robodk", "deep/out.csv"],
     "export again": ["export", "result.json", "--mdh", "old.toml", "--robodk", "old.csv"],
     "compensate": ["compensate", "result.json", "targets.csv", "--out", "old.csv"],
@@ -28,7 +28,7 @@ COMMANDS = {
     "validate": ["validate", "result.json", "table.csv", "--out", "deep/rows.csv"],
     "design": ["design", "cell", "--count", "3", "--candidates", "20", "--out", "old.csv"],
     "study": ["study", "mine.py", "--out", "deep/study"],
-    "compare": ["compare", "cell", "--formulations", "tikhonov", "--selectors", "1", "--splits", "0.25", "--out", "c"],
+    "compare": ["compare", "cell", "--formulations", "tikhonov", "--selector", "1", "--splits", "0.25", "--out", "c"],
 }
 QUICK = ("new", "export again")
 RESUMED = {"study": "deep/study", "compare": "c"}

@@ -21,7 +21,7 @@ def test_times_are_told_on_demand(monkeypatch: pytest.MonkeyPatch, capsys: Any) 
 def test_what_is_measured_already_counts_in_a_design(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     asked = ["design", "position", "--count", "4", "--candidates", "20", "--criterion", "D", "--json"]
     values = []
-    for more in ([], ["--next"]):
+    for more in ([], ["--augment"]):
         assert run(monkeypatch, *asked, *more) == 0
         values.append(json.loads(capsys.readouterr().out))
     assert values[0] != values[1]

@@ -230,7 +230,7 @@ def _wide(limit: float, bound: float, made: Share) -> list[str]:
         ]
     return [
         f"Lacking: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's own scatter "
-        f"would leave {1e3 * made.scatter:.3f} mm of it. `rpim-opt design PROBLEM --next --count 10` names the "
+        f"would leave {1e3 * made.scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` names the "
         "configurations that help most."
     ]
 

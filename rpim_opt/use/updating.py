@@ -32,8 +32,8 @@ def update(
     result: Calibration,
     data: Dataset,
     *,
-    inflate: float = 1.0,
-    anew: Sequence[str] = (),
+    prior_inflation: float = 1.0,
+    reset: Sequence[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Update:
     """Calibrate a robot once more: the posterior of its last calibration is the prior of this one.
@@ -48,11 +48,11 @@ def update(
     result
         The last calibration, with a squared penalty or none; perhaps of `load_result`.
     data
-        New measurements of the same robot, in the same instrument's frame unless ``anew`` says otherwise.
-    inflate
+        New measurements of the same robot, in the same instrument's frame unless ``reset`` says otherwise.
+    prior_inflation
         Factor on the earlier standard deviations, where everything may have drifted a little.
-    anew
-        Patterns of parameters that were set up anew, such as ``("base_*",)`` of another place of the instrument.
+    reset
+        Patterns of parameters of which the earlier result says nothing, ``("base_*",)`` where the instrument moved.
     progress
         Called with what goes on.
 
@@ -74,11 +74,11 @@ def update(
     (['ABB IRB 120-3/0.58'], ())
     """
     say = progress or (lambda text: None)
-    asking = Carried(result, inflate)
+    asking = Carried(result, prior_inflation)
     problem = asking.problem(data)
-    let_go = _named(problem, anew)
+    let_go = _named(problem, reset)
     say("comparing with the last calibration")
-    start = None  # a frame that was set up anew may be anywhere: then it is looked for
+    start = None  # a frame that was reset may be anywhere: then it is looked for
     if not let_go:
         start = asking.start(problem)
     found = asking.calibrated(problem, let_go, start)
@@ -99,7 +99,7 @@ def update(
         _require_this_robot(result, found, data)
     moved = tuple(_moved(result, found, name) for name in asking.known(let_go))
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
-    record = _record(result, inflate, let_go, left_out)
+    record = _record(result, prior_inflation, let_go, left_out)
     return Update(replace(found, record=record), before, after, tuple(changes), first, moved, len(data))
 
 
@@ -111,11 +111,11 @@ def _may(changes: Sequence[Cause], cause: Cause, readings: int) -> bool:
     return len(alike) < MOST
 
 
-def _named(problem: CalibrationProblem, anew: Sequence[str]) -> tuple[str, ...]:
-    if not anew:
+def _named(problem: CalibrationProblem, reset: Sequence[str]) -> tuple[str, ...]:
+    if not reset:
         return ()
     free = problem.parameters.free
-    named = matching(free, anew, "update, anew")
+    named = matching(free, reset, "update, reset")
     return tuple(name for name, new in zip(free.names, named, strict=True) if new)
 
 
@@ -147,8 +147,8 @@ def _require_this_robot(result: Calibration, found: Calibration, data: Dataset) 
         raise InputError(
             "the new measurements",
             f"readings {1e3 * missed:.3g} mm off, whatever is let go",
-            f"those of the same robot ({robots}) in the same units and instrument's frame, or --anew with what was "
-            "set up anew (base)",
+            f"those of the same robot ({robots}) in the same units and instrument's frame, or --reset "
+            "with what moved (base_*)",
         )
 
 

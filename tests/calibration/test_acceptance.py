@@ -122,7 +122,7 @@ def test_the_three_verdicts(result) -> None:
     assert accept(result, Requirement(1.001 * bound)).verdict == "accepted"
     between = accept(result, Requirement(0.8 * bound))
     assert between.verdict == "undecided"
-    assert "design PROBLEM --next" in between.reasons[0]
+    assert "design PROBLEM --augment" in between.reasons[0]
     few = accept(result, Requirement(0.1 * bound))
     assert few.verdict == "undecided"  # nothing shows that a better calibration would not do
     assert "scatter" in few.reasons[0]
@@ -292,7 +292,7 @@ def test_a_wrong_statement_is_named(folder, text: str, said: str) -> None:
 
 def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> None:
     out = str(tmp_path / "out")
-    assert run(monkeypatch, "calibrate", str(stated(folder, STATED)), "--refit-all", "--out", out) == 0
+    assert run(monkeypatch, "calibrate", str(stated(folder, STATED)), "--use-validation", "--out", out) == 0
     text = capsys.readouterr().out
     assert "Accepted: limit 0.2 mm" in text
     assert "Measured by: A. Person" in text

@@ -173,7 +173,7 @@ def test_a_program_without_solution_says_what_is_read_wrongly(monkeypatch, capsy
     wrong, said = MISTAKES["millimetres as metres"]
     made(monkeypatch, tmp_path, wrong("ur5e").problem)
     capsys.readouterr()
-    code = run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--formulation", "robust", "--select", "l_curve")
+    code = run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--formulation", "robust", "--selector", "l_curve")
     assert code in (1, 3)  # whether a solver gives up on kilometres is the solver's
     printed = capsys.readouterr()
     assert said in printed.out + printed.err

@@ -54,7 +54,10 @@ def test_without_blunders_a_robust_loss_costs_little() -> None:
 
 
 def test_the_command_names_and_refits(monkeypatch, capsys) -> None:
-    assert run(monkeypatch, "calibrate", "blunders", "--formulation", "robust", "--select", "reml", "--refit") == 0
+    assert (
+        run(monkeypatch, "calibrate", "blunders", "--formulation", "robust", "--selector", "reml", "--drop-outliers")
+        == 0
+    )
     out = capsys.readouterr().out
     assert "Refitted without " in out
     assert all(label in out for label in BLUNDERS)

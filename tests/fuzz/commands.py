@@ -89,7 +89,7 @@ FITTING: dict[str, list[list[str]]] = {
     "new": [["out/cell", "--robot", "robot.toml", "--data", "table.csv"], ["out/c", "--robot", "ur5e", "--data",
     "rows.csv"]],
     "inspect": [["cell"], ["cell", "--json"]],
-    "calibrate": [["cell"], ["cell", "--select", "1"], ["cell", "--out", "out", "--select", "1"]],
+    "calibrate": [["cell"], ["cell", "--selector", "1"], ["cell", "--out", "out", "--selector", "1"]],
     "report": [["result.json", "--out", "out/r.html"], ["."]],
     "validate": [["result.json", "table.csv"]],
     "export": [["result.json", "--mdh", "out/r.toml"], ["result.json", "--robodk", "out/r.csv"]],
@@ -97,7 +97,7 @@ FITTING: dict[str, list[list[str]]] = {
     "simulate": [["sim", "--out", "out"]],
     "design": [["cell", "--count", "3", "--candidates", "20"]],
     "study": [["mine.py", "--out", "out/s"]],
-    "compare": [["cell", "--formulations", "tikhonov", "--selectors", "1"]],
+    "compare": [["cell", "--formulations", "tikhonov", "--selector", "1"]],
     "robots": [[]],
 }  # fmt: skip
 

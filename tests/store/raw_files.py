@@ -316,7 +316,7 @@ RAW: dict[str, Shape] = {
     ),
     "a controller's text and a workbook": (of_two_kinds, {}, "position"),
     "joints and points of two clocks": (
-        lambda folder: clocked(folder, rate=100.0, apart=0.003), {"within": "0.006"}, "position"
+        lambda folder: clocked(folder, rate=100.0, apart=0.003), {"time-tolerance": "0.006"}, "position"
     ),
     "several files below each other": two(
         text([HEAD], ROWS[:7]), text([[*HEAD[:7], "X [m]", "Y [m]", "Z [m]"]], beside(NAMED, JOINTS, METRES)[7:], ";")

@@ -272,7 +272,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory, arm: Path) -> tuple[Pat
     clean.write_text(text([HEAD], ROWS))
     with pytest.MonkeyPatch.context() as patch:
         assert new(patch, arm, folder / "cell", clean) == 0
-        run(patch, "calibrate", str(folder / "cell"), "--select", "1", "--out", str(folder / "out"))
+        run(patch, "calibrate", str(folder / "cell"), "--selector", "1", "--out", str(folder / "out"))
     return clean, folder / "out"
 
 
@@ -305,7 +305,7 @@ def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatc
 
 def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys, tmp_path, arm) -> None:
     files = clocked(tmp_path, rate=100.0, apart=0.003)
-    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.006") == 0
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.006") == 0
     said = capsys.readouterr().out
     assert f"joined by the nearest time: {COUNT} rows of {10 * COUNT} with joints and {COUNT} measured" in said
     assert "times differ by 0.003 s at most, +0.003 s on average" in said
@@ -318,7 +318,7 @@ def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_pat
     files = clocked(tmp_path, rate=100.0, apart=0.003)
     late = [["late", "99000", *POINTS[0]]]
     files[1].write_text(files[1].read_text() + text([], late))
-    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.006") == 0
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.006") == 0
     assert "1 measured rows without a partner within 0.006 s, left out: late." in capsys.readouterr().out
 
 
@@ -328,12 +328,12 @@ def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_pat
 )
 def test_clocks_that_do_not_agree_are_one_sentence(monkeypatch, capsys, tmp_path, arm, shift, within, said) -> None:
     files = clocked(tmp_path, rate=100.0, apart=0.0, shift=shift)
-    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", within) == 2
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", within) == 2
     error = capsys.readouterr().err.strip()
     assert "\n" not in error
     assert said in error
     files[1].write_text(files[1].read_text().replace("Timestamp [ms]", "Remark"))
-    assert new(monkeypatch, arm, tmp_path / "cell", files, "--within", "0.01") == 2
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.01") == 2
     assert "no column of times among" in capsys.readouterr().err
 
 

@@ -394,7 +394,7 @@ def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     from tests.test_cli import run
 
     out = tmp_path / "out"
-    asked = ["compare", "position", "--formulations", "tikhonov,lasso", "--selectors", "reml,1.0", "--out", str(out)]
+    asked = ["compare", "position", "--formulations", "tikhonov,lasso", "--selector", "reml,1.0", "--out", str(out)]
     assert run(monkeypatch, *asked) == 0
     said = capsys.readouterr().out
     assert "Comparison: 4 methods on 1 problem, 4 replicates (3 ok, 1 impossible)" in said

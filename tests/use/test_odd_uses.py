@@ -236,7 +236,7 @@ def test_validation_says_what_it_knows_and_what_not() -> None:
 def test_everything_may_be_let_go() -> None:
     """Nothing of the last calibration but its widths is then left."""
     data = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 30, 5e-5, 3)[0].data
-    found = ro.use.update(calibrated(), data, anew=["*"])
+    found = ro.use.update(calibrated(), data, reset=["*"])
     anew = ro.calibrate(calibrated().problem.on(data), ro.least_squares)
     assert found.result.x == pytest.approx(anew.x, abs=2e-5)
     halves = [data.take(np.arange(k, k + 15)) for k in (0, 15)]

@@ -129,7 +129,7 @@ def test_a_base_that_moved_is_one_cause() -> None:
 
 def test_an_instrument_that_was_set_up_anew(crashed: Robot) -> None:
     robot = happened(8, base_x=1.5, base_y=-0.8, base_rz=1.0)
-    found = ro.use.update(ro.calibrate(robot.problem), robot.after, anew=("base_*",))
+    found = ro.use.update(ro.calibrate(robot.problem), robot.after, reset=("base_*",))
     assert not found.changes
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
 

@@ -169,7 +169,7 @@ def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
     rows = [i for i, name in enumerate(keys.values) if name in place]
     if not rows:
         found = f"none that {moving[0].file} and {seen[0].file} share"
-        accepted = "--key with a column that both have, --key row, or --within for the nearest time"
+        accepted = "--key with a column that both have, --key row, or --time-tolerance for the nearest time"
         raise InputError(f"the key {keys.how}", found, accepted)
     names = [keys.values[i] for i in rows]
     whole = _beside(joints.columns, [place[name] for name in names], values.columns, rows, names)
@@ -206,7 +206,9 @@ def _keys(moving: Sequence[Understood], seen: Sequence[Understood], joints: Colu
     if name not in common:
         files = f"{moving[0].file} and {seen[0].file}"
         found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {files}"
-        accepted = "a column that both have, --key row for rows in the same order, or --within for the nearest time"
+        accepted = (
+            "a column that both have, --key row for rows in the same order, or --time-tolerance for the nearest time"
+        )
         raise InputError("--key", found, accepted)
     return Keys(f"column '{name}'", _normal(left[name]), _normal(right[name]))
 
@@ -234,7 +236,7 @@ def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str,
     alone (of readings of one time, of all).
     """
     if not (np.isfinite(within) and within >= 0):
-        raise InputError("--within", f"{within:g}", "a time [s], zero or more")
+        raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     joints = _stacked(moving)
     values = _stacked(seen)
     there = _times(moving, key)
@@ -243,7 +245,7 @@ def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str,
     if not len(pairs.left):
         apart = float(np.abs(there[:, None] - then[:1]).min())
         found = f"no two within {within:g} s; the first measured row is {apart:.4g} s from the nearest with joints"
-        raise InputError("times", found, "clocks that agree, or a larger --within")
+        raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
     labels = _labels(values.columns)
     right = pairs.right.tolist()
     whole = _beside(joints.columns, pairs.left.tolist(), values.columns, right, [labels[i] for i in right])
@@ -295,7 +297,9 @@ def _times(tables: Sequence[Understood], key: str) -> Array:
         if name is None:
             what = f"no column '{key}'" if key else "no column of times"
             columns = ", ".join(table.raw)
-            raise InputError(f"--within, {table.file}", f"{what} among {columns}", "one called time, or --key with it")
+            raise InputError(
+                f"--time-tolerance, {table.file}", f"{what} among {columns}", "one called time, or --key with it"
+            )
         found.append(seconds(name, table.raw[name]))
     return np.concatenate(found)
 
