@@ -2,35 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import validate
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import Length, Table, validate
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.basics.units import display, quantities
+from rpim_opt.basics.units import display, joint_columns, quantities
 from rpim_opt.basics.writing import write_files
+from rpim_opt.data.board import on_board
+from rpim_opt.data.contact import touches
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import of_fixture
+from rpim_opt.data.models import Measurement, of_fixture
+from rpim_opt.data.reading import read_data
 from rpim_opt.problem.design import random_candidates
+from rpim_opt.problem.postures import Target, postures_at
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.sight import postures_in_sight
 from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.problem_file import Observation, Stated, read_problem
-from rpim_opt.store.simulated_table import Shape, simulated_table
-from rpim_opt.store.simulated_world import Draws, Simulation, Truth
+
+Columns = dict[str, list[str]]
+MOST = 1_000_000
+"""Configurations of a table."""
+TORQUE = 20.0
+"""Simulated joint torques are uniform up to this [Nm]."""
+DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
+"""Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""
+
+
+class PlaneTable(Table):
+    """A square of a plane that is touched, in the robot's base frame."""
+
+    at_mm: list[float]
+    normal: list[float]
+    size: Length
+
+
+class Simulation(Table):
+    """The keys of ``[simulation]``."""
+
+    seed: int = Field(ge=0)
+    configurations: int = Field(gt=0, le=MOST)
+    validation: int = Field(default=0, ge=0, le=MOST)
+    spread: float = Field(default=1.0, ge=0)
+    joint_share: float = Field(default=0.9, gt=0, le=1)
+    blunders: int = Field(default=0, ge=0)
+    blunder: Length = 0.0
+    markers: dict[str, list[str]] = Field(default_factory=dict)
+    torques: Literal["measured", "gravity"] = "measured"
+    points_mm: dict[str, list[float]] = Field(default_factory=dict)
+    validation_points_mm: dict[str, list[float]] = Field(default_factory=dict)
+    planes: dict[str, PlaneTable] = Field(default_factory=dict)
+    validation_planes: dict[str, PlaneTable] = Field(default_factory=dict)
+    image_px: list[int] = Field(default=[1280, 960])
+    truth: dict[str, Any] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
     """Tables by file name, and the truth they were made from: deviations [SI] by parameter, labels of blunders."""
 
-    tables: Mapping[str, Mapping[str, list[str]]]
+    tables: Mapping[str, Columns]
     deviations: Mapping[str, tuple[str, float]]
     blunders: tuple[str, ...]
 
@@ -62,19 +104,41 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     if not np.isfinite(stated.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
     _require_tables(stated)
-    shapes = [Shape.of(stated, plan, i) for i in range(len(stated.observations))]
+    shapes = [_shape(stated, plan, each) for each in stated.observations]
     parameters = _parameters(stated, shapes)
-    truth = Truth(parameters, _deviations(parameters, plan, rng, stated.path), plan)
-    tables: dict[str, Mapping[str, list[str]]] = {}
+    world = World(stated, plan, parameters, _deviations(parameters, plan, rng, stated.path))
+    tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         # drawn where no table of that role is, too: other tables of the same seed stay as they are
         q = random_candidates(stated.robot, 2 * count, rng, plan.joint_share)
-        for shape, each in _to_make(stated, shapes, role, count):
-            draws = Draws(each.noise or stated.table.noise, rng, noisy=role == "identification")
-            tables[getattr(each, role)], wrong = simulated_table(stated, shape, truth, q, draws)
-            blunders += wrong
-    return Simulated(tables, truth.by_name(), tuple(blunders))
+        for shape in shapes:
+            file = getattr(shape.observation, role)
+            if count and file:
+                tables[file], wrong = TableMaker(world, shape, rng, role == "identification").made(q)
+                blunders += wrong
+    free = parameters.free
+    truth = zip(free.names, free.dimensions, world.x.tolist(), strict=True)
+    return Simulated(tables, {name: (dimension, value) for name, dimension, value in truth}, tuple(blunders))
+
+
+def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
+    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files.
+
+    All of them lie in it: names that lead elsewhere are refused.
+    """
+    made = simulate(name, seed)
+    folder = out or read_problem(name).path.parent
+    texts = {file: csv_text(table, zip(*table.values(), strict=True)) for file, table in made.tables.items()}
+    blunders = ", ".join(f'"{label}"' for label in made.blunders)
+    lines = [f"# made by: rpim-opt simulate {Path(name).name}", f"blunders = [{blunders}]", "", "[deviation]"]
+    for parameter, (dimension, value) in made.deviations.items():
+        unit, si = display(dimension)
+        lines.append(f"{f'{parameter}_{unit}'.rstrip('_')} = {value / si:.12g}")
+    texts["truth.toml"] = "\n".join(lines) + "\n"
+    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
+    write_files(places)
+    return list(places)
 
 
 def _require_tables(stated: Stated) -> None:
@@ -93,56 +157,57 @@ def _require_tables(stated: Stated) -> None:
             taken.add(place)
 
 
-def _to_make(stated: Stated, shapes: Sequence[Shape], role: str, count: int) -> Iterator[tuple[Shape, Observation]]:
-    """Yield the observations that have a table of a role."""
-    for shape, each in zip(shapes, stated.observations, strict=True):
-        if count and getattr(each, role):
-            yield shape, each
+# --- the world that is simulated ---------------------------------------------------------------------------------
 
 
-def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
-    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files.
+class Shape(NamedTuple):
+    """Which reflectors and fixtures the rows of an observation involve."""
 
-    All of them lie in it: names that lead elsewhere are refused.
-    """
-    made = simulate(name, seed)
-    folder = out or read_problem(name).path.parent
-    texts = {file: csv_text(table, zip(*table.values(), strict=True)) for file, table in made.tables.items()}
-    texts["truth.toml"] = _truth_text(name, made)
-    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
-    write_files(places)
-    return list(places)
+    observation: Observation
+    kind: Measurement
+    markers: tuple[str, ...]
+    fixtures: tuple[str, ...]
 
 
-def _truth_text(name: str | Path, made: Simulated) -> str:
-    lines = [
-        f"# made by: rpim-opt simulate {Path(name).name}",
-        f"blunders = [{', '.join(map(repr, made.blunders))}]",
-        "",
-    ]
-    lines += ["[deviation]"]
-    for parameter, (dimension, value) in made.deviations.items():
-        unit, si = display(dimension)
-        key = f"{parameter}_{unit}".rstrip("_")
-        lines.append(f"{key} = {value / si:.12g}")
-    return "\n".join(lines).replace("'", '"') + "\n"
+class World(NamedTuple):
+    """What is simulated: a problem file, its plan, the parameters and their true deviations (n,) [SI]."""
+
+    stated: Stated
+    plan: Simulation
+    parameters: Parameters
+    x: Array
+
+    @property
+    def with_torques(self) -> bool:
+        """Whether joints give way to torques that tables state, and not to those of gravity."""
+        names = self.parameters.free.names
+        return self.plan.torques == "measured" and any(name.startswith("compliance") for name in names)
+
+
+def _shape(stated: Stated, plan: Simulation, each: Observation) -> Shape:
+    kind = stated.kinds[each.measurement]
+    markers = tuple(plan.markers.get(each.identification, stated.tools))
+    for marker in markers:
+        if marker not in stated.tools:
+            raise InputError("table simulation.markers", f"'{marker}'", choices(marker, stated.tools), stated.path)
+    tables = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
+    nested = [key for table in tables for key, value in table.items() if isinstance(value, dict)]
+    return Shape(each, kind, markers, tuple(dict.fromkeys(nested)) or ("",))
 
 
 def _parameters(stated: Stated, shapes: Sequence[Shape]) -> Parameters:
+    places = [(shape.kind, fixture) for shape in shapes for fixture in shape.fixtures]
+    none = np.empty(0, dtype=int)
     blocks = []
-    for shape in shapes:
-        for fixture in shape.fixtures:
-            empty = np.empty((0, shape.kind.points, stated.robot.dof))
-            y = np.empty((0, len(shape.kind.columns)))
-            covariance = np.empty((0, 1, 1))
-            blocks.append(Block(shape.kind, empty, y, covariance, np.empty(0, dtype=int), fixture=fixture))
-    nothing = Dataset(tuple(blocks), (), np.empty(0, dtype=int))
+    for kind, fixture in places:
+        empty = np.empty((0, kind.points, stated.robot.dof))
+        blocks.append(Block(kind, empty, np.empty((0, len(kind.columns))), np.empty((0, 1, 1)), none, fixture=fixture))
+    nothing = Dataset(tuple(blocks), (), none)
     own = place_fixtures(stated.placed, nothing)
     entries = {}
-    for shape in shapes:
-        for fixture in shape.fixtures:
-            names = {n: of_fixture(n, fixture) for n in shape.kind.parameters}
-            entries |= {names[n]: (d, own.get(names[n], 0.0)) for n, d in shape.kind.parameters.items()}
+    for kind, fixture in places:
+        named = {of_fixture(name, fixture): dimension for name, dimension in kind.parameters.items()}
+        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
     base = (0.0,) * 6 if stated.base is None else stated.base
     return stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
 
@@ -150,10 +215,252 @@ def _parameters(stated: Stated, shapes: Sequence[Shape]) -> Parameters:
 def _deviations(parameters: Parameters, plan: Simulation, rng: np.random.Generator, path: Path) -> Array:
     free = parameters.free
     truth = plan.spread * rng.normal(size=len(free)) * free.scale
-    dims = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
+    dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
     try:
-        for (name, _), value in quantities(plan.truth, dims, "table simulation.truth").items():
+        for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
             truth[free.names.index(name)] = value
     except InputError as error:
         raise error.within(path) from None
     return truth
+
+
+# --- one table of it ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TableMaker:
+    """One table of a world: what it holds, its draws, whose order is that of the making, and whether it is noisy.
+
+    A table that identifies has noise and blunders; one that validates has none, though they are drawn all the same.
+    """
+
+    world: World
+    shape: Shape
+    rng: np.random.Generator
+    noisy: bool
+
+    def made(self, random: Array) -> tuple[Columns, list[str]]:
+        """Return the columns as text, and the labels of blunders; of joint values (2 count, dof) [rad or m]."""
+        if self.shape.kind.touching:
+            return self._touched(), []
+        if self.shape.kind.by_camera:
+            return self._seen(len(random) // 2), []
+        return self._measured(random)
+
+    def _measured(self, random: Array) -> tuple[Columns, list[str]]:
+        """Return a table of measured values, or of touches of a plane or sphere; of values the second half serve `to_`."""
+        kind, truth = self.shape.kind, self.world.x
+        rows = self._rows(len(random) // 2)
+        q = np.array([[random[k], random[len(random) // 2 + k]][: kind.points] for k, _, _ in rows])
+        torque = None
+        if self.world.with_torques:
+            torque = self.rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
+        columns = self._names(rows, len(random) // 2)
+        constraint = not kind.columns
+        columns |= self._joints(q, EXACT_DIGITS if constraint else DIGITS, torque)
+        values = np.zeros((len(rows), len(kind.columns)))
+        values[:, [i for i, name in enumerate(kind.columns) if name == "qw"]] = 1.0  # no turn
+        data = self._read({**columns, **self._values(values)})
+        problem = CalibrationProblem(self.world.stated.robot, self.world.parameters, data)
+        if constraint:
+            sigma = np.sqrt(data.blocks[0].covariance[0, 0, 0])
+            errors = sigma * self.rng.normal(size=len(data)) * self.noisy
+            try:
+                q = touching_poses(problem, truth, errors, self.rng, self.world.plan.joint_share)
+            except InputError as error:
+                raise error.within(self.world.stated.path) from None
+            return columns | self._joints(q[:, None], EXACT_DIGITS), []
+        for block, modelled in zip(data.blocks, problem.modelled(truth), strict=True):
+            values[block.row] = modelled
+        # covariances at the true values: a tracker's depend on them
+        for block in self._read({**columns, **self._values(values)}).blocks:
+            errors = self._errors(block)
+            if self.noisy:
+                values[block.row] = kind.plus(block.y, errors)
+        wrong: list[int] = []
+        if self.noisy and self.world.plan.blunders:
+            wrong = self._move(values)
+        return columns | self._values(values), [columns["label"][i] for i in wrong]
+
+    def _rows(self, count: int) -> list[tuple[int, tuple[str, ...], str]]:
+        """Return configuration, reflectors and fixture of every row."""
+        _, kind, markers, fixtures = self.shape
+        if kind.points == 1:
+            return [(k, (m,), f) for k in range(count) for m in markers for f in fixtures]
+        return [(k, tuple(self.rng.choice(markers, kind.points)), f) for k in range(count) for f in fixtures]
+
+    def _names(self, rows: Sequence[tuple[int, tuple[str, ...], str]], count: int) -> Columns:
+        """Return labels, and what tells rows of one configuration apart."""
+        _, _, markers, fixtures = self.shape
+        several = len(rows) > count
+        columns = {"label": [f"c{k}{''.join(m) * several}{f * (len(fixtures) > 1)}" for k, m, f in rows]}
+        if several:
+            columns["configuration"] = [str(k) for k, _, _ in rows]
+        if markers != ("",):
+            for i, prefix in enumerate(self._prefixes):
+                columns[f"{prefix}marker"] = [row[1][i] for row in rows]
+        if fixtures != ("",):
+            columns["fixture"] = [fixture for _, _, fixture in rows]
+        return columns
+
+    @property
+    def _prefixes(self) -> list[str]:
+        """What precedes the columns of each point."""
+        return ["", "to_"][: self.shape.kind.points]
+
+    def _joints(self, q: Array, digits: int, torque: Array | None = None) -> Columns:
+        """Return the joint values (N, p, dof) of every point, each beside its torque [Nm] where there are torques."""
+        columns = {}
+        for p, prefix in enumerate(self._prefixes):
+            for i, (name, si) in enumerate(joint_columns(self.world.stated.robot.joint_dimensions).items()):
+                columns[prefix + name] = [f"{v:.{digits}f}" for v in q[:, p, i] / si]
+                if torque is not None:
+                    columns[f"{prefix}tau{i + 1}_Nm"] = [f"{v:.3f}" for v in torque[:, p, i]]
+        return columns
+
+    def _values(self, y: Array) -> Columns:
+        """Return measured values (N, c): millimetres to a nanometre, quaternions to 1e-12."""
+        columns = {}
+        for i, (name, dimension) in enumerate(self.shape.kind.columns.items()):
+            if dimension:
+                unit, si = display(dimension)
+                columns[f"{name}_{unit}"] = [f"{v:.6f}" for v in y[:, i] / si]
+            else:
+                columns[name] = [f"{v:.12f}" for v in y[:, i]]
+        return columns
+
+    def _read(self, columns: Columns) -> Dataset:
+        noise = self.shape.observation.noise or self.world.stated.table.noise
+        return read_data(columns, self.world.stated.robot, noise, self.shape.kind)
+
+    def _errors(self, block: Block) -> Array:
+        """Return errors (N, k) of the declared covariance; zero without noise."""
+        k = len(block.measurement.components)
+        L = np.linalg.cholesky(np.broadcast_to(block.covariance, (len(block.row), k, k)))
+        return self.noisy * (L @ self.rng.normal(size=(len(block.row), k, 1)))[:, :, 0]
+
+    def _move(self, y: Array) -> list[int]:
+        """Move some rows of y by the length of a blunder, in random directions; return which."""
+        plan = self.world.plan
+        hit = self.rng.choice(len(y), plan.blunders, replace=False)
+        lengths = [i for i, dimension in enumerate(self.shape.kind.columns.values()) if dimension == "length"]
+        direction = self.rng.normal(size=(len(hit), len(lengths)))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        y[hit[:, None], np.array(lengths)] += plan.blunder * direction
+        return sorted(hit.tolist())
+
+    # --- cameras -------------------------------------------------------------------------------------------------
+
+    def _seen(self, count: int) -> Columns:
+        """Return a camera's table: configurations in which it sees its whole board, and where every point appears."""
+        stated, plan = self.world.stated, self.world.plan
+        if stated.board is None:
+            raise InputError("key target", "nothing", "the points of the board that the camera sees", stated.path)
+        if len(plan.image_px) != 2 or min(plan.image_px) < 1:
+            raise InputError("key simulation.image_px", f"{plan.image_px}", "width and height", stated.path)
+        board = stated.board
+        names = list(board)
+        joints = list(joint_columns(stated.robot.joint_dimensions))
+        one = self._read(on_board({"point": names[:1], **{n: ["0"] for n in ("u_px", "v_px", *joints)}}, board))
+        world = CalibrationProblem(stated.robot, self.world.parameters, one)
+        width, height = plan.image_px
+        points = np.array(list(board.values()))
+        q = postures_in_sight(world, points, count, self.rng, self.world.x, plan.joint_share, (width, height))
+        table = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
+        table |= self._joints(np.repeat(q, len(names), axis=0)[:, None], CAMERA_DIGITS)
+        empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
+        data = self._read(on_board({**table, **empty}, board))
+        y = world.on(data).modelled(self.world.x)[0] + self._errors(data.blocks[0])
+        return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
+
+    # --- touches of points and planes that nobody measures -------------------------------------------------------
+
+    def _touched(self) -> Columns:
+        """Return a table of touches, by tools that take turns."""
+        column, things = self._things()
+        robot, markers = self.world.stated.robot, self.shape.markers
+        names = [name for name, places in things.items() for _ in places]
+        table = {"label": [f"{name}_{i}" for name, places in things.items() for i in range(len(places))], column: names}
+        turn = np.arange(len(names)) % len(markers)
+        if len(markers) > 1:
+            table["marker"] = [markers[k] for k in turn.tolist()]
+        q = np.zeros((len(names), robot.dof))
+        declared = self._read({**table, **self._joints(q[:, None], 0)}).blocks[0].covariance[0]
+        errors = self.rng.normal(size=(len(names), 3)) @ np.linalg.cholesky(declared).T
+        targets = np.concatenate(list(things.values())) + self.noisy * errors
+        problem = CalibrationProblem(robot, self.world.parameters, touches(q[:1], ["any"], 1.0))
+        for k, marker in enumerate(markers):
+            mine = turn == k
+            share = self.world.plan.joint_share
+            q[mine] = postures_at(problem, targets[mine], self.rng, self.world.x, share, marker)
+        return table | self._joints(q[:, None], EXACT_DIGITS)
+
+    def _things(self) -> tuple[str, dict[str, Array]]:
+        """Return the column that names what is touched, and by name where (K, 3) [m]."""
+        plan = self.world.plan
+        points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
+        if self.noisy:
+            points, planes, each = plan.points_mm, plan.planes, plan.configurations
+        if bool(points) == bool(planes):
+            raise InputError("table simulation", "points_mm and planes", "one of them, for either table")
+        if planes:
+            return "plane", {name: self._on(square, each) for name, square in planes.items()}
+        return "point", {name: np.tile(_vector(place) / 1e3, (each, 1)) for name, place in points.items()}
+
+    def _on(self, square: PlaneTable, count: int) -> Array:
+        """Return points (count, 3) [m] of a square, uniform."""
+        normal = _vector(square.normal)
+        normal = normal / np.sqrt(np.sum(normal**2))
+        axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
+        first = axis - normal * np.sum(axis * normal)
+        first = first / np.sqrt(np.sum(first**2))
+        second = np.cross(normal, first)
+        places = square.size * (self.rng.uniform(size=(count, 2)) - 0.5)
+        return _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
+
+
+def _vector(values: Sequence[float]) -> Array:
+    if len(values) != 3:
+        raise InputError("table simulation", f"{list(values)}", "three numbers, x, y and z")
+    return np.array(values, dtype=float)
+
+
+def touching_poses(
+    problem: CalibrationProblem, x: Array, wanted: Array, rng: np.random.Generator, share: float = 1.0
+) -> Array:
+    """Return joint values (N, dof) [rad or m] at which a constraint's residuals are the wanted ones.
+
+    From random configurations by Newton's steps (`Target`), whose ends are within the joints' limits.
+
+    Parameters
+    ----------
+    problem
+        Its data are N rows of a measurement with one component and no columns; their joint values do not matter.
+    x
+        (n,) deviations of the identified parameters [SI].
+    wanted
+        (N,) residuals [m], in the order of the rows.
+    rng
+        Of the random configurations. It advances by the same amount however many are needed.
+    share
+        Which part of every joint's range they are drawn from, from 0 to 1.
+
+    Raises
+    ------
+    InputError
+        Where no random configuration leads to the surface.
+    """
+
+    def away(q: Array, rows: np.ndarray) -> Array:
+        data = problem.data.take(rows)
+        blocks = tuple(replace(block, q=q[block.row][:, None]) for block in data.blocks)
+        posed = problem.on(Dataset(blocks, data.label, data.configuration))
+        residual = np.empty(len(q))
+        residual[np.concatenate([block.row for block in blocks])] = posed.residual(x)
+        return (residual - wanted[rows])[:, None]
+
+    target = Target(problem.robot, away, damping=1e-20)  # more would change the last digits of tables
+    poses, beyond = target.reached(len(wanted), rng.spawn(1)[0], share)
+    if beyond is not None:
+        raise InputError("table simulation", "a plane or sphere out of reach", "one that the robot can touch")
+    return poses

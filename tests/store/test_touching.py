@@ -8,7 +8,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
 from rpim_opt.problem import postures
-from rpim_opt.store.touching import touching_poses
+from rpim_opt.store.simulation import touching_poses
 
 SURFACES = ("plane", "sphere")
 COUNT = 30
