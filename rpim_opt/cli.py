@@ -124,8 +124,8 @@ def new(
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with console.progress():
         from rpim_opt.basics.writing import refused
+        from rpim_opt.store.new_folder import new_problem
         from rpim_opt.store.raw import understand_tables
-        from rpim_opt.store.starting import new_problem
 
         asked = console.asked_of(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
@@ -654,7 +654,7 @@ def _calibrated(
     say: Callable[[str], None],
 ) -> "Calibration":
     """Calibrate as a problem's file says, or as the options say instead."""
-    from rpim_opt.store.named import named_formulation, named_weight
+    from rpim_opt.store.problem_file import named_formulation, named_weight
 
     changes: dict[str, Any] = {key: word for key, word in words.items() if word}
     if selector:

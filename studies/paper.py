@@ -20,7 +20,7 @@ from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.baselines import gauss_newton, gradient_descent, linear_least_squares
 from rpim_opt.convex.selection import weight_grid
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.store.named import problems_folder
+from rpim_opt.store.problem_file import problems_folder
 from rpim_opt.study import Metric, Report
 
 QUESTION = "Which of the paper's tables and figures does its published data give, and how much better can one do?"

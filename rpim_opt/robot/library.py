@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.inputs import inside
+from rpim_opt.basics.inputs import inside, require_file
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.expanding import XACRO
 from rpim_opt.robot.plain import read_mdh
@@ -57,3 +58,23 @@ def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = No
 
         return read_urdf(file, urdf_base, urdf_tip)
     return Described(read_mdh(file), np.zeros(6), np.zeros(6))
+
+
+class RobotSource(NamedTuple):
+    """Where a new problem's robot comes from: its file, what the problem file says of it, and in words."""
+
+    file: Path
+    stated: str
+    drawing: str
+
+
+def find_source(robot: str) -> RobotSource:
+    """Return the source of a robot that a command or a script names: a ready one by name, or a file, also a xacro."""
+    endings = (*ROBOT_FILES, XACRO)
+    if not robot.endswith(endings):
+        return RobotSource(find_robot(robot), robot, "a ready robot")
+    file = Path(robot)
+    if not file.exists():
+        raise InputError("the robot", "no such file", f"a file {', '.join(endings)}, or a ready robot", file)
+    require_file(file)
+    return RobotSource(file, "robot.toml", f"modified DH table, from {file.name}")

@@ -1,10 +1,12 @@
 from .instances import Instance as Instance
 from .instances import calibrate as calibrate
 from .instances import load as load
+from .new_folder import new_problem as new_problem
 from .prior_file import load_prior as load_prior
 from .prior_file import save_prior as save_prior
+from .problem_file import find_problem as find_problem
+from .problem_file import problems_folder as problems_folder
 from .raw import Understanding as Understanding
 from .raw import understand_tables as understand_tables
 from .result_file import load_result as load_result
 from .result_file import save_result as save_result
-from .starting import new_problem as new_problem

@@ -34,10 +34,16 @@ from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures
-from rpim_opt.store.named import named_formulation, named_weight
 from rpim_opt.store.observations import Tables, read_tables
 from rpim_opt.store.prior_file import stated_prior
-from rpim_opt.store.problem_file import ProblemTable, Stated, read_problem, stated_scatter
+from rpim_opt.store.problem_file import (
+    ProblemTable,
+    Stated,
+    named_formulation,
+    named_weight,
+    read_problem,
+    stated_scatter,
+)
 from rpim_opt.store.stated_record import stated_details, stated_requirement
 
 

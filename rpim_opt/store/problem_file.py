@@ -13,9 +13,14 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
 from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.units import split_unit
+from rpim_opt.convex.formulation import FORMULATIONS, Formulation
+from rpim_opt.convex.named import LEARNED
+from rpim_opt.convex.select import SELECTORS, Selector
+from rpim_opt.convex.selection import require_weight
 from rpim_opt.data.board import Board, grid_board, read_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -24,14 +29,55 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.named import find, named_formulation, named_weight
 from rpim_opt.store.prior_file import PriorTable
-from rpim_opt.store.proposal import proposed
 from rpim_opt.store.stated_table import Constraints
 
 Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
 LEARNED_NOISE = ("robot", "free", "level", "declared")
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+# --- what people name in a file or on the command line -----------------------------------------------------------
+
+
+def problems_folder() -> Path:
+    """Return the folder of the problems that come with the package: inside it, or beside it in a checkout."""
+    inside = PACKAGE / "problems"
+    return inside if inside.is_dir() else PACKAGE.parent / "problems"
+
+
+def find_problem(name: str | Path) -> Path:
+    """Return the folder of a problem, given its path or the name of one that comes with the package."""
+    path = Path(name)
+    if path.is_file() and path.name == "problem.toml":
+        return path.parent
+    if path.is_dir():
+        return path
+    known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
+    if str(name) in known:
+        return problems_folder() / str(name)
+    accepted = "a folder with problem.toml, or " + choices(str(name), known)
+    raise InputError("the problem", f"no folder '{name}'", accepted)
+
+
+def named_formulation(text: str, file: Path | None = None) -> Formulation:
+    """Return the ready formulation of that name."""
+    return pick(FORMULATIONS, text, "key formulation", file)
+
+
+def named_weight(text: str, file: Path | None = None) -> float | Selector | None:
+    """Return the selector of that name, or the number that the text is; None where hyperparameters are estimated."""
+    if text == LEARNED:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        return pick(SELECTORS, text, "key selector", file, f"a number, {LEARNED}, ")
+    return require_weight(value, "selector", file)
+
+
+# --- the schema --------------------------------------------------------------------------------------------------
 
 
 class FrameTable(Table):
@@ -134,7 +180,7 @@ class Stated:
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
         patterns = table.identify
         if patterns == "auto":
-            patterns = proposed(self.robot, parameters, data)
+            patterns = identifiable(self.robot, parameters, data)
         return parameters.identify(patterns)
 
 
@@ -145,7 +191,7 @@ def read_problem(
     model: KinematicModel | None = None,
 ) -> Stated:
     """Return what a problem file states; arguments and errors as for `load`."""
-    folder = find(name)
+    folder = find_problem(name)
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     table, placed = _tables(read_toml(path), variant, kinds, path)

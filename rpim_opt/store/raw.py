@@ -22,8 +22,7 @@ from rpim_opt.data.tables.understanding import Asked, Understood, understand
 from rpim_opt.data.tables.units import split
 from rpim_opt.problem.orientation import pose_misfit
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.library import read_arm
-from rpim_opt.store.drawing import find_source
+from rpim_opt.robot.library import find_source, read_arm
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
@@ -91,9 +90,8 @@ class Understanding:
     def sentences(self) -> tuple[str, ...]:
         """The same in sentences, without what stands as it was.
 
-        >>> from rpim_opt.store.named import find
         >>> import rpim_opt as ro
-        >>> arm = find("paper_arm")
+        >>> arm = ro.store.find_problem("paper_arm")
         >>> ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"]).sentences
         ()
         """
@@ -111,9 +109,8 @@ class Understanding:
     def content(self) -> dict[str, Any]:
         """Return the same as a document.
 
-        >>> from rpim_opt.store.named import find
         >>> import rpim_opt as ro
-        >>> arm = find("paper_arm")
+        >>> arm = ro.store.find_problem("paper_arm")
         >>> found = ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"])
         >>> found.content()["columns"][1]["meaning"], found.content()["rows"]
         ('joint 1', 9)

@@ -21,7 +21,7 @@ from rpim_opt.data.board import on_board
 from rpim_opt.data.contact import touches
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import Measurement, of_fixture
-from rpim_opt.data.reading import read_data
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.postures import Target, postures_at
 from rpim_opt.problem.problem import CalibrationProblem
@@ -248,7 +248,7 @@ class TableMaker:
         return self._measured(random)
 
     def _measured(self, random: Array) -> tuple[Columns, list[str]]:
-        """Return a table of measured values, or of touches of a plane or sphere; of values the second half serve `to_`."""
+        """Return a table of measured values, or of configurations on a plane or sphere."""
         kind, truth = self.shape.kind, self.world.x
         rows = self._rows(len(random) // 2)
         q = np.array([[random[k], random[len(random) // 2 + k]][: kind.points] for k, _, _ in rows])

@@ -13,13 +13,13 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, of_fixture
 from rpim_opt.data.projection import INTRINSICS
 from rpim_opt.problem.frames import starting_cameras, starting_parameters
+from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.located import locate
 from rpim_opt.problem.views import camera_blocks, posed
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.plain import exact, toml
-from rpim_opt.store.proposal import proposed
 
 TEMPLATE = """\
 # Made by rpim-opt new; look at it, then: rpim-opt inspect, rpim-opt calibrate.
@@ -142,7 +142,7 @@ def problem_text(
         **{**said, "target": TARGET_TEXT.format(target=said["target"]) if seen else ""},
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
-        identify=toml(_patterns(proposed(arm.robot, parameters, rows), arm.robot.dof)),
+        identify=toml(_patterns(identifiable(arm.robot, parameters, rows), arm.robot.dof)),
         auto=f'base = "auto"\n# {how}\n' if base is None else "",
         noise="\n".join(f"{key} = {value}" for key, value in noise.items()),
         scale="100.0" if base is None else "1.0",

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from rpim_opt.data.record import PACKAGES
-from rpim_opt.store.named import problems_folder
+from rpim_opt.store.problem_file import problems_folder
 from rpim_opt.study.grid import files_of, name_of, of_checkout, studies_folder
 
 PACKAGE = Path(__file__).resolve().parents[1]

@@ -16,7 +16,7 @@ from rpim_opt.basics.units import split_unit
 from rpim_opt.convex.combination import combination
 from rpim_opt.convex.sentence import sentence
 from rpim_opt.data.tables.units import split
-from rpim_opt.store.seen_target import seen_target
+from rpim_opt.store.new_folder import stated_target
 
 MANY = 19_000
 SOON = 3.0
@@ -86,4 +86,4 @@ def test_a_table_whose_mark_stands_there_twice(tmp_path: Path) -> None:
 @pytest.mark.parametrize("grid", ["9" * 5000 + "x5,30mm", "300x301,30mm", "1x5,30mm", "7x5,1.2.3mm", "\u0667x5,30mm"])
 def test_a_grid_that_no_board_has(grid: str) -> None:
     with pytest.raises(ro.InputError):
-        seen_target(grid)
+        stated_target(grid)

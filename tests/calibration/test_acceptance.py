@@ -254,9 +254,9 @@ q1_deg = [-30.0, 30.0]
 def folder(tmp_path: Path) -> Path:
     import shutil
 
-    from rpim_opt.store.named import find
+    from rpim_opt.store.problem_file import find_problem
 
-    return Path(shutil.copytree(find("position"), tmp_path / "position"))
+    return Path(shutil.copytree(find_problem("position"), tmp_path / "position"))
 
 
 def stated(folder: Path, text: str) -> Path:

@@ -18,7 +18,7 @@ from typing import Any
 import rpim_opt as ro
 from rpim_opt import cli
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.named import problems_folder
+from rpim_opt.store.problem_file import problems_folder
 from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF, make_cell
 from tests.fuzz.trial import Failure, failure, limited
 

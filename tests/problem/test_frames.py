@@ -128,7 +128,7 @@ def test_a_base_nobody_knows_is_registered() -> None:
 def test_anchors_and_spheres_are_located_where_none_is_stated(tmp_path) -> None:
     import shutil
 
-    from rpim_opt.store.named import problems_folder
+    from rpim_opt.store.problem_file import problems_folder
 
     folder = shutil.copytree(problems_folder() / "sphere", tmp_path / "sphere")
     text = (folder / "problem.toml").read_text()

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.named import find
+from rpim_opt.store.new_folder import stated_target
+from rpim_opt.store.problem_file import find_problem
 from rpim_opt.store.result_file import require_agreement
-from rpim_opt.store.seen_target import seen_target
 from rpim_opt.store.serialize import digest
 from tests import ROOT
 from tests.simulate import simulated
@@ -64,17 +64,17 @@ def test_a_folder_that_does_not_fit_is_named(tmp_path: Path, what: str) -> None:
 
 
 def test_a_folder_may_be_named_by_its_file() -> None:
-    assert find(ROOT / "problems" / "position" / "problem.toml") == ROOT / "problems" / "position"
+    assert find_problem(ROOT / "problems" / "position" / "problem.toml") == ROOT / "problems" / "position"
 
 
 def test_targets_are_grids_or_tables(tmp_path: Path) -> None:
-    assert seen_target("").stated == ""
-    assert len(seen_target("7x5,30mm").board) == 35
+    assert stated_target("").stated == ""
+    assert len(stated_target("7x5,30mm").board) == 35
     with pytest.raises(ro.InputError, match="a grid such as 7x5,30mm"):
-        seen_target("7 by 5")
+        stated_target("7 by 5")
     path = tmp_path / "board.csv"
     path.write_text("point,x_mm,y_mm\na,0,0\nb,30,0\nc,0,30\n")
-    found = seen_target(str(path))
+    found = stated_target(str(path))
     assert found.board["b"] == pytest.approx([0.03, 0.0, 0.0])
     assert found.table["point"] == ["a", "b", "c"]
 

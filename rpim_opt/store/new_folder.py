@@ -1,0 +1,330 @@
+"""A problem folder from a robot and a table of measurements: what it holds, and which rows are kept for validation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.inputs import read_text
+from rpim_opt.basics.tables import Columns, csv_text
+from rpim_opt.basics.units import UNITS
+from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
+from rpim_opt.data.board import Board, grid_board, on_board, read_board
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.models import CAMERAS, Measurement
+from rpim_opt.data.tables.naming import TOUCHED
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.understanding import Asked
+from rpim_opt.data.tables.units import parse_units
+from rpim_opt.problem.frames import starting_cameras
+from rpim_opt.problem.located import locate
+from rpim_opt.problem.views import posed
+from rpim_opt.robot.chain import Described
+from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
+from rpim_opt.robot.library import RobotSource, find_source, read_arm
+from rpim_opt.robot.plain import toml, write_robot
+from rpim_opt.store.raw import Understanding, understand_of
+from rpim_opt.store.template import problem_text
+
+NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
+"""Standard deviations that are written where the data state none."""
+IDENTIFICATION, VALIDATION, TARGET = "identification.csv", "validation.csv", "target.csv"
+"""Files of a new folder."""
+GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
+CAMERA_CLEARLY = 3.0
+"""The camera is where the poses fit so many times better."""
+
+
+@dataclass(frozen=True)
+class Started:
+    """A folder that was made: its files with their rows, a sentence for all that was recognised or guessed."""
+
+    folder: Path
+    rows: Mapping[str, int]
+    notes: tuple[str, ...]
+    understood: Understanding
+
+    def __str__(self) -> str:
+        """Return the files and the sentences."""
+        lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
+        then = f"Look at {self.folder / 'problem.toml'}, then: rpim-opt inspect {self.folder}"
+        return "\n".join([f"Made: {self.folder}", *lines, *self.notes, then])
+
+
+def new_problem(
+    folder: str | Path,
+    robot: str,
+    data: str | Path | Sequence[str | Path],
+    *,
+    measurement: str | None = None,
+    units: str = "",
+    asked: Asked | None = None,
+    validation: str | Path | None = None,
+    hold_out: float | None = None,
+    seed: int = 0,
+    urdf_base: str | None = None,
+    urdf_tip: str | None = None,
+    target: str = "",
+    understood: Callable[[Understanding], None] | None = None,
+) -> Started:
+    """Make a problem folder that `load` reads; the folder is whole or not there.
+
+    Parameters
+    ----------
+    folder
+        A new one.
+    robot
+        The name of a ready robot, or a file ``.urdf``, ``.xacro``, ``.toml``, ``.json`` or ``.csv``.
+    data
+        Measurements, in one or several text, Excel or Parquet files of whatever columns `understand_tables` recognises.
+    measurement
+        What was measured; by default poses where the table has orientations, else positions.
+    units
+        Units of columns whose name carries none, ``"deg,mm"``.
+    asked
+        What else is stated of the tables, and their units.
+    validation
+        A table of measurements for validation.
+    hold_out
+        Instead of that, which part of the configurations to hold out, drawn at random.
+    seed
+        Of the draw.
+    urdf_base, urdf_tip
+        Links between which a URDF's robot is.
+    target
+        What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
+    understood
+        Called with what was understood of the tables, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        For a folder that is there already, and whatever of the robot or the data cannot be used.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.store.find_problem("paper_arm")
+    >>> made = ro.store.new_problem("cell7", str(arm / "robot.toml"), arm / "identification.csv", hold_out=0.25)
+    >>> made.rows
+    {'identification.csv': 7, 'validation.csv': 2}
+    """
+    folder = Path(folder)
+    if folder.exists() or folder.is_symlink():
+        raise InputError("the folder", "one that is there", "a new one: nothing is overwritten", folder)
+    if validation is not None and hold_out is not None:
+        raise InputError("validation", "a table and a part to hold out", "one of them")
+    source = find_source(robot)
+    arm = read_arm(source.file, urdf_base, urdf_tip)
+    paths = [data] if isinstance(data, str | Path) else data
+    found = understand_of(arm, paths, measurement, asked or Asked(units=parse_units(units)))
+    if understood is not None:
+        understood(found)
+    board = stated_target(target)
+    _require_target(found, board)
+    kind, how = _kind(arm, found, board, measurement)
+    reader = _Reader(arm, kind, board)
+    rows = reader.rows(found.file, found.columns)
+    columns = found.columns
+    if "label" not in columns:  # a row keeps its number where others are held out
+        columns = {"label": rows.label, **columns}
+    if validation is not None:
+        parts = reader.beside(found, columns, rows, validation)
+    elif hold_out is not None:
+        parts = _held_out(columns, rows, hold_out, seed)
+    else:
+        said = f'# validation = "{VALIDATION}"   # a table that no choice may see; none was given'
+        parts = _Parts({IDENTIFICATION: columns}, rows, said)
+    tables = parts.tables
+    if board.table:
+        tables = {**tables, TARGET: board.table}
+    said = {
+        "target": board.stated,
+        "robot": toml(source.stated),
+        "drawing": source.drawing,
+        "columns": how,
+        "data": Path(found.file).name,
+        "count": str(len(parts.rows)),
+        "validation": parts.said,
+    }
+    try:
+        text, guessed = problem_text(arm, kind, parts.rows, reader.noise, said)
+    except InputError as error:
+        raise error.within(found.file) from None
+    _write(folder, text, tables, source, arm)
+    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
+    notes = (*found.sentences, *parts.notes, f"Measurement {kind.name}: {how}.", *guessed)
+    return Started(folder, counts, notes, replace(found, kind=kind))
+
+
+def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: RobotSource, arm: Described) -> None:
+    """Make the folder beside its place, and move it there when it is whole."""
+    with undoing() as parents, ExitStack() as stack:
+        make_folder(folder.parent, parents)
+        made = stack.enter_context(scratch_folder(folder)) / folder.name
+        write_text(made / "problem.toml", text)
+        for name, each in tables.items():
+            write_text(made / name, csv_text(each, zip(*each.values(), strict=True)))
+        if source.file.suffix == ".toml" and source.stated == "robot.toml":
+            write_text(made / "robot.toml", read_text(source.file))  # with its comments
+        elif source.stated == "robot.toml":
+            write_robot(arm.robot, made / "robot.toml")
+        made.rename(folder)
+
+
+# --- rows that identify, and rows for validation -----------------------------------------------------------------
+
+
+class _Parts(NamedTuple):
+    """Tables by file, the rows that identify, what the problem file says of validation, and notes."""
+
+    tables: Mapping[str, Columns]
+    rows: Dataset
+    said: str
+    notes: tuple[str, ...] = ()
+
+
+class _Reader(NamedTuple):
+    """How tables are read."""
+
+    arm: Described
+    kind: Measurement
+    target: StatedTarget
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Noise by key, where the data state none."""
+        return {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in self.kind.noise.items()}
+
+    def rows(self, file: str | Path, columns: Columns) -> Dataset:
+        """Return the rows of a table; errors name its file."""
+        try:
+            return read_data(self.target.under(columns), self.arm.robot, self.noise, self.kind)
+        except InputError as error:
+            raise error.within(file) from None
+
+    def beside(self, found: Understanding, columns: Columns, rows: Dataset, validation: str | Path) -> _Parts:
+        """Return all rows, and those of a table of its own for validation."""
+        other = understand_of(self.arm, [validation], self.kind.name, found.asked)
+        self.rows(validation, other.columns)
+        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; no choice sees it'
+        return _Parts({IDENTIFICATION: columns, VALIDATION: other.columns}, rows, said, other.sentences)
+
+
+def _held_out(columns: Columns, rows: Dataset, share: float, seed: int) -> _Parts:
+    """Return the rows without a share of the configurations, at least one, which is held out."""
+    known = len(np.unique(rows.configuration))
+    if not 0 < share < 1 or known < 2:
+        raise InputError("--hold-out", f"{share:g} of {known} configurations", "a part between 0 and 1 of two or more")
+    drawn = rows.configurations(min(max(round(share * known), 1), known - 1), seed)
+    held = np.isin(rows.configuration, drawn.configuration)
+
+    def take(chosen: np.ndarray) -> Columns:
+        return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
+
+    said = f'validation = "{VALIDATION}"\n# configurations drawn with seed {seed}; no choice sees them'
+    return _Parts({IDENTIFICATION: take(~held), VALIDATION: take(held)}, rows.take(np.flatnonzero(~held)), said)
+
+
+# --- what was measured, and the board that a camera sees ---------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StatedTarget:
+    """A board: its points, what ``target`` of a problem file says of it, and the table to write, if it has one."""
+
+    board: Board
+    stated: str
+    table: Columns
+
+    def under(self, columns: Columns) -> Columns:
+        """Return the columns of a table of corners with where their points are; as they are without a board."""
+        return on_board(columns, self.board) if self.board else columns
+
+
+def stated_target(text: str) -> StatedTarget:
+    """Return the board that ``--target`` states: a table, or columns, rows and spacing of a grid; empty for nothing.
+
+    Examples
+    --------
+    >>> from rpim_opt.store.new_folder import stated_target
+    >>> stated_target("7x5,30mm").stated
+    'target = { columns = 7, rows = 5, spacing_mm = 30 }'
+    """
+    if not text:
+        return StatedTarget({}, "", {})
+    match = GRID.fullmatch(text.strip())
+    if match:
+        columns, rows, spacing, unit = match.groups()
+        board = grid_board(int(columns), int(rows), float(spacing) * UNITS[unit].si)
+        return StatedTarget(board, f"target = {{ columns = {columns}, rows = {rows}, spacing_{unit} = {spacing} }}", {})
+    if "." not in text:
+        raise InputError("--target", f"'{text}'", "a table with point, x_mm, y_mm, or a grid such as 7x5,30mm")
+    board = read_board(text)
+    places = np.array(list(board.values())) * 1e3
+    table = {"point": list(board)}
+    table |= {f"{axis}_mm": [repr(float(v)) for v in column] for axis, column in zip("xyz", places.T, strict=True)}
+    return StatedTarget(board, f'target = "{TARGET}"', table)
+
+
+def _require_target(found: Understanding, target: StatedTarget) -> None:
+    """Refuse pixels without a board, and a board without pixels."""
+    if target.board and not found.kind.by_camera:
+        accepted = f"none: measurement {found.kind.name} sees no points of one"
+        raise InputError("--target", "a board", accepted, found.file)
+    stated = any(name.startswith("target_x") for name in found.columns)
+    if found.kind.by_camera and not target.board and not stated:
+        accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
+        raise InputError("the target", "nothing", accepted, found.file)
+
+
+def _kind(
+    arm: Described, found: Understanding, target: StatedTarget, measurement: str | None
+) -> tuple[Measurement, str]:
+    """Return the kind of measurement, and how it is known."""
+    kind = found.kind
+    if measurement is not None:
+        return kind, "as you said"
+    if kind.by_camera:
+        return _camera(arm, target.under(found.columns))
+    if not kind.touching:
+        return kind, f"guessed from the columns {', '.join(kind.columns)}"
+    column = next(name for name in TOUCHED if name in found.columns)
+    count = len(set(found.columns[column]))
+    return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
+
+
+def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
+    """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found.
+
+    Raises
+    ------
+    InputError
+        Where neither fits clearly better.
+    """
+    misfit = {name: _misfit(arm, columns, kind) for name, kind in CAMERAS.items()}
+    best, other = sorted(misfit, key=lambda name: misfit[name])
+    said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
+    if not misfit[other] > CAMERA_CLEARLY * misfit[best]:
+        raise InputError("the camera", f"no clear place ({best} leaves {said})", f"--measurement {best} or {other}")
+    return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
+
+
+def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:
+    """Return by how much poses of the views are off (RMS) where base and tool fit best [m]."""
+    data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
+    poses = posed(data, starting_cameras(data, {}))
+    tools = {block.markers[0]: np.zeros(6) for block in poses.blocks}
+    base, places, _ = locate(arm.robot, poses, tools)
+    squares = []
+    for block in poses.blocks:
+        T = numeric_frame(base) @ forward_kinematics(arm.robot, block.q[:, 0]) @ numeric_frame(places[block.markers[0]])
+        squares += np.sum((T[:, :3, 3] - block.y[:, :3]) ** 2, axis=1).tolist()
+    return float(np.sqrt(np.mean(squares)))
