@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -10,16 +9,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import CAMERAS
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
-
-GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
-BASE = re.compile(r"base_.*")
-PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
-POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
-"""Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,17 +80,3 @@ def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -
         farthest = x
     machine = replace(known.machine, at=x, farthest=farthest)
     return replace(model, parameters=replace(known, machine=machine))
-
-
-def identifiable(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
-    """Return the names that ``identify = "auto"`` means: geometry, Hayati's beta where it is needed, and places."""
-    from rpim_opt.problem.observability import near_parallel
-
-    kinds = {block.measurement.name for block in data.blocks}
-    turning = {"pose", *CAMERAS}
-    patterns = [GEOMETRY]
-    if kinds & {"position", *turning}:  # distances do not tell where the robot stands
-        patterns.append(BASE)
-    patterns.append(PLACES if kinds & turning else POINTS)  # nothing else sees how a reflector is turned
-    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in patterns)
-    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

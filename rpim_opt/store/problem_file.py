@@ -20,7 +20,6 @@ from rpim_opt.convex.selection import require_weight
 from rpim_opt.data.board import Board, grid_board, read_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import MEASUREMENTS, Measurement
-from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -180,6 +179,8 @@ class Stated:
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
         patterns = table.identify
         if patterns == "auto":
+            from rpim_opt.problem.observability import identifiable  # most files name them
+
             patterns = identifiable(self.robot, parameters, data)
         return parameters.identify(patterns)
 

@@ -13,8 +13,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, of_fixture
 from rpim_opt.data.projection import INTRINSICS
 from rpim_opt.problem.frames import starting_cameras, starting_parameters
-from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.located import locate
+from rpim_opt.problem.observability import identifiable
 from rpim_opt.problem.views import camera_blocks, posed
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
