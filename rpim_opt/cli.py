@@ -150,7 +150,7 @@ def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) ->
     """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
-        from rpim_opt.problem.inspection import inspect
+        from rpim_opt.problem.diagnosis import inspect
         from rpim_opt.store.instances import load
 
         say("reading the problem")
@@ -526,7 +526,7 @@ def design(
     with console.progress() as say:
         from rpim_opt.basics.tables import csv_text
         from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
-        from rpim_opt.problem.postures import postures_at, touched_place
+        from rpim_opt.problem.workspace import postures_at, touched_place
         from rpim_opt.store.instances import load
 
         say("reading the problem")

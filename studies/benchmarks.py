@@ -30,9 +30,8 @@ from rpim_opt.basics.threads import cores, on_all_cores, one_blas_thread
 from rpim_opt.convex import conic
 from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
+from rpim_opt.problem.parts import ROWS, PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.triangles import ROWS, reduced
 from rpim_opt.study.grid import find_study, load_study
 from rpim_opt.study.report import Metric, Report
 

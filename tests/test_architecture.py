@@ -158,7 +158,6 @@ ELSEWHERE = {
     "rpim_opt.bayes.population",
     "rpim_opt.convex.sentence",
     "rpim_opt.data.tracker",
-    "rpim_opt.problem.observability",
     "rpim_opt.robot.urdf",
     "cattrs",
 }

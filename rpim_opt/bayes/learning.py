@@ -16,8 +16,8 @@ from rpim_opt.bayes.outliers import beyond, suspected, unbelievable
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.frames import settled
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import settled
 from rpim_opt.problem.scatter import Scatter, Stack
 from rpim_opt.problem.source import Source
 

@@ -19,7 +19,7 @@ from rpim_opt.calibration.weighed import calibrated, require_passes
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.convex.named import formulation_of, weight_of
 from rpim_opt.convex.select import Selector
-from rpim_opt.problem.frames import relocated
+from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.source import Source
 
 NOISE = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.problem.views import camera_blocks
+from rpim_opt.problem.registration.camera import camera_blocks
 
 
 def camera_remarks(result: Calibration) -> list[str]:

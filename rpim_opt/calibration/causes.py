@@ -12,9 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.readings import Better, better_reading
-from rpim_opt.problem.suspects import (
+from rpim_opt.problem.diagnosis import (
     exchanged_rows,
     moved,
     moved_far,
@@ -22,6 +20,8 @@ from rpim_opt.problem.suspects import (
     rows_without_values,
     shared_rows,
 )
+from rpim_opt.problem.misreadings import Better, better_reading
+from rpim_opt.problem.problem import CalibrationProblem
 
 NOISY = 3.0
 """Residuals beyond so many times what the instrument is stated to have are looked into."""

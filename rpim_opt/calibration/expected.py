@@ -12,7 +12,7 @@ from rpim_opt.calibration.intervals import coverage_factor
 from rpim_opt.calibration.leaving_out import influence
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.identified import Machine, require_robot
-from rpim_opt.problem.predicting import moved, predicted, within_ranges
+from rpim_opt.problem.workspace import moved, predicted, within_ranges
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameter_names import of_joint, own_name
 

@@ -19,8 +19,8 @@ from rpim_opt.calibration.weighed import calibrated
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import pose
 from rpim_opt.convex.selection import Selection
-from rpim_opt.problem.frames import relocated
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameters import Parameters
 

@@ -11,7 +11,7 @@ from scipy.special import chdtrc, stdtrit
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.sessions import unknown_sessions
+from rpim_opt.problem.several import unknown_sessions
 from rpim_opt.problem.source import Source
 
 Interval = Literal["mean", "reached", "reading"]

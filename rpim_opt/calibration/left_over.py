@@ -14,8 +14,8 @@ from rpim_opt.bayes.comparison import OWNED, SPEAK, Comparison, Judged
 from rpim_opt.bayes.model_selection import SESSIONS, TURNED, WARMTH
 from rpim_opt.bayes.prior import family_of
 from rpim_opt.calibration.alike import Alike, alike
-from rpim_opt.problem.loads import measured_torques, repeatable
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.row_functions import measured_torques, repeatable
 
 PATTERNS = {
     "gravity": ("compliance?",),

@@ -40,11 +40,10 @@ from rpim_opt.convex.trust import Trusted
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.data.record import Record
-from rpim_opt.problem.frames import fitted_frames
-from rpim_opt.problem.functions import transform
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.row_functions import bearing, transform
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameter_names import own_name

@@ -13,7 +13,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.requirement import Requirement
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.identified import Machine, identified_of, require_robot
-from rpim_opt.problem.predicting import in_base, markers
+from rpim_opt.problem.workspace import in_base, markers
 
 DRAWN, ROUNDS = 4096, 16
 """Configurations that are drawn at once, and how often at most."""

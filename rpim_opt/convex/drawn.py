@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
-from rpim_opt.problem.predicting import within_box, within_ranges
+from rpim_opt.problem.workspace import within_box, within_ranges
 from rpim_opt.robot.parameters import Parameters
 
 if TYPE_CHECKING:

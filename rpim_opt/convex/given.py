@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.patterns import fits
 from rpim_opt.convex.atoms import cp
 from rpim_opt.problem.identified import Identified, Machine
-from rpim_opt.problem.predicting import Predicted, markers, moved, predicted
+from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
 
 

@@ -16,8 +16,8 @@ from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import position
 from rpim_opt.problem.linear import RANK_TOLERANCE
-from rpim_opt.problem.loads import bearing
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.row_functions import bearing
 from rpim_opt.robot.mdh import Robot
 
 CRITERIA = ("D", "A", "E", "V")

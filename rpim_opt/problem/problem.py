@@ -15,12 +15,15 @@ from rpim_opt.basics.phases import phase
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
-from rpim_opt.problem.functions import Functions, Kept, Structure, asked
 from rpim_opt.problem.identified import Identified, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
-from rpim_opt.problem.loads import (
+from rpim_opt.problem.row_functions import (
+    Functions,
+    Kept,
     Loads,
     Needs,
+    Structure,
+    asked,
     columns,
     loads_of,
     measured_torques,

@@ -26,9 +26,9 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.data.requirement import Requirement
-from rpim_opt.problem.frames import starting_parameters
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel

@@ -23,9 +23,8 @@ from rpim_opt.data.tables.naming import TOUCHED
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked
 from rpim_opt.data.tables.units import parse_units
-from rpim_opt.problem.frames import starting_cameras
-from rpim_opt.problem.located import locate
-from rpim_opt.problem.views import posed
+from rpim_opt.problem.registration.camera import posed
+from rpim_opt.problem.registration.frames import locate, starting_cameras
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 from rpim_opt.robot.library import RobotSource, find_source, read_arm

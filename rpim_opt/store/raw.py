@@ -20,7 +20,7 @@ from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked, Understood, understand
 from rpim_opt.data.tables.units import split
-from rpim_opt.problem.orientation import pose_misfit
+from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_source, read_arm
 

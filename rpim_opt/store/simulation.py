@@ -23,9 +23,8 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.postures import Target, postures_at
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.sight import postures_in_sight
+from rpim_opt.problem.workspace import Target, postures_at, postures_in_sight
 from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.fixtures import place_fixtures

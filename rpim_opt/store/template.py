@@ -12,10 +12,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, of_fixture
 from rpim_opt.data.projection import INTRINSICS
-from rpim_opt.problem.frames import starting_cameras, starting_parameters
-from rpim_opt.problem.located import locate
 from rpim_opt.problem.observability import identifiable
-from rpim_opt.problem.views import camera_blocks, posed
+from rpim_opt.problem.registration.camera import camera_blocks, posed
+from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH

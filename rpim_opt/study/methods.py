@@ -17,8 +17,8 @@ from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_o
 from rpim_opt.convex.named import LEARNED, weight_of
 from rpim_opt.convex.select import SELECTORS
 from rpim_opt.convex.selection import require_weight
-from rpim_opt.problem.frames import fitted_frames
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance
 from rpim_opt.study.splits import FOLDER
 

@@ -20,7 +20,7 @@ from rpim_opt.convex.structure import Quadratic
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.sessions import knowing_sessions
+from rpim_opt.problem.several import knowing_sessions
 from rpim_opt.problem.source import Source
 from rpim_opt.use.changes import SIZES, Missed, widths
 

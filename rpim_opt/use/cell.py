@@ -17,8 +17,8 @@ from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import Measurement, position
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.loads import Loads, bearing, loads_on, require_same_torques
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.row_functions import Loads, bearing, loads_on, require_same_torques
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot

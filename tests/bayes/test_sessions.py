@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.unseen import judged
 from rpim_opt.problem.parts import PartitionedProblem
-from rpim_opt.problem.sessions import unknown_sessions
+from rpim_opt.problem.several import unknown_sessions
 from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameter_names import of_session
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL

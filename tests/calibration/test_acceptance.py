@@ -15,7 +15,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_json
 from rpim_opt.calibration.reaching import distance_quantile, reaching
 from rpim_opt.calibration.region import region_of
-from rpim_opt.problem.predicting import in_base
+from rpim_opt.problem.workspace import in_base
 from rpim_opt.store.serialize import digest
 from tests.simulate import simulated
 from tests.test_cli import run

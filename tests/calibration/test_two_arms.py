@@ -11,7 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.contact_words import scatter
 from rpim_opt.data.contact import by_points
-from rpim_opt.problem.meeting import met
+from rpim_opt.problem.registration.frames import met
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
 SIGMA = 3e-5

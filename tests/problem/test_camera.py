@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
 from rpim_opt.data.projection import INTRINSICS, TARGET
-from rpim_opt.problem import sight
-from rpim_opt.problem.readings import better_reading
-from rpim_opt.problem.views import normalized, posed, starting_camera
+from rpim_opt.problem import workspace as sight
+from rpim_opt.problem.misreadings import better_reading
+from rpim_opt.problem.registration.camera import normalized, posed, starting_camera
 
 BOARD = ro.data.grid_board(4, 3, 0.05)
 POINTS = np.array(list(BOARD.values()))

@@ -11,11 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rpim_opt as ro
-from rpim_opt.problem.located import locate
-from rpim_opt.problem.moments import relaxation, rotation_constraints
-from rpim_opt.problem.placing import hand_eye, transforms
-from rpim_opt.problem.relaxed import relax
-from rpim_opt.problem.rotations import lifted, smallest
+from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
+from rpim_opt.problem.registration.frames import locate
+from rpim_opt.problem.registration.relaxation import lifted, relax, relaxation, rotation_constraints, smallest
 from rpim_opt.study.grid import find_study, load_study
 from tests import SHARED
 

@@ -10,9 +10,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rpim_opt as ro
-from rpim_opt.problem.consensus import MOST_PAIRED, alone, compatible, core, likeliest
-from rpim_opt.problem.loops import Loops, Seen, Turns, of_motions, of_poses
-from rpim_opt.problem.rotations import lifted, smallest, undercut
+from rpim_opt.problem.registration.loops import (
+    MOST_PAIRED,
+    Loops,
+    Seen,
+    Turns,
+    alone,
+    compatible,
+    core,
+    likeliest,
+    of_motions,
+    of_poses,
+)
+from rpim_opt.problem.registration.relaxation import lifted, smallest, undercut
 
 BEYOND = float(chi2.ppf(0.99, 6))
 

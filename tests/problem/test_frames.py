@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
-from rpim_opt.problem import located
-from rpim_opt.problem.located import locate
-from rpim_opt.problem.placing import hand_eye, register, tool_from_distances
+from rpim_opt.problem.registration import frames as located
+from rpim_opt.problem.registration.closed_forms import hand_eye, register, tool_from_distances
+from rpim_opt.problem.registration.frames import locate
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ARM, simulated
 

@@ -13,7 +13,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
-from rpim_opt.problem.functions import Kept, _built, _ready, asked
+from rpim_opt.problem.row_functions import Kept, _built, _ready, asked
 
 ZERO = 0.0
 COLUMNS = {"z": "length"}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.inspection import inspect
+from rpim_opt.problem.diagnosis import inspect
 from tests.test_cli import run
 
 CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axis", "tracker", "scara", "paper_arm")

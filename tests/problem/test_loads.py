@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.models import MEASUREMENTS
-from rpim_opt.problem.loads import bearing, repeatable
+from rpim_opt.problem.row_functions import bearing, repeatable
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misfit import (
+from rpim_opt.problem.misreadings import (
     FEWEST_ROWS,
     Points,
     _registered,

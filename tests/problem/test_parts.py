@@ -15,8 +15,7 @@ from rpim_opt.basics import threads
 from rpim_opt.convex.majorize import Squares
 from rpim_opt.convex.trust import trusted_parts
 from rpim_opt.problem import parts as parts_module
-from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster
-from rpim_opt.problem.triangles import whole_configurations
+from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster, whole_configurations
 
 
 def thirds(problem: ro.CalibrationProblem) -> list[np.ndarray]:

@@ -13,11 +13,10 @@ from rpim_opt.data.board import on_board
 from rpim_opt.data.contact import KnownAngle, KnownDistance, touches
 from rpim_opt.data.models import plane, pose, position
 from rpim_opt.data.spread import declared_noise
-from rpim_opt.problem.located import locate
 from rpim_opt.problem.parts import partitions
-from rpim_opt.problem.postures import postures_at, touched_place
-from rpim_opt.problem.predicting import Machine, within_box
-from rpim_opt.problem.views import posed, starting_camera
+from rpim_opt.problem.registration.camera import posed, starting_camera
+from rpim_opt.problem.registration.frames import locate
+from rpim_opt.problem.workspace import Machine, postures_at, touched_place, within_box
 from tests.problem.test_camera import BOARD, LENS, SIGMA, world
 from tests.simulate import ARM
 

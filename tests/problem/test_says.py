@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.contact import contact_sentences
-from rpim_opt.problem.inspection import _angle_units
-from rpim_opt.problem.suspects import moved_far, rounded_joints, shared_rows
+from rpim_opt.problem.diagnosis import _angle_units, contact_sentences, moved_far, rounded_joints, shared_rows
 from tests.simulate import ARM, simulated
 
 

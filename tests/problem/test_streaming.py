@@ -18,9 +18,8 @@ from rpim_opt.data import reading
 from rpim_opt.data.models import MEASUREMENTS
 from rpim_opt.problem import parts as streaming
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions
+from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.triangles import reduced
 
 PARTS, ROWS = 5, 1100
 
@@ -85,7 +84,7 @@ def test_pieces_stay_as_they_are_when_the_next_one_comes() -> None:
 @pytest.mark.parametrize("name", ["position", "mixed", "pose", "tracker", "markers"])
 @pytest.mark.parametrize("few", [3, 7, 1024])
 def test_rows_that_are_written_where_they_are_reduced_say_the_same(name: str, few: int, monkeypatch) -> None:
-    monkeypatch.setattr("rpim_opt.problem.triangles.FEW", few)
+    monkeypatch.setattr("rpim_opt.problem.parts.FEW", few)
     problem = ro.load(name).problem
     x = 0.1 * problem.parameters.free.scale
     rows, found = problem.linearize(x), reduced(problem, x)

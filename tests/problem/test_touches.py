@@ -16,8 +16,7 @@ from rpim_opt.bayes.outliers import clustered, ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.contact import KnownAngle, KnownDistance, touches, with_known
 from rpim_opt.problem.scatter import Scatter, stacked
-from rpim_opt.problem.touched import Plane
-from rpim_opt.problem.touches import Touches, contrasted
+from rpim_opt.problem.touches import Plane, Touches, contrasted
 
 SIGMA = 3e-5
 NAMES = ("A", "B", "C", "D")

@@ -1,4 +1,4 @@
-"""Where a camera and its board were in every view, by homographies: what a start needs."""
+"""Camera poses by homographies (PnP) and start values of intrinsics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import CAMERAS, eye_in_hand, of_fixture, pose
 from rpim_opt.data.projection import INTRINSICS, TARGET
-from rpim_opt.problem.placing import proper
+from rpim_opt.problem.registration.closed_forms import proper
 
 FEWEST = {True: 4, False: 6}
 """Points that a view of a plane, and of points in space, has to show."""
@@ -48,7 +48,7 @@ def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
     Examples
     --------
     >>> import numpy as np
-    >>> from rpim_opt.problem.views import normalized
+    >>> from rpim_opt.problem.registration.camera import normalized
     >>> normalized(np.array([[740.0, 480.0]]), {"fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 480.0})
     array([[0.1, 0. ]])
     """
@@ -247,7 +247,7 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.views import starting_camera
+    >>> from rpim_opt.problem.registration.camera import starting_camera
     >>> data = ro.load("camera").problem.data
     >>> found = starting_camera(data, data.blocks[0])
     >>> list(found), 800 < found["fx"] < 1000, 800 < found["fy"] < 1000  # 915 and 880, with distortion
@@ -310,7 +310,7 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.views import posed
+    >>> from rpim_opt.problem.registration.camera import posed
     >>> problem = ro.load("camera").problem
     >>> own = dict(zip(problem.parameters.names, problem.parameters.nominal))
     >>> posed(problem.data, own).blocks

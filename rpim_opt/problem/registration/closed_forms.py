@@ -1,4 +1,4 @@
-"""Closed forms that place frames: registration, tool offsets from distances, hand and eye (AX = ZB)."""
+"""Closed forms of registration: point sets, tool offsets from distances, hand and eye (AX = ZB)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Registration: frames of robot, instrument, tools and cameras from measurements."""

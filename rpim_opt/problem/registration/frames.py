@@ -1,0 +1,574 @@
+"""Start values of base frame, reflectors and fixtures, and their registration on the nominal robot."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.models import of_fixture
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
+from rpim_opt.problem.registration.closed_forms import (
+    NOMINAL_ERROR,
+    TOOL_ERROR,
+    Place,
+    hand_eye,
+    proper,
+    register,
+    tool_from_distances,
+    transforms,
+)
+from rpim_opt.problem.source import Source
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.model import model_parameters
+from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from rpim_opt.problem.registration.certified import CertifiedStart
+
+
+ENOUGH = 2000
+"""Rows of a measurement from which frames are placed, where there are more."""
+FREE = 0.1
+"""Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
+MOST_PLACING = 30
+"""Markers that place the base, where there are more: the others follow from the base."""
+MOST_TURNING = 4
+"""Markers whose orientations place the base, where more turn: those of the others follow from the base."""
+
+
+class Located(NamedTuple):
+    """Where base (6,) and reflectors (6,) by marker are [m, rad], and how that was found, in a sentence."""
+
+    base: Array
+    tools: dict[str, Array]
+    how: str
+
+
+def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
+    """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
+
+    All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where the
+    rotations are not determined by that, closed forms say what they can: poses by `hand_eye`; of positions, distances
+    correct the reflectors and registration places the base.
+
+    Raises
+    ------
+    InputError
+        When there are no positions and no poses, or they do not determine the base.
+    """
+    seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
+    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
+    if not seen:
+        raise InputError("key base", '"auto" without positions or poses', "a table [base]")
+    places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
+    flanges = [forward_kinematics(robot, block.q[:, 0]) for block in seen]
+    try:
+        return _certified(seen, flanges, places)
+    except InputError as error:
+        base, found = _closed_forms(seen, flanges, places)
+        return Located(base, found, f"by closed forms: {error.found}")
+
+
+def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
+    """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
+    turning = _most([block for block in seen if block.measurement.name == "pose"], MOST_TURNING)
+    try:
+        start = _started(seen, flanges, places, turning | _most(seen, MOST_PLACING), turning)
+    except InputError:  # where every configuration shows other markers, it takes all of them
+        if len(places) <= MOST_PLACING:
+            raise
+        start = _started(seen, flanges, places, set(places), turning)
+    base = start.bases[""]
+    found = _seen_from(base, seen, flanges, places)
+    for marker, tool in start.tools.items():
+        found[marker][:3] = tool[:3, 3]
+    for block, flange in zip(seen, flanges, strict=True):
+        if block.measurement.name == "pose":
+            tool = np.eye(4)
+            turned = (base @ flange)[:, :3, :3].transpose(0, 2, 1) @ transforms(block.y)[:, :3, :3]
+            tool[:3, :3] = proper(turned.sum(axis=0))
+            tool[:3, 3] = found[block.markers[0]][:3]
+            found[block.markers[0]] = frame_numbers(tool)
+    verdict = "certified" if start.certified else "not certified"
+    return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+
+
+def _started(
+    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
+) -> CertifiedStart:
+    """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
+    from rpim_opt.problem.registration.certified import certified_hand_eye  # CVXPY waits until a base is located
+
+    asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
+    sigma = np.concatenate([_deviations(block) for block, _ in asked])
+    start = certified_hand_eye(
+        np.concatenate([flange for _, flange in asked]),
+        np.concatenate([_measured(block, block.markers[0] in turning) for block, _ in asked]),
+        marker=[block.markers[0] for block, _ in asked for _ in block.row],
+        sigma=(sigma[:, 0], sigma[:, 1]),
+        expected=places,
+        spread=TOOL_ERROR,
+    )
+    if start.uncertainty > FREE:
+        raise InputError("the data", start.reason, "turns about two axes")
+    return start
+
+
+def _seen_from(
+    base: Array, seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the reflectors (6,) by marker where their positions are least off, seen from a base (4, 4) that is known.
+
+    They are expected where they are stated, up to `TOOL_ERROR`.
+    """
+    certain = dict.fromkeys(places, TOOL_ERROR**-2)
+    total = {marker: place[:3] * TOOL_ERROR**-2 for marker, place in places.items()}
+    for block, flange in zip(seen, flanges, strict=True):
+        T = base @ flange
+        there = np.einsum("nji,nj->ni", T[:, :3, :3], block.y[:, :3] - T[:, :3, 3])
+        precision = _deviations(block)[:, 0] ** -2
+        certain[block.markers[0]] += precision.sum()
+        total[block.markers[0]] = total[block.markers[0]] + precision @ there
+    found = {marker: place.copy() for marker, place in places.items()}
+    for marker, place in found.items():
+        place[:3] = total[marker] / certain[marker]
+    return found
+
+
+def _most(blocks: Sequence[Block], count: int) -> set[str]:
+    """Return so many markers of those with the most rows, for each makes the relaxation larger."""
+    rows: Counter[str] = Counter()
+    for block in blocks:
+        rows[block.markers[0]] += len(block.row)
+    return {marker for marker, _ in rows.most_common(count)}
+
+
+def _measured(block: Block, turning: bool) -> Array:
+    """Return poses (N, 4, 4), their rotations NaN where positions alone count."""
+    if turning and block.measurement.name == "pose":
+        return transforms(block.y)
+    T = np.full((len(block.y), 4, 4), np.nan)
+    T[:, :3, 3] = block.y[:, :3]
+    T[:, 3] = [0.0, 0.0, 0.0, 1.0]
+    return T
+
+
+def _deviations(block: Block) -> Array:
+    """Return standard deviations (N, 2) of a position [m] and a turn [rad]: the instrument's and the robot's."""
+    variance = np.full((len(block.row), 2), NOMINAL_ERROR**2)
+    covariance = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
+    variance[:, 0] += np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3
+    if block.measurement.name == "pose":
+        variance[:, 1] += np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+    return np.sqrt(variance)
+
+
+def _closed_forms(
+    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """Return the base and the reflectors, of which the first whose poses tell decide alone."""
+    found = {marker: place.copy() for marker, place in places.items()}
+    source, target, weight = [], [], []
+    for block, flange in zip(seen, flanges, strict=True):
+        marker = block.markers[0]
+        if block.measurement.name == "pose":
+            try:
+                base, tool = hand_eye(flange, transforms(block.y), found[marker][:3])
+            except InputError:
+                pass  # too few turns: positions and the stated tool have to do
+            else:
+                found[marker] = frame_numbers(tool)
+                return frame_numbers(base), found
+        if len(flange) > 3:
+            found[marker][:3] = tool_from_distances(flange, block.y[:, :3], found[marker][:3], TOOL_ERROR)
+        source.append(flange[:, :3, :3] @ found[marker][:3] + flange[:, :3, 3])
+        target.append(block.y[:, :3])
+        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
+        weight.append(1 / np.broadcast_to(variance, len(flange)))
+    q = np.concatenate(weight)
+    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), found
+
+
+def _spread(count: int) -> np.ndarray:
+    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
+
+
+APART = 0.1
+"""How far nominal robots may be from each other at a point that both have touched [m], until it is another point."""
+Places = Mapping[str, Array]
+
+
+def met(problem: CalibrationProblem) -> dict[str, Array]:
+    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them.
+
+    The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
+    that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
+
+    Raises
+    ------
+    InputError
+        For a point that robots are said to have touched alike, and that is elsewhere for one of them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.problem.registration.frames import met
+    >>> arm = ro.load("contact").problem
+    >>> p = arm.parameters
+    >>> free = arm.with_parameters(p.identify([*p.free.names, "base_*"]))
+    >>> both = ro.together(left=arm, right=free, shared=["tool_*"])  # the same touches twice
+    >>> bool(np.abs(met(both)["right"]).max() < 1e-9)  # so that they stand in one place
+    True
+    """
+    known: dict[str, Array] = {}
+    found = {}
+    for robot, places in _touched(problem):
+        base, placed = _standing(problem, robot, places, known)
+        if placed:
+            found[robot] = frame_numbers(base)
+        for name, place in places.items():
+            known.setdefault(name, _in_instrument(base, place))
+    return found
+
+
+def _standing(problem: CalibrationProblem, robot: str, places: Places, known: Places) -> tuple[Array, bool]:
+    """Return where a base (4, 4) is, and whether known places say so; refuse touches that are elsewhere."""
+    p = problem.parameters.of_robot(robot)
+    stated = numeric_frame(_frame(p, "base_"))
+    common = {name: place for name, place in places.items() if name in known}
+    if not _placed_by_touches(problem, robot, p):
+        _require_near(robot, stated, common, known)
+        return stated, False
+    try:
+        base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
+    except InputError:  # too few, or on a line
+        return stated, False
+    _require_near(robot, base, common, known)
+    return base, True
+
+
+def _in_instrument(base: Array, place: Array) -> Array:
+    return base[:3, :3] @ place + base[:3, 3]
+
+
+def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, Places]]:
+    """Yield the nominal positions (3,) [m] of touched points by name in a robot's own frame, robot by robot."""
+    for robot, arm in problem.arms.items():
+        p = problem.parameters.of_robot(robot)
+        all_of: dict[str, list[Array]] = {}
+        for block in problem.data.blocks:
+            names = _points(block)
+            if block.robot == robot and len(names):
+                T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(_frame(p, tool_prefix(block.markers[0])))
+                for name, position in zip(names, T[:, :3, 3], strict=True):
+                    all_of.setdefault(name, []).append(position)
+        if all_of:
+            yield robot, {name: np.mean(positions, axis=0) for name, positions in all_of.items()}
+
+
+def _points(block: Block) -> list[str]:
+    """Return the points that rows touched; none where they touched planes, or nothing."""
+    if block.touched is None or not block.measurement.touching or block.measurement.planar:
+        return []
+    return [str(name) for name in block.touched[:, 0]]
+
+
+def _frame(p: Parameters, prefix: str) -> Array:
+    return p.nominal[[p.names.index(prefix + component) for component in FRAME]]
+
+
+def _placed_by_touches(problem: CalibrationProblem, robot: str, p: Parameters) -> bool:
+    """Whether a robot's base is sought, and nothing but touches tells where it is."""
+    sought = p.identified[[p.names.index(f"base_{component}") for component in FRAME]].all()
+    return bool(sought) and all(block.touched is not None for block in problem.data.blocks if block.robot == robot)
+
+
+def _require_near(robot: str, base: Array, places: Places, known: Places) -> None:
+    """Refuse touches of one point that nominal robots put into different places."""
+    for name, place in places.items():
+        distance = float(np.linalg.norm(_in_instrument(base, place) - known[name]))
+        if distance > APART:
+            found = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
+            accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
+            raise InputError(f"together, problem '{robot}'", found, accepted)
+
+
+MISPLACED = 3.0
+"""How many scales a frame may be from where it is stated before the statement counts as a mistake."""
+MOST_STEPS = 200
+"""Steps, taken or refused, after which frames are as good as they get."""
+SHORT, ROUNDING = 1e-11, 1e-12
+"""Frames are found when a full step is shorter than the first, relative to 1 + |z|; a step is refused when it raises
+the objective by more than the second."""
+
+
+def starting_parameters(
+    robot: Robot,
+    data: Dataset,
+    base: Place | None = (0.0,) * 6,
+    tools: Mapping[str, Place] | None = None,
+    own: Mapping[str, float] | None = None,
+    temperature: float | None = None,
+    sessions: Sequence[str] = (),
+) -> Parameters:
+    """Return the model's parameters with closed-form values for what is not stated; none identified yet.
+
+    Parameters
+    ----------
+    robot, data
+        The nominal robot and what was measured.
+    base
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
+    tools
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
+    own
+        Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
+        parameters is stated is located from the nominal robot.
+    temperature
+        At which lengths are as on the drawing [K], where the data state temperatures; their mean by default.
+    sessions
+        Names of sessions that are not among the data, where these are the first of several parts.
+
+    Raises
+    ------
+    InputError
+        For a marker of the data without a reflector, and data that do not determine what they have to.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem
+    >>> tools = {"": [0.02, 0, 0.06, 0, 0, 0]}
+    >>> parameters = ro.problem.starting_parameters(problem.robot, problem.data, base=None, tools=tools)
+    >>> parameters.identify(["base_[xyz]"]).free.nominal.round(2)  # [m]; it stands at 1.8, -0.7, 0.35
+    array([ 1.8 , -0.7 ,  0.35])
+    """
+    tools = tools or {"": (0.0,) * 6}
+    _require_reflectors(data, tools)
+    own = {**(own or {}), **starting_cameras(data, own or {})}
+    places = tools
+    if base is None:
+        base, located, _ = locate(robot, posed(data, own), tools)
+        # a board or a camera that is turned otherwise is not in sight
+        tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
+        places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
+    entries: dict[str, tuple[str, float]] = {}
+    for block in data.blocks:
+        given = _own_values(robot, block, base, places[block.markers[0]], own)
+        for name, dimension in block.measurement.parameters.items():
+            entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
+    reference = _reference(data, temperature)
+    named = sorted({*data.sessions, *sessions})
+    return model_parameters(robot, base, tools, entries, own_frames(data), named, reference)
+
+
+def _reference(data: Dataset, stated: float | None) -> float | None:
+    """Return the temperature at which lengths are as on the drawing [K]; None where nothing is known of it."""
+    if stated is None and len(data.temperatures):
+        return float(data.temperatures.mean())
+    return stated
+
+
+def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
+    """Return focal lengths and centres [px] by name of cameras of which nothing is stated in ``own``."""
+    found = {}
+    for block in camera_blocks(data):
+        names = {name: of_fixture(name, block.fixture) for name in block.measurement.parameters}
+        if len(block.row) and not any(full in own for name, full in names.items() if name.startswith("camera_")):
+            start = starting_camera(data, block)
+            found |= {of_fixture(f"camera_{name}", block.fixture): value for name, value in start.items()}
+    return found
+
+
+def own_frames(data: Dataset) -> tuple[str, ...]:
+    """Return the prefixes of the frames that measurements have of their own, ``plane_``."""
+    blocks = [(block.measurement, block.fixture) for block in data.blocks]
+    return tuple(dict.fromkeys(of_fixture(name + "_", fixture) for kind, fixture in blocks for name in kind.frames))
+
+
+def _require_reflectors(data: Dataset, tools: Mapping[str, Place]) -> None:
+    """Refuse rows of a reflector that nobody has stated."""
+    for block in data.blocks:
+        for marker in set(block.markers) - set(tools):
+            where = f"row {data.label[block.row[0]]}, column marker"
+            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
+
+
+def _own_values(
+    robot: Robot, block: Block, base: Place, tool: Place, stated: Mapping[str, float]
+) -> Mapping[str, float]:
+    """Return what is stated of a measurement's own parameters, or where the nominal robot puts its fixture."""
+    kind = block.measurement
+    names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+    given = {name: stated[full] for name, full in names.items() if full in stated}
+    if given or not names or kind.start is None:
+        return given
+    T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ numeric_frame(tool)
+    return kind.start(T[:, :3, 3], block.y)
+
+
+def relocated(problem: Source) -> Source | None:
+    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that.
+
+    Compared is what `locate` finds on the nominal robot with identified frames. A frame that is more than three
+    scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
+    it was found. None when every frame is near enough, or the data do not tell.
+    """
+    if len(problem.arms) > 1:
+        return _each_relocated(problem)
+    p = problem.parameters
+    nominal = p.nominal.copy()
+    for k, place in _located(problem):
+        free = p.identified[k]
+        if _misplaced(p, k, place):
+            nominal[k[free]] = place[free]
+    return _moved(problem, nominal)
+
+
+def _located(problem: Source) -> list[tuple[np.ndarray, Array]]:
+    """Return where base and reflectors are in the table and where the data put them, (6,) each; none if they do not."""
+    p = problem.parameters
+    base = _frame_of(p, "base_")
+    if not p.identified[base].all():
+        return []
+    try:
+        data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
+        at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
+        found, places, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
+    except InputError:
+        return []
+    return [(base, found), *((k, places[marker]) for marker, k in at.items())]
+
+
+def _moved(problem: Source, nominal: Array) -> Source | None:
+    """Return the problem with other nominal values (P,); None if they are the same."""
+    if (nominal == problem.parameters.nominal).all():
+        return None
+    return problem.with_parameters(replace(problem.parameters, nominal=nominal))
+
+
+def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
+    """Return the places (6,) of a frame in a table."""
+    index = {name: i for i, name in enumerate(p.names)}
+    return np.array([index[prefix + component] for component in FRAME])
+
+
+def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
+    """Whether an identified frame at places k (6,) of a table is surely not where it is stated."""
+    position, orientation = np.split(p.identified[k], 2)
+    if not position.all() or orientation.any() != orientation.all():
+        return False
+    far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
+    return bool((far & p.identified[k]).any())
+
+
+def _each_relocated(problem: Source) -> Source | None:
+    """Return the problem of several robots, each relocated; of a frame that they share the first one's word counts."""
+    p = problem.parameters
+    nominal = p.nominal.copy()
+    for name in problem.arms:
+        found = relocated(problem.sample().alone(name))
+        if found is not None:
+            places = p.places_of(name)
+            untouched = nominal[places] == p.nominal[places]
+            nominal[places] = np.where(untouched, found.parameters.nominal, nominal[places])
+    for name, place in met(problem.sample()).items():
+        own = p.of_robot(name)
+        base = _frame_of(own, "base_")
+        if _misplaced(own, base, place):
+            nominal[p.places_of(name)[base]] = place
+    return _moved(problem, nominal)
+
+
+def fitted_frames(problem: Source) -> tuple[Source, Array]:
+    """Return the problem that identifies frames alone, and its solution: what the data say before calibration.
+
+    ::
+
+        minimize    |Sigma^-1/2 r(S z)|^2 + |z|^2
+
+    over the identified parameters of base, reflectors, anchors and the like, in units of their scales; the robot is as
+    its drawing says. By Marquardt's damped Gauss-Newton steps.
+
+    Parameters
+    ----------
+    problem
+        In memory or in parts. One that identifies no frame comes back as it is, at nominal.
+
+    Returns
+    -------
+    The problem of the frames (all other parameters nominal; where frames were stated far off, counted from where the
+    data put them, `relocated`), and the deviations (f,) [SI].
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> fitted, x = ro.problem.fitted_frames(instance.problem)
+    >>> len(x), f"{1e3 * fitted.on(instance.validation).errors(x).mean():.2f} mm"
+    (9, '1.13 mm')
+    """
+    p = problem.parameters
+    frames = p.placed & p.identified
+    if not frames.any():
+        return problem, np.zeros(len(p.free))
+    alone = problem.identifying(frames)
+    alone = relocated(alone) or alone
+    return alone, settled(alone)
+
+
+def settled(alone: Source) -> Array:
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated."""
+    source = in_parts(alone.frozen())
+    scale = alone.parameters.free.scale
+    z = np.zeros(len(scale))
+    model = source.linearize(scale * z)
+    damping = 0.0
+    for _ in range(MOST_STEPS):
+        step = _damped_step(model, z, damping)
+        candidate = source.linearize(scale * (z + step))
+        if _objective(candidate, z + step) > _objective(model, z) * (1 + ROUNDING):
+            damping = max(4 * damping, 1e-3)
+            continue
+        z = z + step
+        model = candidate
+        if damping == 0 and np.linalg.norm(step) <= SHORT * (1 + np.linalg.norm(z)):
+            break
+        damping = damping / 8 if damping > 1e-6 else 0.0
+    return scale * z
+
+
+def _damped_step(model: LinearModel, z: Array, damping: float) -> Array:
+    """Return s that minimizes |A (z + s) - b|^2 + |z + s|^2 + damping |D s|^2, D the sizes of the columns."""
+    R = model.triangle
+    n = len(z)
+    A = np.vstack([R[:, :n], np.eye(n)])
+    b = np.concatenate([R[:, n] - R[:, :n] @ z, -z])
+    size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
+    step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), np.concatenate([b, np.zeros(n)]), rcond=None)[0]
+    return np.asarray(step, dtype=float)
+
+
+def _objective(model: LinearModel, z: Array) -> float:
+    return float(np.sum((model.A @ z - model.b) ** 2) + np.sum(z**2))
+
+
+def _deviation(place: Place, nominal: Array) -> Array:
+    """Return the deviation (6,) that takes a nominal frame to a place (`kinematics.frame`)."""
+    T, T0 = numeric_frame(place), numeric_frame(nominal)
+    return np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])

@@ -1,0 +1,489 @@
+"""Quadratic forms of rotations: semidefinite relaxation, rounding, refinement and a lower bound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.late import Late, sparse, transform
+from rpim_opt.basics.phases import phase
+from rpim_opt.problem.registration.closed_forms import proper
+
+if TYPE_CHECKING:
+    import cvxpy as cp
+else:
+    cp = Late("cvxpy")
+
+
+@lru_cache
+def rotation_constraints(count: int) -> Array:
+    """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic.
+
+    Of every rotation the twenty independent ones: R R' = 1 and R'R = 1, of which one diagonal entry follows from the
+    others, and each row the cross product of the next two, which says that R is right-handed.
+    """
+    rows = [_quadratic(count, terms) for k in range(count) for terms in _of_rotation(1 + 9 * k)]
+    return np.array(rows)
+
+
+def _of_rotation(first: int) -> list[list[tuple[int, int, float]]]:
+    """Return the terms (place, place, coefficient) of the quadratics that vanish on one rotation."""
+    at = first + np.arange(9).reshape(3, 3)
+    forms = []
+    for entries in (at, at.T):
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            terms = [(int(a), int(b), 1.0) for a, b in zip(entries[i], entries[j], strict=True)]
+            forms.append([*terms, (0, 0, -float(i == j))])
+    del forms[-1]  # both sums of squares are three
+    for i in range(3):
+        p, q, r = at[i], at[(i + 1) % 3], at[(i + 2) % 3]
+        for a in range(3):
+            b = (a + 1) % 3
+            c = (a + 2) % 3
+            forms.append([(int(p[b]), int(q[c]), 1.0), (int(p[c]), int(q[b]), -1.0), (0, int(r[a]), -1.0)])
+    return forms
+
+
+def _quadratic(count: int, terms: list[tuple[int, int, float]]) -> Array:
+    """Return the symmetric matrix (n, n) of a sum of products."""
+    M = np.zeros((1 + 9 * count, 1 + 9 * count))
+    for i, j, value in terms:
+        M[i, j] += value / 2
+        M[j, i] += value / 2
+    return M
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """The relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), in the form that has k 20 + 1 unknowns.
+
+    ::
+
+        maximize    bound
+        subject to  Q - bound e e' - sum_j multipliers_j C_j  positive semidefinite,    e = (1, 0, ..., 0)
+
+    For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
+    constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
+    M_00 = 1 and <C_j, M> = 0.
+
+    Where Q has no products of some rotations (tools seen by the same cameras), the left side is the sum of positive
+    semidefinite parts, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler et
+    al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
+
+    Parameters
+    ----------
+    problem
+        As above.
+    places
+        Of each part among the n.
+    forms
+        Each part's share of Q; products of what is shared stand in the last.
+    bound, multipliers
+        The unknowns.
+    constraints
+        One for each part.
+    """
+
+    problem: cp.Problem
+    places: tuple[np.ndarray, ...]
+    forms: tuple[cp.Parameter, ...]
+    bound: cp.Variable
+    multipliers: cp.Variable
+    constraints: tuple[Any, ...]
+
+    def state(self, Q: Array) -> None:
+        """Give the parameters the values of a form."""
+        for form, share in zip(self.forms, shares(Q, self.places), strict=True):
+            form.value = share
+
+
+def _places(count: int, shared: int) -> tuple[np.ndarray, ...]:
+    """Return the places of every part: of 1, the shared rotations and one of the others."""
+    common = np.arange(1 + 9 * shared)
+    own = [np.arange(1 + 9 * k, 10 + 9 * k) for k in range(shared, count)]
+    return tuple(np.concatenate([common, each]) for each in own) or (common,)
+
+
+def shares(Q: Array, places: Sequence[np.ndarray]) -> list[Array]:
+    """Return each part's share of a form."""
+    common = np.intersect1d(places[0], places[-1])
+    parts = [Q[np.ix_(place, place)] for place in places]
+    for part in parts[:-1]:
+        part[: len(common), : len(common)] = 0.0
+    return parts
+
+
+def relaxation(count: int, shared: int) -> Relaxation:
+    """Return the definition for so many rotations, of which the first are shared by all others."""
+    places = _places(count, shared)
+    bound = cp.Variable()
+    multipliers = cp.Variable(20 * count)
+    common = 1 + 9 * shared
+    moved = [cp.Variable((common, common), symmetric=True) for _ in places[1:]]
+    first = np.zeros((common, common))
+    first[0, 0] = 1.0
+    last = -bound * first  # of what is shared, the last part has what the others leave
+    for each in moved:
+        last = last - each
+    forms = tuple(cp.Parameter((len(place), len(place)), symmetric=True) for place in places)
+    constraints = []
+    for place, form, corner in zip(places, forms, [*moved, last], strict=True):
+        border = np.eye(len(place))[:, :common]
+        own = _own_constraints(place, count, shared, corner is last)
+        C = rotation_constraints(count)[np.ix_(own, place, place)].reshape(len(own), -1)
+        combined = cp.reshape(C.T @ multipliers[own], form.shape, order="C")
+        constraints.append(form + border @ corner @ border.T - combined >> 0)
+    problem = cp.Problem(cp.Maximize(bound), constraints)
+    return Relaxation(problem, places, forms, bound, multipliers, tuple(constraints))
+
+
+def _own_constraints(place: np.ndarray, count: int, shared: int, last: bool) -> np.ndarray:
+    """Return which constraints are a part's: of its own rotation, and in the last of those that are shared."""
+    rotations = [*range(shared)] if last else []
+    if len(place) > 1 + 9 * shared:
+        rotations.append(int(place[-1]) // 9 - 1)
+    return (20 * np.array(rotations)[:, None] + np.arange(20)).ravel()
+
+
+conif: Any = Late("cvxpy.reductions.solvers.conic_solvers.clarabel_conif")
+
+clarabel: Any = Late("clarabel")  # a compiled module, without types
+SOUGHT = 1e-8
+"""Tolerance of gap and feasibility, the form being of size one: what follows refines rotations and multipliers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """What the relaxation says.
+
+    Parameters
+    ----------
+    matrix
+        (n, n) moment matrix; of rank one where it is x x' of rotations.
+    multipliers
+        (c,) of the constraints of `moments.rotation_constraints`.
+    status
+        Clarabel's word.
+    """
+
+    matrix: Array
+    multipliers: Array
+    status: str
+
+    @property
+    def rank_ratio(self) -> float:
+        """Second eigenvalue of the moment matrix over its first: zero where it is of rank one."""
+        eigenvalues = np.linalg.eigvalsh(self.matrix)
+        return float(abs(eigenvalues[-2]) / eigenvalues[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Cone:
+    """The relaxation in Clarabel's form, which CVXPY made once: of Q is b alone, its parts' triangles."""
+
+    A: Any
+    q: Array
+    cones: Any
+    columns: slice
+    places: tuple[np.ndarray, ...]
+
+    def triangles(self, Q: Array) -> Array:
+        """Return the parts' upper triangles column by column, what is off the diagonal times the root of two."""
+        return np.concatenate([_triangle(share) for share in shares(Q, self.places)])
+
+    def matrix(self, triangles: Array) -> Array:
+        """Return the moment matrix (n, n) of which the parts know theirs, completed so that it stays semidefinite."""
+        sizes = [len(place) * (len(place) + 1) // 2 for place in self.places]
+        parts = [_square(each) for each in np.split(triangles, np.cumsum(sizes)[:-1])]
+        n = int(self.places[-1][-1]) + 1
+        M = np.zeros((n, n))
+        for place, part in zip(self.places, parts, strict=True):
+            M[np.ix_(place, place)] = part
+        if len(parts) > 1:
+            common = len(np.intersect1d(self.places[0], self.places[-1]))
+            known = M[:, :common]
+            completed = known @ np.linalg.pinv(M[:common, :common], rcond=1e-9, hermitian=True) @ known.T
+            unknown = np.ones((n, n), dtype=bool)
+            for place in self.places:
+                unknown[np.ix_(place, place)] = False
+            M[unknown] = completed[unknown]
+        return M
+
+
+def _triangle(M: Array) -> Array:
+    columns, rows = np.tril_indices(len(M))
+    return np.where(rows == columns, 1.0, np.sqrt(2)) * M[rows, columns]
+
+
+def _square(triangle: Array) -> Array:
+    n = int(np.sqrt(2 * len(triangle)))
+    columns, rows = np.tril_indices(n)
+    M = np.zeros((n, n))
+    M[rows, columns] = triangle / np.where(rows == columns, 1.0, np.sqrt(2))
+    return M + np.triu(M, 1).T
+
+
+@lru_cache
+def _cone(count: int, shared: int) -> _Cone:
+    stated = relaxation(count, shared)
+    stated.state(np.eye(1 + 9 * count))
+    data = stated.problem.get_problem_data(cp.CLARABEL, solver_opts={})[0]
+    start = data["param_prob"].var_id_to_col[stated.multipliers.id]
+    own = slice(start, start + stated.multipliers.size)
+    return _Cone(sparse.csc_matrix(data["A"]), data["c"], conif.dims_to_solver_cones(data["dims"]), own, stated.places)
+
+
+def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moments:
+    """Return the moment matrix and the multipliers of `moments.Relaxation`.
+
+    Parameters
+    ----------
+    Q
+        (n, n) symmetric, n = 1 + 9 k for k rotations.
+    shared
+        The first so many rotations are those that the others have products with, and they have none among themselves;
+        all by default.
+    sought
+        Tolerance of gap and feasibility.
+
+    Examples
+    --------
+    The rotation with the largest trace is none at all.
+
+    >>> import numpy as np
+    >>> from rpim_opt.problem.registration.relaxation import relax
+    >>> Q = np.zeros((10, 10))
+    >>> Q[0, [1, 5, 9]] = Q[[1, 5, 9], 0] = -0.5
+    >>> found = relax(Q)
+    >>> found.matrix[0, 1:].reshape(3, 3).round(6) + 0.0
+    array([[1., 0., 0.],
+           [0., 1., 0.],
+           [0., 0., 1.]])
+    """
+    count = (len(Q) - 1) // 9
+    cone = _cone(count, count if shared is None else shared)
+    size = float(np.abs(Q).max()) or 1.0
+    P = sparse.csc_matrix((len(cone.q), len(cone.q)))
+    with phase("solve"):
+        b = cone.triangles(Q / size)
+        found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings(sought)).solve()
+    return Moments(cone.matrix(np.array(found.z)), size * np.array(found.x)[cone.columns], str(found.status))
+
+
+@lru_cache
+def _settings(sought: float) -> Any:
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = sought
+    return settings
+
+
+STEPS = 50
+"""Newton steps after which rotations are as good as they get."""
+SHORT = 1e-13
+"""Rotations are found when a step is shorter [rad]."""
+SPREAD = 1e-3
+"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
+FINE = 1e-12
+"""Tolerance with which the relaxation is solved again where its moments are those of several rotations."""
+DRAWN = 20
+CROSS = np.array(
+    [
+        [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+        [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]],
+        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+    ]
+)
+"""The matrices of the cross products e_a x."""
+
+
+@dataclass(frozen=True, eq=False)
+class Smallest:
+    """The rotations (k, 3, 3) that minimize |L x|^2 over x = (1, vec R_1, ..., vec R_k), and what is known of that.
+
+    Parameters
+    ----------
+    rotations
+        (k, 3, 3).
+    value
+        |L x|^2.
+    bound
+        No rotations have a smaller value than this, up to rounding.
+    rank_ratio
+        Second eigenvalue of the relaxation's moment matrix over its first.
+    information
+        (3k, 3k) half the second derivative of the value by rotation vectors [1/rad^2].
+    steepness
+        c >= 0: every x has a value of at least bound + c |x_other|^2, x_other being what of x is not along the best.
+    """
+
+    rotations: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    information: Array
+    steepness: float
+
+    def radius(self, excess: float) -> float:
+        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
+
+        Both x have the length n = 1 + 3 k, squared, so that c = x'x_best / n has 1 - c^2 = |x_other|^2 / n, and
+        |x - x_best|^2 = 2 n (1 - c), of which one rotation has 8 sin^2(angle / 2). A trace of -1 or more keeps c above
+        (1 - k) / n.
+        """
+        if self.steepness <= 0:
+            return float(np.pi)
+        k = len(self.rotations)
+        n = 1 + 3 * k
+        square = 1 - (excess + self.value - self.bound) / (self.steepness * n)
+        if square <= ((1 - k) / n) ** 2:
+            return float(np.pi)
+        apart = 2 * n * (1 - np.sqrt(square))
+        return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
+
+
+def nearest(L: Array, rotations: Array) -> Smallest:
+    """Return the stationary rotations near some, of which nothing is known."""
+    best = _refined(L, rotations)
+    return Smallest(best, _value(L, best), -np.inf, np.inf, np.zeros((3 * len(best), 3 * len(best))), 0.0)
+
+
+def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = None) -> Smallest:
+    """Return the best of what the relaxation and candidates (k, 3, 3) lead to, with the relaxation's bound.
+
+    ::
+
+        Q - f e e' - sum_j multipliers_j C_j  >=  mu 1,    mu <= 0
+        x'Q x  >=  f + mu |x|^2  =  f + mu (1 + 3 k)    for every x = (1, vec R_1, ..., vec R_k)
+
+    The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
+    their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
+
+    Parameters
+    ----------
+    L
+        (m, n), n = 1 + 9 k.
+    candidates
+        Further rotations to start from.
+    shared
+        As `relax` has it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rpim_opt.problem.registration.relaxation import smallest
+    >>> wanted = np.diag([1.0, -1.0, -1.0])
+    >>> L = np.hstack([-wanted.reshape(9, 1), np.eye(9)])  # |L x|^2 = |R - wanted|^2
+    >>> found = smallest(L)
+    >>> bool(np.abs(found.rotations[0] - wanted).max() < 1e-9), bool(abs(found.bound) < 1e-9)
+    (True, True)
+    """
+    Q = L.T @ L
+    moments = relax(Q, shared)
+    if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
+        moments = relax(Q, shared, FINE)
+    starts = [*_rounded(moments), *candidates]
+    refined = [_refined(L, start) for start in starts]
+    values = [_value(L, R) for R in refined]
+    best = refined[int(np.argmin(values))]
+    bound, steepness = _bound(Q, lifted(best), min(values), moments.multipliers)
+    return Smallest(best, min(values), bound, moments.rank_ratio, _slopes(L, best)[1] / 2, steepness)
+
+
+def undercut(L: Array, shared: int | None = None) -> float:
+    """Return a value of |L x|^2 that no rotations undercut, by the relaxation's multipliers alone."""
+    Q = L.T @ L
+    moments = relax(Q, shared, FINE)
+    value = float(np.sum(Q * moments.matrix))
+    count = (len(Q) - 1) // 9
+    S = Q - np.tensordot(moments.multipliers, rotation_constraints(count), axes=1)
+    S[0, 0] -= value
+    return value + min(0.0, float(np.linalg.eigvalsh(S)[0])) * (1 + 3 * count)
+
+
+def lifted(rotations: Array) -> Array:
+    """Return x = (1, vec R_1, ..., vec R_k), rows first."""
+    return np.concatenate([[1.0], rotations.ravel()])
+
+
+def _value(L: Array, rotations: Array) -> float:
+    return float(np.sum((L @ lifted(rotations)) ** 2))
+
+
+def _rounded(moments: Moments) -> list[Array]:
+    """Return rotations that the moment matrix stands for: their mean, and where it has several, some drawn from it."""
+    eigenvalues, vectors = np.linalg.eigh(moments.matrix)
+    lifts = [moments.matrix[:, 0]]
+    if moments.rank_ratio > SPREAD:
+        lifts += [np.copysign(1.0, v[0]) * v for v in vectors.T[::-1][:4]]
+        normal = np.random.default_rng(0).normal(size=(DRAWN, len(eigenvalues)))
+        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
+        lifts += [np.copysign(1.0, v[0]) * v for v in drawn]
+    return [proper(lift[1:].reshape(-1, 3, 3)) for lift in lifts]
+
+
+def _slopes(L: Array, rotations: Array) -> tuple[Array, Array]:
+    """Return first (3k,) and second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
+    k = len(rotations)
+    residual = L @ lifted(rotations)
+    G = (2 * L.T @ residual)[1:].reshape(k, 3, 3)
+    D = np.zeros((L.shape[1], 3 * k))
+    B = np.zeros((3 * k, 3 * k))
+    for i, R in enumerate(rotations):
+        own = slice(3 * i, 3 * i + 3)
+        D[1 + 9 * i : 10 + 9 * i, own] = (R @ CROSS).reshape(3, 9).T
+        M = R.T @ G[i]
+        # the second order of exp([w] x) is ([w] x)^2 / 2 = (w w' - |w|^2) / 2
+        B[own, own] = (M + M.T) / 2 - np.trace(M) * np.eye(3)
+    J = L @ D
+    return 2 * J.T @ residual, 2 * J.T @ J + B
+
+
+def _refined(L: Array, rotations: Array) -> Array:
+    """Return the stationary rotations to which Newton's steps lead, uphill directions turned, long steps halved."""
+    value = _value(L, rotations)
+    for _ in range(STEPS):
+        slope, curvature = _slopes(L, rotations)
+        eigenvalues, V = np.linalg.eigh(curvature)
+        sizes = np.maximum(np.abs(eigenvalues), 1e-14 * np.abs(eigenvalues).max() + 1e-300)
+        step = -V @ ((V.T @ slope) / sizes)
+        step *= min(1.0, 1.0 / max(np.linalg.norm(step), 1e-300))
+        moved, lower = _moved(L, rotations, step, value)
+        if lower >= value:
+            break
+        rotations = moved
+        value = lower
+        if np.linalg.norm(step) < SHORT:
+            break
+    return rotations
+
+
+def _moved(L: Array, rotations: Array, step: Array, value: float) -> tuple[Array, float]:
+    """Return the rotations after the step, or the first of its halves that lowers the value."""
+    part = step
+    for _ in range(12):
+        turn = transform.Rotation.from_rotvec(part.reshape(-1, 3)).as_matrix()
+        moved = proper(rotations @ turn)
+        lower = _value(L, moved)
+        if lower < value:
+            return moved, lower
+        part = part / 2
+    return rotations, value
+
+
+def _bound(Q: Array, x: Array, value: float, multipliers: Array) -> tuple[float, float]:
+    """Return a value that no rotations undercut, from multipliers near the solver's, and how steeply others rise."""
+    C = rotation_constraints((len(x) - 1) // 9)
+    S = Q - np.tensordot(multipliers, C, axes=1)
+    S[0, 0] -= value
+    moves = np.linalg.lstsq((C @ x).T, S @ x, rcond=1e-12)[0]
+    S = S - np.tensordot(moves, C, axes=1)
+    eigenvalues = np.linalg.eigvalsh(S)
+    return value + min(0.0, float(eigenvalues[0])) * float(x @ x), max(0.0, float(eigenvalues[1]))
