@@ -18,9 +18,10 @@ from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import KNOWN, position
-from rpim_opt.problem.misreadings import Placed, Points, better_reading, lever_arms, misfit, placed, points_of
+from rpim_opt.problem.misreadings import Points, better_reading, lever_arms, misfit, placed, points_of
 from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.closed_forms import Fit
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.problem.source import Source
@@ -472,7 +473,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
         )
 
 
-def _pairs(points: Points, found: Placed, far: np.ndarray) -> list[tuple[int, int]]:
+def _pairs(points: Points, found: Fit, far: np.ndarray) -> list[tuple[int, int]]:
     pairs = []
     for a, i in enumerate(far):
         for j in far[a + 1 :]:
@@ -484,7 +485,7 @@ def _pairs(points: Points, found: Placed, far: np.ndarray) -> list[tuple[int, in
     return pairs
 
 
-def _other_markers(robot: Robot, points: Points, found: Placed, far: np.ndarray) -> list[int]:
+def _other_markers(robot: Robot, points: Points, found: Fit, far: np.ndarray) -> list[int]:
     """Return the rows that fit another reflector, which the other rows place."""
     if len(points.tools) < 2 or not len(far):
         return []
@@ -559,7 +560,7 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         )
 
 
-def _apart(first: Placed, second: Placed) -> float:
+def _apart(first: Fit, second: Fit) -> float:
     """Return how far apart two bases put the points of the second one's rows [m], in the mean."""
     body = (second.modelled - second.base[:3, 3]) @ second.base[:3, :3]
     seen = body @ first.base[:3, :3].T + first.base[:3, 3]

@@ -16,7 +16,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import posed
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, hand_eye, transforms
+from rpim_opt.problem.registration.closed_forms import Fit, hand_eye, register_arm, transforms
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
@@ -26,13 +26,6 @@ from rpim_opt.robot.plain import read_mdh
 MOST_ROWS = 300
 """Rows that are tried, evenly spread where there are more."""
 FEWEST_ROWS = 6
-STEPS = 7
-SHORT = 1e-5
-"""Reflectors are found when they move by less [m], and where nothing fits earlier: what is off by metres stays so."""
-TRUSTED = 3.0
-"""Rows further than so many medians count less, in proportion: blunders do not decide what a table means."""
-TINY = 1e-13
-"""Keeps normal equations regular where a direction is not seen."""
 AT_ONCE = 128
 """Readings that are fitted at once: more need memory, and are not faster."""
 LONGEST = 3.0
@@ -43,24 +36,11 @@ BEST = 0.75
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Measured points of a robot.
+    """N measured points of a robot.
 
-    Parameters
-    ----------
-    q
-        (N, dof) joint values of the controller [rad or m].
-    y
-        (N, 3) measured positions [m].
-    marker
-        (N,) number of the reflector.
-    tools
-        (M, 3) where the reflectors are stated in the flange frame [m].
-    turns
-        (N, 3, 3) measured orientations; None where there are none.
-    row
-        (N,) row of the dataset.
-    seen
-        Whether they are poses of a camera's views.
+    Joint values of the controller q (N, dof) [rad or m], positions y (N, 3) [m], numbers of the M reflectors
+    ``marker`` (N,), ``tools`` (M, 3) where these are stated in the flange frame [m], orientations ``turns`` (N, 3, 3)
+    or None, rows of the dataset (N,), and whether they are poses of a camera's views.
     """
 
     q: Array
@@ -82,28 +62,6 @@ class Points:
     def extent(self) -> float:
         """How far the points spread [m]."""
         return float(np.linalg.norm(self.y.std(axis=0)))
-
-
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """Where base and reflectors fit best.
-
-    Parameters
-    ----------
-    modelled
-        (N, 3) points [m].
-    error
-        (N,) their errors [m].
-    tools
-        (M, 3) the reflectors in the flange frame [m].
-    base
-        (4, 4) the robot's base in the instrument's frame.
-    """
-
-    modelled: Array
-    error: Array
-    tools: Array
-    base: Array
 
 
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
@@ -152,96 +110,17 @@ def _reflectors(markers: Sequence[str], own: Mapping[str, float]) -> Array:
     return tools
 
 
-def placed(robot: Robot, points: Points) -> Placed:
-    """Return where base and reflectors fit best, robot nominal.
-
-    Minimizes sum_i w_i |y_i - R (R_i o + p_i) - t|^2 + (0.005 |o - o_stated| / 0.1)^2 over R, t and the reflectors o
-    by Gauss-Newton steps from a registration, with weights that fall as 1 / error beyond three medians.
-    """
-    model, error, tools, base = _placed(robot, [points])
-    return Placed(model[0], error[0], tools[0], base[0])
+def placed(robot: Robot, points: Points) -> Fit:
+    """Return where base and reflectors fit best, robot nominal: modelled (N, 3), errors (N,), base, reflectors."""
+    return Fit(*(each[0] for each in _fitted(robot, [points])))
 
 
-def _placed(robot: Robot, tries: Sequence[Points]) -> tuple[Array, Array, Array, Array]:
-    """Return modelled points (B, N, 3), errors (B, N), reflectors (B, M, 3) and bases (B, 4, 4) of B tries at once."""
+def _fitted(robot: Robot, tries: Sequence[Points]) -> Fit:
+    """Return where base and reflectors fit each of B tries of as many points best."""
     q = np.stack([points.q for points in tries])
-    y = np.stack([points.y for points in tries])
-    marker = np.stack([points.marker for points in tries])
-    stated = np.stack([points.tools for points in tries])
-    B, N, dof = q.shape
-    flange = forward_kinematics(robot, q.reshape(-1, dof)).reshape(B, N, 4, 4)
-    tools = stated.copy()
-    weights = np.ones((B, N))
-    model, error, base = _modelled(flange, tools, marker, y, weights)
-    for _ in range(STEPS):
-        weights = _weights(error)
-        turned = base[:, None, :3, :3] @ flange[..., :3, :3]
-        step = _steps(turned, marker, model, y, weights, stated - tools)
-        limit = SHORT * (1 + np.median(error, axis=1) / NOMINAL_ERROR)
-        if (np.abs(step).max(axis=(1, 2)) < limit).all():
-            break
-        tools = tools + step
-        model, error, base = _modelled(flange, tools, marker, y, weights)
-    return model, error, tools, base
-
-
-def _modelled(flange: Array, tools: Array, marker: np.ndarray, y: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Return modelled points (B, N, 3), errors (B, N) and bases (B, 4, 4) of reflectors (B, M, 3)."""
-    which = np.arange(len(y))[:, None]
-    body = np.einsum("bnij,bnj->bni", flange[..., :3, :3], tools[which, marker]) + flange[..., :3, 3]
-    base = _registered(body, y, weights)
-    model = np.einsum("bij,bnj->bni", base[:, :3, :3], body) + base[:, None, :3, 3]
-    return model, np.linalg.norm(y - model, axis=2), base
-
-
-def _registered(source: Array, target: Array, weights: Array) -> Array:
-    """Return the rigid motions (B, 4, 4) of `register`, of many sets of points (B, N, 3) at once."""
-    q = weights[:, :, None]
-    p = (q * source).sum(axis=1) / q.sum(axis=1)
-    r = (q * target).sum(axis=1) / q.sum(axis=1)
-    H = np.swapaxes(source - p[:, None], 1, 2) @ (q * (target - r[:, None]))
-    U, _, Vt = np.linalg.svd(H)
-    D = np.tile(np.eye(3), (len(H), 1, 1))
-    D[:, 2, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    T = np.tile(np.eye(4), (len(H), 1, 1))
-    T[:, :3, :3] = np.swapaxes(Vt, 1, 2) @ D @ np.swapaxes(U, 1, 2)
-    T[:, :3, 3] = r - np.einsum("bij,bj->bi", T[:, :3, :3], p)
-    return T
-
-
-def _weights(error: Array) -> Array:
-    limit = TRUSTED * np.median(error, axis=1, keepdims=True) + 1e-12
-    return np.minimum(1.0, limit / np.maximum(error, 1e-300))
-
-
-def _steps(turned: Array, marker: np.ndarray, model: Array, y: Array, weights: Array, away: Array) -> Array:
-    """Return the steps (B, M, 3) of the reflectors; base and reflectors move together."""
-    B, N, _ = y.shape
-    M = away.shape[1]
-    J = np.zeros((B, N, 3, 6 + 3 * M))
-    J[..., :3] = np.eye(3)
-    J[..., 3:6] = -_cross(model - model.mean(axis=1, keepdims=True))
-    for m in range(M):
-        J[..., 6 + 3 * m : 9 + 3 * m] = turned * (marker == m)[:, :, None, None]
-    root = np.sqrt(weights)[:, :, None]
-    A = (J * root[..., None]).reshape(B, 3 * N, -1)
-    b = ((y - model) * root).reshape(B, 3 * N)
-    normal = np.swapaxes(A, 1, 2) @ A
-    right = np.einsum("bki,bk->bi", A, b)
-    ridge = (NOMINAL_ERROR / TOOL_ERROR) ** 2
-    normal[:, range(6, 6 + 3 * M), range(6, 6 + 3 * M)] += ridge
-    right[:, 6:] += ridge * away.reshape(B, 3 * M)
-    whole = np.trace(normal, axis1=1, axis2=2)
-    normal += TINY * whole[:, None, None] * np.eye(6 + 3 * M)
-    step = np.linalg.solve(normal, right[..., None])[..., 0]
-    return step[:, 6:].reshape(B, M, 3)
-
-
-def _cross(v: Array) -> Array:
-    """Return the matrices (B, N, 3, 3) of the cross products with v (B, N, 3)."""
-    x, y, z = np.moveaxis(v, 2, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=2).reshape(*x.shape, 3, 3)
+    flange = forward_kinematics(robot, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
+    y, marker, tools = (np.stack([getattr(points, name) for points in tries]) for name in ("y", "marker", "tools"))
+    return register_arm(flange, y, marker, tools)
 
 
 def misfit(robot: Robot, points: Points) -> float:
@@ -259,7 +138,7 @@ def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
     for size in np.unique(sizes):
         for some in np.array_split(np.flatnonzero(sizes == size), 1 + np.count_nonzero(sizes == size) // AT_ONCE):
             chosen = [tries[i] for i in some]
-            error = np.sort(_placed(robot, chosen)[1], axis=1)[:, : int(np.ceil(BEST * size))]
+            error = np.sort(_fitted(robot, chosen).error, axis=1)[:, : int(np.ceil(BEST * size))]
             extent = np.array([max(points.extent, 1e-12) for points in chosen])
             found[some] = np.sqrt(np.mean(error**2, axis=1)) / extent
     for i, points in enumerate(tries):
@@ -270,17 +149,32 @@ def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
 
 def _angle(robot: Robot, points: Points) -> float:
     """Return the median angle [rad] between measured and nominal orientations, base and tool fitted."""
-    flange = forward_kinematics(robot, points.q)
     measured = np.tile(np.eye(4), (len(points.q), 1, 1))
     measured[:, :3, :3] = points.turns
     measured[:, :3, 3] = points.y
+    angles = _angles(robot, points.q, measured)
+    return 0.0 if angles is None else float(np.median(angles))
+
+
+def _angles(robot: Robot, q: Array, measured: Array) -> Array | None:
+    """Return the angles (N,) [rad] between measured poses and nominal ones; None where base and tool do not follow."""
+    flange = forward_kinematics(robot, q)
     try:
         Z, X = hand_eye(flange, measured)
     except InputError:
-        return 0.0
+        return None
     error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
-    cosine = np.clip((np.trace(error, axis1=1, axis2=2) - 1) / 2, -1, 1)
-    return float(np.median(np.arccos(cosine)))
+    return transform.Rotation.from_matrix(error).magnitude()
+
+
+def pose_misfit(robot: Robot, data: Dataset) -> float:
+    """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
+
+    Base and tool are fitted; pi where the poses do not determine them.
+    """
+    block = next(each for each in data.blocks if each.measurement.name == "pose")
+    angles = _angles(robot, block.q[:, 0], transforms(block.y))
+    return float(np.pi) if angles is None else float(np.sqrt(np.mean(angles**2)))
 
 
 def lever_arms(robot: Robot, q: Array, tool: Array) -> Array:
@@ -619,28 +513,3 @@ def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
         return None
     other = Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', lambda points: points)
     return _compared(robot, [other], points, stated, best)
-
-
-def pose_misfit(robot: Robot, data: Dataset) -> float:
-    """Return the RMS angle [rad] between measured and nominal orientations, base and tool fitted.
-
-    Parameters
-    ----------
-    robot
-        As its drawing says.
-    data
-        Poses; the first block of them counts.
-
-    Returns
-    -------
-    Pi where the poses do not determine base and tool.
-    """
-    block = next(each for each in data.blocks if each.measurement.name == "pose")
-    flange = forward_kinematics(robot, block.q[:, 0])
-    measured = transforms(block.y)
-    try:
-        Z, X = hand_eye(flange, measured)
-    except InputError:
-        return float(np.pi)
-    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
-    return float(np.sqrt(np.mean(transform.Rotation.from_matrix(error).magnitude() ** 2)))

@@ -14,8 +14,6 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.misreadings import (
     FEWEST_ROWS,
     Points,
-    _registered,
-    _weights,
     lever_arms,
     misfit,
     misfits,
@@ -112,29 +110,6 @@ def test_a_few_rows_are_too_few_and_many_are_taken_evenly() -> None:
     assert some is not None
     assert some.row.tolist() == [3 * k for k in range(14)]
     assert some.y == pytest.approx(problem.data.blocks[0].y[::3])
-
-
-def test_motions_of_many_sets_are_those_of_each() -> None:
-    rng = np.random.default_rng(5)
-    source, weights = rng.normal(size=(4, 9, 3)), rng.uniform(0.1, 1, (4, 9))
-    turns = Rotation.random(4, rng=rng).as_matrix()
-    target = np.einsum("bij,bnj->bni", turns, source) + rng.normal(size=(4, 1, 3))
-    noisy = target + 0.1 * rng.normal(size=target.shape)
-    assert _registered(source, target, weights)[:, :3, :3] == pytest.approx(turns, abs=1e-12)
-    for T, p, y, w in zip(_registered(source, noisy, weights), source, noisy, weights, strict=True):
-        about, to = np.average(p, axis=0, weights=w), np.average(y, axis=0, weights=w)
-        best = Rotation.align_vectors(y - to, p - about, w)[0].as_matrix()
-        assert T[:3, :3] == pytest.approx(best, abs=1e-9)
-        assert T[:3, 3] == pytest.approx(to - best @ about, abs=1e-9)
-    flat = source * [1, 1, 0]  # in a plane a reflection fits as well: it is none that is returned
-    assert np.linalg.det(_registered(flat, noisy, weights)[:, :3, :3]) == pytest.approx(np.ones(4))
-
-
-def test_rows_beyond_three_medians_lose_their_weight() -> None:
-    error = np.array([[1.0, 1.0, 2.0, 3.0, 6.0]])
-    assert _weights(error) == pytest.approx(np.array([[1.0, 1.0, 1.0, 1.0, 1.0]]))
-    assert _weights(error * [1, 1, 1, 4, 5]) == pytest.approx(np.array([[1.0, 1.0, 1.0, 0.5, 0.2]]))
-    assert (_weights(np.zeros((1, 4))) == 1).all()
 
 
 def test_arms_are_how_far_a_joint_moves_a_point() -> None:

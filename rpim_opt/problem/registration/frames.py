@@ -24,6 +24,7 @@ from rpim_opt.problem.registration.closed_forms import (
     hand_eye,
     proper,
     register,
+    register_arm,
     tool_from_distances,
     transforms,
 )
@@ -38,8 +39,10 @@ if TYPE_CHECKING:
     from rpim_opt.problem.registration.certified import CertifiedStart
 
 
-ENOUGH = 2000
-"""Rows of a measurement from which frames are placed, where there are more."""
+ENOUGH, FEW = 2000, 300
+"""Rows of a measurement that register frames, where there are more; of all together, where they are only compared."""
+MISFIT = 3.0
+"""Nominal errors of a robot up to which positions agree with a registration in closed form."""
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
 MOST_PLACING = 30
@@ -68,8 +71,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     InputError
         When there are no positions and no poses, or they do not determine the base.
     """
-    seen = [b for b in data.blocks if b.measurement.name in ("position", "pose")]
-    seen = [b.take(k, k) for b in seen for k in [_spread(len(b.row))]]
+    seen = _positions(data, ENOUGH)
     if not seen:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
     places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
@@ -79,6 +81,17 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     except InputError as error:
         base, found = _closed_forms(seen, flanges, places)
         return Located(base, found, f"by closed forms: {error.found}")
+
+
+def _positions(data: Dataset, most: int) -> list[Block]:
+    """Return the blocks of positions and poses, of each no more than so many rows, evenly spread."""
+    found = []
+    for block in data.blocks:
+        if block.measurement.name in ("position", "pose"):
+            count = len(block.row)
+            rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+            found.append(block.take(rows, rows))
+    return found
 
 
 def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
@@ -94,15 +107,45 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
     found = _seen_from(base, seen, flanges, places)
     for marker, tool in start.tools.items():
         found[marker][:3] = tool[:3, 3]
+    _turn(found, base, seen, flanges)
+    verdict = "certified" if start.certified else "not certified"
+    return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+
+
+def _turn(tools: dict[str, Array], base: Array, seen: Sequence[Block], flanges: Sequence[Array]) -> None:
+    """Give reflectors (6,) the orientations that poses show from a base (4, 4)."""
     for block, flange in zip(seen, flanges, strict=True):
         if block.measurement.name == "pose":
             tool = np.eye(4)
             turned = (base @ flange)[:, :3, :3].transpose(0, 2, 1) @ transforms(block.y)[:, :3, :3]
             tool[:3, :3] = proper(turned.sum(axis=0))
-            tool[:3, 3] = found[block.markers[0]][:3]
-            found[block.markers[0]] = frame_numbers(tool)
-    verdict = "certified" if start.certified else "not certified"
-    return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+            tool[:3, 3] = tools[block.markers[0]][:3]
+            tools[block.markers[0]] = frame_numbers(tool)
+
+
+def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located | None:
+    """Return base and reflectors in closed form, from positions alone; None where the nominal robot does not fit them.
+
+    A sum of squares, as that of `locate`: what is off by metres does not fit, and is looked at there.
+    """
+    seen = _positions(data, FEW // max(len(data.blocks), 1) + 3)
+    if not seen:
+        return None
+    flanges = [forward_kinematics(robot, block.q[:, 0]) for block in seen]
+    markers = list(tools)
+    flange = np.concatenate(flanges)
+    y = np.concatenate([block.y[:, :3] for block in seen])
+    marker = np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in seen])
+    places = np.array([tools[name][:3] for name in markers])
+    register(
+        np.einsum("nij,nj->ni", flange[:, :3, :3], places[marker]) + flange[:, :3, 3], y
+    )  # refuses points on a line
+    fit = register_arm(flange[None], y[None], marker[None], places[None], robust=False)
+    if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
+        return None
+    found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
+    _turn(found, fit.base[0], seen, flanges)
+    return Located(frame_numbers(fit.base[0]), found, "in closed form")
 
 
 def _started(
@@ -199,11 +242,6 @@ def _closed_forms(
         weight.append(1 / np.broadcast_to(variance, len(flange)))
     q = np.concatenate(weight)
     return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), found
-
-
-def _spread(count: int) -> np.ndarray:
-    """Return which of so many rows place a frame: no more than `ENOUGH`, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
 
 
 APART = 0.1
@@ -427,32 +465,35 @@ def relocated(problem: Source) -> Source | None:
 
     Compared is what `locate` finds on the nominal robot with identified frames. A frame that is more than three
     scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
-    it was found. None when every frame is near enough, or the data do not tell.
+    it was found. None when every frame is near enough, or the data do not tell. Where a registration in closed form
+    fits, and puts every frame within half of that, nothing else is asked: the certified start takes longer than all
+    the rest of a calibration.
     """
     if len(problem.arms) > 1:
         return _each_relocated(problem)
     p = problem.parameters
-    nominal = p.nominal.copy()
-    for k, place in _located(problem):
-        free = p.identified[k]
-        if _misplaced(p, k, place):
-            nominal[k[free]] = place[free]
-    return _moved(problem, nominal)
-
-
-def _located(problem: Source) -> list[tuple[np.ndarray, Array]]:
-    """Return where base and reflectors are in the table and where the data put them, (6,) each; none if they do not."""
-    p = problem.parameters
     base = _frame_of(p, "base_")
     if not p.identified[base].all():
-        return []
+        return None
+    nominal = p.nominal.copy()
     try:
         data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
         at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
-        found, places, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
+        tools = {marker: p.nominal[k] for marker, k in at.items()}
+
+        def far(found: Located, limit: float) -> list[tuple[np.ndarray, Array]]:
+            frames = [(base, found.base), *((k, found.tools[marker]) for marker, k in at.items())]
+            return [(k, place) for k, place in frames if _misplaced(p, k, place, limit)]
+
+        quick = _registered(problem.robot, data, tools)
+        if quick is not None and not far(quick, MISPLACED / 2):
+            return None
+        for k, place in far(locate(problem.robot, data, tools), MISPLACED):
+            free = p.identified[k]
+            nominal[k[free]] = place[free]
     except InputError:
-        return []
-    return [(base, found), *((k, places[marker]) for marker, k in at.items())]
+        return None
+    return _moved(problem, nominal)
 
 
 def _moved(problem: Source, nominal: Array) -> Source | None:
@@ -468,12 +509,12 @@ def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
     return np.array([index[prefix + component] for component in FRAME])
 
 
-def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
-    """Whether an identified frame at places k (6,) of a table is surely not where it is stated."""
+def _misplaced(p: Parameters, k: np.ndarray, place: Array, limit: float = MISPLACED) -> bool:
+    """Whether an identified frame at places k (6,) of a table is further than so many scales from its statement."""
     position, orientation = np.split(p.identified[k], 2)
     if not position.all() or orientation.any() != orientation.all():
         return False
-    far = np.abs(_deviation(place, p.nominal[k])) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
+    far = np.abs(_deviation(place, p.nominal[k])) > limit * (p.scale[k] + NOMINAL_ERROR)
     return bool((far & p.identified[k]).any())
 
 
