@@ -394,19 +394,7 @@ MOST_EQUATIONS = 3000
 
 
 def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows have zero or the same number for every measured coordinate: what an instrument writes for none.
-
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.diagnosis import rows_without_values
-    >>> problem = ro.load("position").problem
-    >>> block = problem.data.blocks[0]
-    >>> y = block.y.copy()
-    >>> y[3] = 0.0
-    >>> wrong = problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
-    >>> print(*rows_without_values(wrong))
-    row c3 has 0 for every measured coordinate: no measurement? Leave out what is none ([exclude]).
-    """
+    """Say which rows have zero or the same number for every measured coordinate: what an instrument writes for none."""
     data = problem.data
     for block in data.blocks:
         if len(block.measurement.columns) < 3:

@@ -37,15 +37,6 @@ class Identified(Parameters):
     ----------
     machine
         That they belong to; None for a table alone.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("paper_arm").problem
-    >>> parameters = problem.linearize(np.zeros(len(problem.parameters.free))).parameters
-    >>> parameters.machine.robot.dof, len(parameters), len(parameters.machine.parameters)
-    (6, 26, 114)
     """
 
     machine: Machine | None = None

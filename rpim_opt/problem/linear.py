@@ -200,17 +200,6 @@ def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0
         How many equations A and b had.
     offset
         As `LinearModel` has it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.linear import from_triangle
-    >>> problem = ro.load("position").problem
-    >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
-    >>> small = from_triangle(model, model.triangle, model.equations)
-    >>> bool(np.allclose(small.svd[1], model.svd[1])), len(small.b), small.equations
-    (True, 35, 120)
     """
     group = np.zeros(len(R), dtype=int)
     return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)

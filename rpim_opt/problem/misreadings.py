@@ -352,18 +352,6 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     ----------
     problem
         Its robot as the drawing says; base and reflectors are fitted anew for every reading.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.misreadings import better_reading
-    >>> problem = ro.load("position").problem
-    >>> better_reading(problem)
-    >>> block = problem.data.blocks[0]
-    >>> wrong = problem.on(replace(problem.data, blocks=(replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]]),)))
-    >>> better_reading(wrong)[:2]
-    ('joints 2 and 3 exchanged', 'exchange the names of the columns q2 and q3')
     """
     points = points_of(problem)
     if points is None:

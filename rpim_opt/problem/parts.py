@@ -46,16 +46,6 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
         (n,) deviations [SI].
     reweigh
         What weighs the equations of `ROWS` rows, whole configurations, by their residuals at x; or None.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> from rpim_opt.problem.parts import reduced
-    >>> model = reduced(problem, np.zeros(len(problem.parameters.free)))
-    >>> model.A.shape, model.equations
-    ((35, 34), 120)
     """
     if reweigh is None:
         return problem.triangle(x, FEW)
@@ -305,14 +295,7 @@ class PartitionedProblem:
 
 
 def in_parts(problem: Source) -> Source:
-    """Return the problem as it is solved: in parts of whole configurations where it keeps more than `KEPT` equations.
-
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("paper_arm").problem
-    >>> from rpim_opt.problem.parts import in_parts
-    >>> in_parts(problem) is problem  # 27 equations
-    True
-    """
+    """Return the problem in parts of whole configurations where it has more than `KEPT` equations, else as it is."""
     if not isinstance(problem, CalibrationProblem):
         return problem
     if sum(len(block.row) * len(block.measurement.components) for block in problem.data.blocks) <= KEPT:

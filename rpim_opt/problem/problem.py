@@ -17,30 +17,14 @@ from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.models import of_fixture
 from rpim_opt.problem.identified import Identified, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
-from rpim_opt.problem.row_functions import (
-    Functions,
-    Kept,
-    Loads,
-    Needs,
-    Structure,
-    asked,
-    columns,
-    loads_of,
-    measured_torques,
-    require_loads,
-    require_same_torques,
-)
-from rpim_opt.problem.scatter import Scatter, Stack, stacked
+from rpim_opt.problem.row_functions import Evaluation, Kept, measured_torques, require_loads, require_same_torques
+from rpim_opt.problem.scatter import Scatter, Stack, joint_slopes, shifts, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
-from rpim_opt.robot.evaluation import evaluate_rows, write_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.model import with_terms
 from rpim_opt.robot.open_model import Model
-from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
+from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters
-
-SHIFTED = ("base_x", "base_y", "base_z")
-"""Parameters that move all of a robot alike."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,11 +41,11 @@ class CalibrationProblem(Tabled):
     parameters
         All parameters of the model, some of them identified.
     data
-        The measurements, of one kind or several.
+        The measurements, of one type or several.
     asked
-        What `frozen` keeps; None where every call asks the measurements anew.
+        The functions that `frozen` keeps; None where every call asks the measurement models anew.
     scatter
-        The robot's own noise; None for the instrument's alone.
+        The robot's repeatability; None for the instrument's noise alone.
 
     Raises
     ------
@@ -175,13 +159,7 @@ class CalibrationProblem(Tabled):
 
     @property
     def joint_values(self) -> Array:
-        """Joint values of the model at every row's first point, (N, dof) [rad or m]; zero for joints that it lacks.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem  # its controller counts as the table does
-        >>> bool((problem.joint_values == problem.data.q).all())
-        True
-        """
+        """Joint values of the model at every row's first point, (N, dof) [rad or m]; zero for joints that it lacks."""
         found = np.zeros(self.data.q.shape)
         for block in self.data.blocks:
             M = self.arms[block.robot].joint_map
@@ -343,12 +321,16 @@ class CalibrationProblem(Tabled):
             return self
         copy = replace(self, asked=Kept())
         for block in copy.data.blocks:
-            copy._functions(block)
+            copy._rows.functions(block)
         return copy
+
+    @cached_property
+    def _rows(self) -> Evaluation:
+        return Evaluation(self.arms, self.parameters, self.data, self.asked)
 
     def residual(self, x: Array) -> Array:
         """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
-        residual = np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+        residual = np.concatenate([self._rows.values(block, "residual", x).ravel() for block in self.data.blocks])
         if self.touches is not None:
             residual, _ = self.touches.centred(residual, size=self._size)
         return residual
@@ -364,12 +346,8 @@ class CalibrationProblem(Tabled):
 
     def _residuals(self, x: Array) -> Iterator[tuple[Block, Array]]:
         """Yield every block with its residual (N, c) [SI]."""
-        if self.touches is None:
-            for block in self.data.blocks:
-                yield block, self._evaluate(block, "residual", x)[0][:, 0]
-            return
-        residual = self.residual(x)
         start = 0
+        residual = self.residual(x)
         for block in self.data.blocks:
             each = len(block.measurement.components)
             end = start + each * len(block.row)
@@ -378,7 +356,7 @@ class CalibrationProblem(Tabled):
 
     def modelled(self, x: Array) -> list[Array]:
         """Return what the instrument would read at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
-        return [self._evaluate(block, "modelled", x)[0][:, 0] for block in self.data.blocks]
+        return [self._rows.values(block, "modelled", x) for block in self.data.blocks]
 
     def errors(self, x: Array, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
@@ -408,19 +386,14 @@ class CalibrationProblem(Tabled):
             dimensions = list(block.measurement.components.values())
             if dimension != "pixel":
                 dimensions = error_dimensions(block)
-                residual = self._in_lengths(block, residual, x)
+                if block.measurement.metres is not None:
+                    residual = residual * self._rows.values(block, "metres", x)
             of = [i for i, d in enumerate(dimensions) if d == dimension]
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
         if self.touches is not None:
-            errors[self._rows_of_equations[self.touches.alone]] = np.nan
+            errors[self._rows.owners[self.touches.alone]] = np.nan
         return errors
-
-    def _in_lengths(self, block: Block, residual: Array, x: Array) -> Array:
-        """Return the residual (N, c) of a block in metres where it is measured in something else, else as it is."""
-        if block.measurement.metres is None:
-            return residual
-        return residual * self._evaluate(block, "metres", x)[0][:, 0]
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,).
@@ -455,29 +428,17 @@ class CalibrationProblem(Tabled):
         return np.sqrt(squares), np.bincount(which)
 
     def whitened_residual(self, x: Array) -> Array:
-        """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> nominal = np.zeros(len(problem.parameters.free))
-        >>> bool(np.allclose(problem.whitened_residual(nominal), problem.linearize(nominal).b))
-        True
-        """
+        """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations."""
         if self.scatter is not None or self.touches is not None:
             return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
         parts = []
         for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
-            residual = self._evaluate(block, "residual", x)[0]
-            parts.append((whitening @ residual.transpose(0, 2, 1)).ravel())
+            parts.append((whitening @ self._rows.values(block, "residual", x)[:, :, None]).ravel())
         return np.concatenate(parts)
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
-        if self.touches is not None:
-            return self.slopes(x)[1]
-        parts = [self._evaluate(block, "jacobian", x)[1] for block in self.data.blocks]
-        return np.concatenate([part.reshape(-1, len(x)) for part in parts])
+        return self.slopes(x)[1]
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
         """Return the whitened, scaled linear model around the deviations x (n,) [SI].
@@ -502,25 +463,9 @@ class CalibrationProblem(Tabled):
         return replace(weighed, offset=offset)
 
     def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model of `linearize` some rows at a time, block by block.
-
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI].
-        most
-            Rows of a piece.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> [len(piece.b) for piece in problem.pieces(np.zeros(len(problem.parameters.free)), 5)]
-        [15, 12]
-        """
+        """Yield the linear model of `linearize` at x (n,) [SI], no more than so many rows at a time, block by block."""
         if self.scatter is not None or self.touches is not None:
-            yield from self._scattered(x, most)
+            yield from self._by_configurations(x, most)
             return
         n = len(x)
         for i, part in self._spans(most):
@@ -534,28 +479,12 @@ class CalibrationProblem(Tabled):
             )
 
     def triangle(self, x: Array, most: int) -> LinearModel:
-        """Return the model of `linearize` as its triangle: n + 1 equations, the same |A z - b| for every z.
+        """Return the model of `linearize` at x (n,) [SI] as its QR factor: n + 1 equations, the same |A z - b|.
 
-        Rows are evaluated where they are reduced, so that memory does not grow with their number.
-
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI].
-        most
-            Rows that are evaluated and reduced together.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> model = problem.triangle(np.zeros(len(problem.parameters.free)), 5)
-        >>> model.A.shape, model.equations
-        ((27, 26), 27)
+        Rows are evaluated where they are reduced, so many together, and memory does not grow with their number.
         """
         if self.scatter is not None or self.touches is not None:
-            return reduced_models(self._scattered(x, most))
+            return reduced_models(self._by_configurations(x, most))
         R, equations, n = None, 0, len(x) + 1
         for i, part in self._spans(most):
             each = len(self.data.blocks[i].measurement.components)
@@ -582,7 +511,6 @@ class CalibrationProblem(Tabled):
 
     @cached_property
     def _identified(self) -> Identified:
-        """The identified parameters, with what their positions are predicted from."""
         only = self.robots if isinstance(self.robots, Robot) else None
         return identified_of(only, self.parameters, self.data)
 
@@ -590,20 +518,15 @@ class CalibrationProblem(Tabled):
         """Write the whitened, scaled [A r] of N rows of a block into ``found`` (n + 1, k, N); b = r + A z."""
         block, whitening, factors = self.data.blocks[i], self._whitening[i], self._factors[i]
         if factors is not None:
-            into = [found[-1:], found[:-1].transpose(1, 0, 2)]
-            function = self._functions(block)["jacobian"]
-            rows = self._rows(block, part)
-            with phase("evaluation"):
-                write_rows(function, [x, self.parameters.nominal], rows, into, factors)
+            self._rows.write(block, x, part, found, factors)
             return
-        scale = self.parameters.free.scale
         L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._evaluate(block, "jacobian", x, part)
-        _weigh(L, jacobian.transpose(1, 2, 0), scale, found[:-1])
+        residual, jacobian = self._rows.of(block, "jacobian", x, part)
+        _weigh(L, jacobian.transpose(1, 2, 0), self.parameters.free.scale, found[:-1])
         _weigh(L, residual.transpose(2, 1, 0), np.ones(1), found[-1:])
 
-    def _scattered(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model by whole configurations, whose rows share the robot's scatter."""
+    def _by_configurations(self, x: Array, most: int) -> Iterator[LinearModel]:
+        """Yield the linear model by whole configurations, whose rows share the robot's repeatability."""
         scale = self.parameters.free.scale
         parts = [np.arange(len(self.data))]
         if len(self.data) > most:
@@ -618,31 +541,18 @@ class CalibrationProblem(Tabled):
             yield self._model(A, r + A @ (x / scale), problem.groups)
 
     def slopes(self, x: Array) -> tuple[Array, Array]:
-        """Return residual (m,) and Jacobian (m, n) [SI], evaluated together.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> [part.shape for part in problem.slopes(np.zeros(len(problem.parameters.free)))]
-        [(27,), (27, 26)]
-        """
-        both = [self._evaluate(block, "jacobian", x) for block in self.data.blocks]
+        """Return residual (m,) and Jacobian (m, n) at x (n,) [SI], evaluated together."""
+        both = [self._rows.of(block, "jacobian", x) for block in self.data.blocks]
         residual = np.concatenate([r.ravel() for r, _ in both])
         jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
-        if self.touches is not None:
-            left, slopes = self.touches.centred(residual, jacobian, self._size)
-            return left, np.asarray(slopes)
-        return residual, jacobian
+        if self.touches is None:
+            return residual, jacobian
+        return self.touches.centred(residual, jacobian, self._size)
 
     def contrasts(self, values: Array) -> Array:
         """Return what values of the rows' equations (m, c) say without the points that were touched, (k, c).
 
         They are what `linearize` whitens, in its order; the values themselves where no row touches a point.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.contrasts(np.eye(27)).shape
-        (27, 27)
         """
         if self.touches is None:
             return values
@@ -671,22 +581,13 @@ class CalibrationProblem(Tabled):
             Whether the slopes by the joints' angles are wanted.
         at
             (P,) values of all parameters at which they are taken [SI]; None for nominal.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> stacks = ro.load("markers").problem.stacks()  # 25 configurations, three reflectors
-        >>> [stack.index.shape for stack in stacks], stacks[0].joint.shape
-        ([(25, 9)], (25, 9, 6))
         """
-        slopes = None
-        if joints:
-            slopes = self.joint_slopes(at)
-        found = stacked(self.data, slopes, self.shifts(at))
+        slopes = joint_slopes(self._rows, at) if joints else None
+        found = stacked(self.data, slopes, shifts(self._rows, at))
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, found, self.touched, stop[self._rows_of_equations])
+        return contrasted(self.touches, found, self.touched, stop[self._rows.owners])
 
     @cached_property
     def _size(self) -> float:
@@ -699,7 +600,7 @@ class CalibrationProblem(Tabled):
     def _untouched(self) -> Array:
         """The residual (m,) of the nominal robot [SI] with touched points at the origin."""
         x = np.zeros(len(self.parameters.free))
-        return np.concatenate([self._evaluate(block, "residual", x)[0].ravel() for block in self.data.blocks])
+        return np.concatenate([self._rows.values(block, "residual", x).ravel() for block in self.data.blocks])
 
     @cached_property
     def touched(self) -> Things:
@@ -713,113 +614,17 @@ class CalibrationProblem(Tabled):
             return ()
         return [thing.level for thing in self.touches.located(self._untouched)]
 
-    def joint_slopes(self, at: Array | None = None) -> Array:
-        """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
-
-        Parameters
-        ----------
-        at
-            (P,) values of all parameters [SI]; None for nominal.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.joint_slopes().shape
-        (27, 6)
-        """
-        p = self.parameters
-        number = self._turning
-        angles = np.array([name in number for name in p.names])
-        nominal = p.nominal
-        if at is not None:
-            nominal = at
-        alone = replace(self, parameters=replace(p, nominal=nominal, identified=angles), scatter=None)
-        found = np.zeros((len(self._rows_of_equations), max(robot.dof for robot in self.arms.values())))
-        if angles.any():
-            columns = [number[name] for name in p.names if name in number]
-            at_nominal = np.zeros(len(columns))
-            parts = [alone._evaluate(block, "jacobian", at_nominal)[1] for block in self.data.blocks]
-            J = np.concatenate([part.reshape(-1, len(columns)) for part in parts])
-            # the same joint of several robots: a row has slopes by those of its own robot alone
-            np.add.at(found.T, columns, J.T)
-        return found
-
-    def shifts(self, at: Array | None = None) -> Array | None:
-        """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
-
-        Zero for other rows, whose own lengths are shifted. A camera or a board that the robot holds elsewhere shifts
-        all points of a view together.
-
-        Parameters
-        ----------
-        at
-            (P,) values of all parameters [SI]; None for nominal.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.shifts() is None
-        True
-        >>> ro.load("camera").problem.shifts().shape
-        (960, 3)
-        """
-        if all(block.measurement.metres is None for block in self.data.blocks):
-            return None
-        p = self.parameters
-        places = np.array([own_name(name) in SHIFTED for name in p.names])
-        nominal = p.nominal
-        if at is not None:
-            nominal = at
-        alone = replace(self, parameters=replace(p, nominal=nominal, identified=places), scatter=None)
-        columns = [SHIFTED.index(own_name(name)) for name in np.array(p.names)[places]]
-        found = []
-        for block in self.data.blocks:
-            part = np.zeros((len(block.row) * len(block.measurement.components), 3))
-            if block.measurement.metres is not None:
-                slopes = alone._evaluate(block, "jacobian", np.zeros(len(columns)))[1]
-                np.add.at(part.T, columns, slopes.reshape(len(part), -1).T)
-            found.append(part)
-        return np.concatenate(found)
-
-    @cached_property
-    def _turning(self) -> dict[str, int]:
-        """The offsets of revolute joints by name, with the joints' places."""
-        found = {}
-        for name, robot in self.arms.items():
-            for i, kind in enumerate(robot.joint_types):
-                if kind == "revolute":
-                    found[f"theta{i + 1}"] = i
-                    found[f"{name}.theta{i + 1}"] = i
-        return found
-
     @cached_property
     def groups(self) -> np.ndarray:
-        """Number of the configuration that every equation belongs to, (m,).
-
-        >>> import rpim_opt as ro
-        >>> ro.load("position").problem.groups.reshape(-1, 3)[:2]  # three equations a position
-        array([[19, 19, 19],
-               [ 0,  0,  0]])
-        """
+        """Number of the configuration that every equation belongs to, (m,)."""
         return np.asarray(self.data.configuration[self.owners])
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """Number of the row that every equation of `linearize` belongs to, (m,).
-
-        >>> import rpim_opt as ro
-        >>> ro.load("position").problem.owners[:4]
-        array([0, 0, 0, 1])
-        """
+        """Number of the row that every equation of `linearize` belongs to, (m,)."""
         if self.touches is None:
-            return self._rows_of_equations
-        return self._rows_of_equations[self.touches.kept(self.touched)]
-
-    @cached_property
-    def _rows_of_equations(self) -> np.ndarray:
-        """Number of the row of every equation, with those that the touched points take (m,)."""
-        rows = [np.repeat(block.row, len(block.measurement.components)) for block in self.data.blocks]
-        return np.concatenate(rows)
+            return self._rows.owners
+        return self._rows.owners[self.touches.kept(self.touched)]
 
     @cached_property
     def _whitening(self) -> list[Array]:
@@ -851,11 +656,6 @@ class CalibrationProblem(Tabled):
         reading
             Of a reading; otherwise without the instrument's part: the robot's own scatter.
 
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> [V.shape for V in ro.load("paper_arm").problem.covariances()]
-        [(1, 3, 3)]
         """
         found = self._of_rows(reading)
         if self.touches is None:
@@ -867,14 +667,12 @@ class CalibrationProblem(Tabled):
         scatter = self.scatter
         if scatter is None:
             return [block.covariance * reading for block in self.data.blocks]
-        slopes = None
-        if scatter.joint > 0:
-            slopes = self.joint_slopes(scatter.at)
+        slopes = joint_slopes(self._rows, scatter.at) if scatter.joint > 0 else None
         # each row as a configuration of its own
         alone = replace(self.data, configuration=np.arange(len(self.data)))
-        count = len(self._rows_of_equations)
+        count = len(self._rows.owners)
         found = {}
-        for stack in stacked(alone, slopes, self.shifts(scatter.at)):
+        for stack in stacked(alone, slopes, shifts(self._rows, scatter.at)):
             place = np.full(count, -1)
             place[stack.index[:, 0]] = np.arange(len(stack.index))
             found[stack.index.shape[1]] = (place, stack.covariance(scatter, reading))
@@ -887,86 +685,9 @@ class CalibrationProblem(Tabled):
             begin += k * len(block.row)
         return blocks
 
-    def _evaluate(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
-        rows = self._rows(block, part)
-        function = self._functions(block)[what]
-        with phase("evaluation"):
-            return evaluate_rows(function, [x, self.parameters.nominal], rows)
-
-    def _functions(self, block: Block) -> Functions:
-        if id(block) not in self._structures:
-            self._structures[id(block)] = self._structure(block)
-        return (self.asked or asked)(self._structures[id(block)], block.measurement)
-
-    @cached_property
-    def _structures(self) -> dict[int, Structure]:
-        return {}
-
-    def _structure(self, block: Block) -> Structure:
-        """Return what the functions of a block's rows depend on, besides its measurement."""
-        p = self.parameters
-        absent = (p.nominal == 0) & ~p.identified
-        robot = self.arms[block.robot]
-        names = p.names
-        if block.robot:  # those of other robots keep their long names, which nobody asks for
-            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-        return Structure(
-            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
-            self._loads(block), tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
-        )  # fmt: skip
-
-    @cached_property
-    def _needs(self) -> dict[str, Needs]:
-        return {name: Needs.of(robot, self.parameters.of_robot(name)) for name, robot in self.arms.items()}
-
-    def _loads(self, block: Block) -> Loads:
-        return loads_of(self.arms[block.robot], self._needs[block.robot], self.data, block)
-
-    def _rows(self, block: Block, part: slice) -> Array:
-        """Return joint values of the model, what the joints bear, and measured values, side by side."""
-        if id(block) not in self._kept:
-            self._kept[id(block)] = self._stacked(block)
-        return self._kept[id(block)][part]
-
-    @cached_property
-    def _kept(self) -> dict[int, Array]:
-        return {}
-
-    def _stacked(self, block: Block) -> Array:
-        robot = self.arms[block.robot]
-        joints = (block.q.reshape(-1, block.q.shape[-1]) @ robot.joint_map.T).reshape(len(block.y), -1)
-        return np.hstack([joints, *columns(robot, block, slice(None)), self._of_sessions(block), block.y])
-
-    @cached_property
-    def _sessions(self) -> dict[str, tuple[str, ...]]:
-        """The prefixes of the sessions of every robot that shift anything."""
-        p = self.parameters
-        present = p.take(np.flatnonzero(p.identified | (p.nominal != 0)))
-        return {
-            robot: tuple(dict.fromkeys(frame_of(name) for name in present.of_robot(robot).names if of_session(name)))
-            for robot in self.arms
-        }
-
-    def _of_sessions(self, block: Block) -> Array:
-        """Return 1 where a row is of a session that shifts anything, (N, sessions)."""
-        known = self._sessions[block.robot]
-        found = np.zeros((len(block.row), len(known)))
-        if known:
-            prefixes = {name: session_prefix(name) for name in dict.fromkeys(block.session_names)}
-            mine = np.array([prefixes[name] for name in block.session_names], dtype=object)
-            for i, prefix in enumerate(known):
-                found[:, i] = mine == prefix
-        return found
-
 
 def error_dimensions(block: Block) -> list[str]:
-    """Return what the components of a block's residual count as in errors: ``length``, ``angle``, ``stated``.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.problem import error_dimensions
-    >>> error_dimensions(ro.load("paper_arm").problem.data.blocks[0])
-    ['length', 'length', 'length']
-    """
+    """Return what the components of a block's residual count as in errors: ``length``, ``angle``, ``stated``."""
     dimensions = list(block.measurement.components.values())
     if block.measurement.metres is not None:
         return ["length"] * len(dimensions)

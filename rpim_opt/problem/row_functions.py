@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -13,15 +13,24 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.phases import phase
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.models import READY, Measurement, of_fixture
 from rpim_opt.robot.deflection import Statics
-from rpim_opt.robot.evaluation import SYMBOLS
+from rpim_opt.robot.evaluation import SYMBOLS, evaluate_rows, write_rows
 from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.open_model import asked_by
-from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
+from rpim_opt.robot.parameter_names import (
+    EXPANSION,
+    REFERENCE,
+    frame_of,
+    of_session,
+    of_term,
+    session_prefix,
+    tool_prefix,
+)
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.posture import Posture, Symbol
 from rpim_opt.robot.terms import Term
@@ -395,17 +404,17 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
     return Loads(torques=torques, payload=weighs or needs.payload, gravity=gravity, weighs=weighs)
 
 
-def columns(robot: Robot, block: Block, part: slice) -> list[Array]:
-    """Return what some rows state of their joints, side by side, about the joints of the model."""
-    N = len(block.y[part])
+def loads_in(robot: Robot, block: Block) -> list[Array]:
+    """Return what rows state of the joints of the model, (N, c) each, in the order of `Stated`."""
+    N = len(block.y)
     found = []
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
-        found.append((block.torque[part] @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
+        found.append((block.torque @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
     if block.payload is not None:
-        found.append(block.payload[part].reshape(N, 1))
+        found.append(block.payload.reshape(N, 1))
     if block.approach is not None:
-        found.append(np.sign(block.approach[part] @ robot.joint_map.T).reshape(N, -1))
-    return [*found, *(values[part].reshape(N, 1) for values in block.columns.values())]
+        found.append(np.sign(block.approach @ robot.joint_map.T).reshape(N, -1))
+    return [*found, *(values.reshape(N, 1) for values in block.columns.values())]
 
 
 def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
@@ -481,12 +490,106 @@ def bearing(
 
 
 def repeatable(block: Block) -> Array:
-    """Return what is the same (N, c) in rows that read the same thing again: joint values, and what a model sees else.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.row_functions import repeatable
-    >>> repeatable(ro.load("paper_arm").problem.data.blocks[0]).shape
-    (9, 6)
-    """
+    """Return what is the same (N, c) in rows that repeat a measurement: joint values and a model's own columns."""
     seen = [block.columns[name][:, None] for name in block.measurement.sees if name in block.columns]
     return np.hstack([block.q.reshape(len(block.row), -1), *seen])
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Rows of a dataset, evaluated by the CasADi functions of their blocks.
+
+    ``arms`` are the nominal robots by name, ``kept`` the functions that were asked for once, if any were.
+    """
+
+    arms: Mapping[str, Robot]
+    parameters: Parameters
+    data: Dataset
+    kept: Kept | None = None
+
+    def of(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+        """Return the results of a function of `Functions` for rows of a block at x (n,), (N, ...) each."""
+        function = self.functions(block)[what]
+        with phase("evaluation"):
+            return evaluate_rows(function, [x, self.parameters.nominal], self._stated(block)[part])
+
+    def values(self, block: Block, what: str, x: Array) -> Array:
+        """Return the vector (N, c) of a function of every row of a block at x (n,)."""
+        return self.of(block, what, x)[0][:, 0]
+
+    def write(self, block: Block, x: Array, part: slice, found: Array, factors: Array) -> None:
+        """Write [J r] of N rows, each entry times its factor, into ``found`` (n + 1, k, N)."""
+        into = [found[-1:], found[:-1].transpose(1, 0, 2)]
+        function = self.functions(block)["jacobian"]
+        rows = self._stated(block)[part]
+        with phase("evaluation"):
+            write_rows(function, [x, self.parameters.nominal], rows, into, factors)
+
+    def slopes_by(self, chosen: np.ndarray, at: Array | None = None) -> list[Array]:
+        """Return the slopes (m, c) of each block by chosen parameters (P,), at values (P,) of all [SI] or nominal."""
+        nominal = self.parameters.nominal if at is None else at
+        alone = replace(self, parameters=replace(self.parameters, nominal=nominal, identified=chosen))
+        x = np.zeros(int(chosen.sum()))
+        return [alone.of(block, "jacobian", x)[1].reshape(-1, len(x)) for block in self.data.blocks]
+
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """Number of the row of every equation (m,)."""
+        rows = [np.repeat(block.row, len(block.measurement.components)) for block in self.data.blocks]
+        return np.concatenate(rows)
+
+    def functions(self, block: Block) -> Functions:
+        """Return the functions of a block's rows."""
+        if block not in self._structures:
+            self._structures[block] = self._structure(block)
+        return (self.kept or asked)(self._structures[block], block.measurement)
+
+    @cached_property
+    def _structures(self) -> dict[Block, Structure]:
+        return {}
+
+    @cached_property
+    def _arguments(self) -> dict[Block, Array]:
+        return {}
+
+    def _structure(self, block: Block) -> Structure:
+        """Return what the functions of a block's rows depend on, besides its measurement."""
+        p = self.parameters
+        absent = (p.nominal == 0) & ~p.identified
+        robot = self.arms[block.robot]
+        names = p.names
+        if block.robot:  # those of other robots keep their long names, which nobody asks for
+            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
+        needs = Needs.of(robot, p.of_robot(block.robot))
+        return Structure(
+            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
+            loads_of(robot, needs, self.data, block), tuple(robot.model.terms), len(self.arms) > 1,
+            self._sessions[block.robot],
+        )  # fmt: skip
+
+    def _stated(self, block: Block) -> Array:
+        """Return joint values of the model, what the joints bear, sessions and measured values, side by side."""
+        if block not in self._arguments:
+            robot = self.arms[block.robot]
+            joints = (block.q.reshape(-1, block.q.shape[-1]) @ robot.joint_map.T).reshape(len(block.y), -1)
+            columns = loads_in(robot, block)
+            self._arguments[block] = np.hstack([joints, *columns, self._of_sessions(block), block.y])
+        return self._arguments[block]
+
+    @cached_property
+    def _sessions(self) -> dict[str, tuple[str, ...]]:
+        """The prefixes of the sessions of every robot that shift anything."""
+        p = self.parameters
+        present = p.take(np.flatnonzero(p.identified | (p.nominal != 0)))
+        return {
+            robot: tuple(dict.fromkeys(frame_of(name) for name in present.of_robot(robot).names if of_session(name)))
+            for robot in self.arms
+        }
+
+    def _of_sessions(self, block: Block) -> Array:
+        """Return 1 where a row is of a session that shifts anything, (N, sessions)."""
+        known = self._sessions[block.robot]
+        if not known:
+            return np.zeros((len(block.row), 0))
+        mine = np.array([session_prefix(name) for name in block.session_names], dtype=object)
+        return np.column_stack([mine == prefix for prefix in known]).astype(float)

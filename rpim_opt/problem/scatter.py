@@ -8,6 +8,11 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.problem.row_functions import Evaluation
+from rpim_opt.robot.parameter_names import own_name
+
+SHIFTED = ("base_x", "base_y", "base_z")
+"""Parameters that move all of a robot alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,3 +190,43 @@ def _covariances(block: Block, rows: np.ndarray) -> Array:
     if len(block.covariance) == 1:
         return np.broadcast_to(block.covariance, (len(rows), *block.covariance.shape[1:]))
     return block.covariance[rows]
+
+
+def joint_slopes(rows: Evaluation, at: Array | None = None) -> Array:
+    """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
+
+    They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
+    """
+    joints = {}
+    for name, robot in rows.arms.items():
+        for i, kind in enumerate(robot.joint_types):
+            if kind == "revolute":
+                joints[f"theta{i + 1}"] = i
+                joints[f"{name}.theta{i + 1}"] = i
+    names = rows.parameters.names
+    chosen = np.array([name in joints for name in names])
+    found = np.zeros((len(rows.owners), max(robot.dof for robot in rows.arms.values())))
+    if chosen.any():
+        J = np.concatenate(rows.slopes_by(chosen, at))
+        # the same joint of several robots: a row has slopes by those of its own robot alone
+        np.add.at(found.T, [joints[name] for name in names if name in joints], J.T)
+    return found
+
+
+def shifts(rows: Evaluation, at: Array | None = None) -> Array | None:
+    """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
+
+    Zero for other rows, whose own lengths are shifted. A camera or a board that the robot holds elsewhere shifts
+    all points of a view together. Values ``at`` as for `joint_slopes`.
+    """
+    seen = [block.measurement.metres is not None for block in rows.data.blocks]
+    if not any(seen):
+        return None
+    names = [own_name(name) for name in rows.parameters.names]
+    columns = [SHIFTED.index(name) for name in names if name in SHIFTED]
+    parts = rows.slopes_by(np.array([name in SHIFTED for name in names]), at)
+    found = [np.zeros((len(part), 3)) for part in parts]
+    for sums, part, camera in zip(found, parts, seen, strict=True):
+        if camera:
+            np.add.at(sums.T, columns, part.T)
+    return np.concatenate(found)

@@ -177,14 +177,6 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     ----------
     problem
         With measurements, perhaps of other sessions.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.several import knowing_sessions
-    >>> problem = ro.load("position").problem
-    >>> knowing_sessions(problem) is problem  # nobody named a session
-    True
     """
     p = problem.parameters
     like = dict(chain.from_iterable(_new(problem, robot) for robot in problem.arms))
@@ -209,14 +201,6 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
     ----------
     problem
         With the measurements.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.several import unknown_sessions
-    >>> problem = ro.load("position").problem
-    >>> float(max(V.max() for V in unknown_sessions(problem)))  # nobody named a session
-    0.0
     """
     whole = knowing_sessions(problem)
     if whole is problem or problem.touches is not None:

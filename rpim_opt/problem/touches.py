@@ -48,13 +48,6 @@ class Point:
         K.
     normal, across
         Zero: a point has none.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from rpim_opt.problem.touches import Point
-    >>> Point.of(np.array([[0, 0, 0.1], [0, 0, 0.3]])).centre
-    array([0. , 0. , 0.2])
     """
 
     centre: Array
@@ -123,14 +116,6 @@ class Plane:
         (K, 3): 1 and the coordinates u, v [m] of every touch in the plane.
     aside
         (K, K - 3) the orthonormal basis.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from rpim_opt.problem.touches import Plane
-    >>> flat = Plane.of(np.array([[0, 0, 0.1], [1, 0, 0.1], [0, 1, 0.1], [1, 1, 0.1]]))
-    >>> abs(flat.normal).round(9), flat.aside.shape
-    (array([0., 0., 1.]), (4, 1))
     """
 
     centre: Array
@@ -249,17 +234,6 @@ class Touches:
         What is known of two of them.
     equations
         How many equations there are before points and planes are eliminated.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.touches import Touches
-    >>> data = ro.data.touches(np.zeros((5, 6)), ["A", "A", "A", "B", "B"], sigma=1e-4)
-    >>> found = Touches.of(data)
-    >>> where = found.located(np.zeros(15))
-    >>> found.equations, found.contrasts(np.eye(15), where).shape  # without two points
-    (15, (9, 15))
     """
 
     rows: tuple[np.ndarray, ...]

@@ -48,17 +48,6 @@ def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Arr
         The reflector; the only one, or the first, by default.
     torque
         (N, dof) joint torques [Nm], where the compliance of joints is identified from measured ones.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.workspace import predicted
-    >>> problem = ro.load("paper_arm").problem
-    >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
-    >>> where = predicted(model.parameters.machine, np.zeros((2, 6)))
-    >>> where.position.shape, where.slope.shape
-    ((2, 3), (2, 3, 26))
     """
     here = _there(machine, q, marker, torque)
     return _about(here, _at(machine))
@@ -330,13 +319,6 @@ def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Arr
     ------
     InputError
         For a text that is not three numbers, and data that touch nothing.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.workspace import touched_place
-    >>> touched_place(ro.load("contact").problem, "400,0,200")
-    array([0.4, 0. , 0.2])
     """
     if stated is not None:
         try:

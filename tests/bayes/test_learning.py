@@ -12,6 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.hyperparameters import Learning
 from rpim_opt.bayes.learning import MOST, sampled
 from rpim_opt.bayes.outliers import clustered, ratios, resistant, suspected, unbelievable
+from rpim_opt.problem.scatter import joint_slopes
 
 POSITION = ro.load("position").problem
 
@@ -22,7 +23,7 @@ def measured(
     """Return the problem with positions of a robot that deviates by x, instrument noise and a scatter of its own."""
     rng = np.random.default_rng(seed)
     blocks = []
-    T = problem.joint_slopes()
+    T = joint_slopes(problem._rows)
     for block, y in zip(problem.data.blocks, problem.modelled(x), strict=True):
         e = np.einsum("nij,nj->ni", np.linalg.cholesky(block.covariance), rng.normal(size=y.shape))
         e = e + scatter * rng.normal(size=y.shape)

@@ -120,20 +120,20 @@ def test_the_same_answer_builds_no_second_function() -> None:
     measurement, change = by_closure()
     problem = heights(measurement)
     block = problem.data.blocks[0]
-    first = problem._functions(block)
+    first = problem._rows.functions(block)
     change(1.0)
-    second = problem._functions(block)
+    second = problem._rows.functions(block)
     change(0.0)
-    assert problem._functions(block) is first
+    assert problem._rows.functions(block) is first
     assert second is not first
     twin = ro.data.Measurement("height", lambda T: T[2, 3] + 0.0, COLUMNS)
-    assert heights(twin)._functions(replace(block, measurement=twin)) is first
+    assert heights(twin)._rows.functions(replace(block, measurement=twin)) is first
 
 
 def test_ready_measurements_are_built_once() -> None:
     problem = ro.load("pose").problem
     block = problem.data.blocks[0]
-    assert problem._functions(block) is problem._functions(block)
+    assert problem._rows.functions(block) is problem._rows.functions(block)
     hits = _built.cache_info()
     _ready(*next(iter(problem.frozen().asked._functions)))
     assert _built.cache_info() == hits
@@ -179,10 +179,10 @@ def test_a_kept_function_is_the_one_of_its_structure() -> None:
     problem = heights(by_closure()[0])
     one = replace(problem, asked=kept)
     block = problem.data.blocks[0]
-    both = one._functions(block)
+    both = one._rows.functions(block)
     other = one.identifying(problem.parameters.identify(["base_z"]).identified)
-    assert other._functions(block)["jacobian"].size_in(0) == (1, 1)
-    assert one._functions(block) is both
+    assert other._rows.functions(block)["jacobian"].size_in(0) == (1, 1)
+    assert one._rows.functions(block) is both
 
 
 def test_a_wrong_number_of_components_is_named() -> None:

@@ -233,7 +233,7 @@ def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.D
 
 
 def jacobian_of(problem: CalibrationProblem):
-    return problem._functions(problem.data.blocks[0])["jacobian"]
+    return problem._rows.functions(problem.data.blocks[0])["jacobian"]
 
 
 def test_ready_measurements_stay_the_same_in_other_processes() -> None:

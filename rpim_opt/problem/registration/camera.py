@@ -44,13 +44,6 @@ def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
         Pixels.
     camera
         ``fx, fy, cx, cy``, and distortion where it is known.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from rpim_opt.problem.registration.camera import normalized
-    >>> normalized(np.array([[740.0, 480.0]]), {"fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 480.0})
-    array([[0.1, 0. ]])
     """
     k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
@@ -243,15 +236,6 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     ------
     InputError
         For fewer views, boards that are not flat, and views all from one side, which tell no focal length.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.registration.camera import starting_camera
-    >>> data = ro.load("camera").problem.data
-    >>> found = starting_camera(data, data.blocks[0])
-    >>> list(found), 800 < found["fx"] < 1000, 800 < found["fy"] < 1000  # 915 and 880, with distortion
-    (['fx', 'fy', 'cx', 'cy'], True, True)
     """
     rows = []
     points = targets(block)
@@ -306,15 +290,6 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     ------
     InputError
         For a camera without focal length, and views none of which shows a pose.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.registration.camera import posed
-    >>> problem = ro.load("camera").problem
-    >>> own = dict(zip(problem.parameters.names, problem.parameters.nominal))
-    >>> posed(problem.data, own).blocks
-    (<Block 24 rows of pose>,)
     """
     if not camera_blocks(data):
         return data

@@ -259,18 +259,6 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     ------
     InputError
         For a point that robots are said to have touched alike, and that is elsewhere for one of them.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.problem.registration.frames import met
-    >>> arm = ro.load("contact").problem
-    >>> p = arm.parameters
-    >>> free = arm.with_parameters(p.identify([*p.free.names, "base_*"]))
-    >>> both = ro.together(left=arm, right=free, shared=["tool_*"])  # the same touches twice
-    >>> bool(np.abs(met(both)["right"]).max() < 1e-9)  # so that they stand in one place
-    True
     """
     known: dict[str, Array] = {}
     found = {}

@@ -240,21 +240,6 @@ def compatible(turns: Turns, beyond: Array) -> np.ndarray:
         B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
 
     |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
-
-    Examples
-    --------
-    The third has turned by another angle than the flange.
-
-    >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from rpim_opt.problem.registration.loops import compatible
-    >>> from rpim_opt.problem.registration.loops import Turns
-    >>> A, B = (Rotation.from_rotvec([[0, 0, 0], each, [1, 0, 0]]).as_matrix() for each in ([0, 1, 0], [0, 0, 1]))
-    >>> B[2] = Rotation.from_rotvec([0.5, 0, 0]).as_matrix()
-    >>> compatible(Turns(A, B, np.full(3, 1e-3), np.zeros(3, dtype=int)), np.full(3, 16.8))
-    array([[ True,  True, False],
-           [ True,  True, False],
-           [False, False,  True]])
     """
     N = len(beyond)
     if N > MOST_PAIRED:

@@ -250,20 +250,6 @@ def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moment
         all by default.
     sought
         Tolerance of gap and feasibility.
-
-    Examples
-    --------
-    The rotation with the largest trace is none at all.
-
-    >>> import numpy as np
-    >>> from rpim_opt.problem.registration.relaxation import relax
-    >>> Q = np.zeros((10, 10))
-    >>> Q[0, [1, 5, 9]] = Q[[1, 5, 9], 0] = -0.5
-    >>> found = relax(Q)
-    >>> found.matrix[0, 1:].reshape(3, 3).round(6) + 0.0
-    array([[1., 0., 0.],
-           [0., 1., 0.],
-           [0., 0., 1.]])
     """
     count = (len(Q) - 1) // 9
     cone = _cone(count, count if shared is None else shared)
@@ -374,16 +360,6 @@ def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = No
         Further rotations to start from.
     shared
         As `relax` has it.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from rpim_opt.problem.registration.relaxation import smallest
-    >>> wanted = np.diag([1.0, -1.0, -1.0])
-    >>> L = np.hstack([-wanted.reshape(9, 1), np.eye(9)])  # |L x|^2 = |R - wanted|^2
-    >>> found = smallest(L)
-    >>> bool(np.abs(found.rotations[0] - wanted).max() < 1e-9), bool(abs(found.bound) < 1e-9)
-    (True, True)
     """
     Q = L.T @ L
     moments = relax(Q, shared)
