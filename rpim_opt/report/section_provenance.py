@@ -15,7 +15,7 @@ from rpim_opt.report.markup import Element, tag
 from rpim_opt.report.pieces import sets
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
-from rpim_opt.store.stated_record import FIELDS
+from rpim_opt.store.statements import FIELDS
 
 
 def provenance_section(result: Calibration) -> list[Element]:

@@ -18,7 +18,7 @@ from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import known_distance, known_parallel, known_square
 from rpim_opt.store.result_file import figures, sets
-from rpim_opt.store.stated_record import FIELDS
+from rpim_opt.store.statements import FIELDS
 
 if TYPE_CHECKING:
     from rpim_opt.calibration.acceptance import Acceptance

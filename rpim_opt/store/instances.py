@@ -33,7 +33,6 @@ from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.observations import Tables, read_tables
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (
@@ -44,7 +43,7 @@ from rpim_opt.store.problem_file import (
     read_problem,
     stated_scatter,
 )
-from rpim_opt.store.stated_record import stated_details, stated_requirement
+from rpim_opt.store.statements import place_fixtures, stated_details, stated_requirement
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
 from rpim_opt.basics.inputs import inside
-from rpim_opt.basics.units import split_unit
+from rpim_opt.basics.units import accepted_units, split_unit
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.named import LEARNED
 from rpim_opt.convex.select import SELECTORS, Selector
@@ -29,7 +29,7 @@ from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
 from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.prior_file import PriorTable
-from rpim_opt.store.stated_table import Constraints
+from rpim_opt.store.statements import Constraints
 
 Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
@@ -106,6 +106,32 @@ class GridTable(Table):
     spacing: Length
 
 
+class DistanceTable(Table):
+    """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One that validates identifies nothing."""
+
+    between: list[Name]
+    validation: bool = False
+    distance: Length
+    sigma: Annotated[float | None, "length"] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _distance(cls, table: Any) -> Any:
+        units = accepted_units("length")
+        if not isinstance(table, dict):
+            return table
+        return {f"distance_{key}" if key in units else key: value for key, value in table.items()}
+
+
+class AngleTable(Table):
+    """A known angle, 0 or 90 degrees."""
+
+    between: list[Name]
+    validation: bool = False
+    deg: float
+    sigma: Annotated[float | None, "angle"] = None
+
+
 class Observation(Table):
     """Tables of one kind of measurement: ``[[observation]]``."""
 
@@ -144,8 +170,8 @@ class ProblemTable(Table):
     tolerance: dict[Name, Any] = Field(default_factory=dict)
     prior: PriorTable = PriorTable()
     constraints: Constraints = Constraints()
-    known_distance: list[dict[str, Any]] = Field(default_factory=list)
-    known_angle: list[dict[str, Any]] = Field(default_factory=list)
+    known_distance: list[DistanceTable] = Field(default_factory=list)
+    known_angle: list[AngleTable] = Field(default_factory=list)
     base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
     tool: dict[str, Any] = Field(default_factory=dict)
     published: dict[str, dict[str, float]] = Field(default_factory=dict)
@@ -227,12 +253,11 @@ def _board(table: ProblemTable, path: Path) -> Board | None:
         return None
     if isinstance(table.target, str):
         return read_board(inside(path.parent, table.target, "key target", path))
+    pattern = _part(GridTable, table.target, "key target", path)
     try:
-        pattern = validate(GridTable, table.target, path)
-        return grid_board(pattern.columns, pattern.rows, float(pattern.spacing))
+        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
     except InputError as error:
-        where = error.where.replace("key ", "key target.").replace("board", "key target").replace(".the top level", "")
-        raise InputError(where, error.found, error.accepted, path) from None
+        raise InputError("key target", error.found, error.accepted, path) from None
 
 
 def _tables(
@@ -322,19 +347,29 @@ def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
             accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"
             raise InputError("key scatter", f"'{table.scatter}'", accepted, path)
         return None
-    found = validate(ScatterTable, table.scatter, path)
-    for name, value in found.model_dump().items():
+    found = _part(ScatterTable, table.scatter, "key scatter", path)
+    for name, value in found:
         if value < 0:
             raise InputError(f"key scatter.{name}", f"{value}", "a standard deviation, zero or more", path)
-    return Scatter(float(found.position), float(found.orientation), float(found.joint))
+    return Scatter(found.position, found.orientation, found.joint)
 
 
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
     if not isinstance(table, dict):
         raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
-    try:
-        place = validate(FrameTable, table, path)
-    except InputError as error:
-        where = f"key {where}" + error.where.removeprefix("key").replace(" the top level", "").replace(" ", ".", 1)
-        raise InputError(where, error.found, error.accepted, path) from None
+    place = _part(FrameTable, table, f"key {where}", path)
     return tuple(getattr(place, c) for c in FRAME)
+
+
+Part = TypeVar("Part", bound=Table)
+
+
+def _part(kind: type[Part], content: dict[str, Any], where: str, path: Path) -> Part:
+    """Return a table of the file as a model; errors say where it stands."""
+    try:
+        return validate(kind, content, path)
+    except InputError as error:
+        key = error.where.removeprefix("key ")
+        if key != "the top level":
+            where = f"{where}.{key}"
+        raise InputError(where, error.found, error.accepted, path) from None

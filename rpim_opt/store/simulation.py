@@ -27,8 +27,8 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import Target, postures_at, postures_in_sight
 from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.store.fixtures import place_fixtures
 from rpim_opt.store.problem_file import Observation, Stated, read_problem
+from rpim_opt.store.statements import place_fixtures
 
 Columns = dict[str, list[str]]
 MOST = 1_000_000
