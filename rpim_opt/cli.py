@@ -332,7 +332,7 @@ def iso9283(
     as_json: Json = False,
 ) -> None:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
-    from rpim_opt.use.approaches import read_approaches
+    from rpim_opt.use.iso9283 import read_approaches
 
     console.require_positive("--limit", limit)
     console.require_positive("--repeatability", repeatability)
@@ -425,11 +425,16 @@ def export(
     with _loaded(result) as (loaded, _):
         from rpim_opt.robot.plain import write_robodk, write_robot
         from rpim_opt.robot.ur_kinematics import write_ur_kinematics
-        from rpim_opt.use.export import export_ur_calibration, export_urdf, found_by, write_all
-        from rpim_opt.use.geometry import geometry_alone
+        from rpim_opt.use.export import (
+            export_ur_calibration,
+            export_urdf,
+            geometry_alone,
+            with_first_reflector,
+            write_all,
+        )
 
         loaded, without = geometry_alone(loaded)
-        robot = found_by(loaded, marker)[0].robot
+        robot = with_first_reflector(loaded, marker).robot
         options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
         corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
             (urdf, lambda target: export_urdf(loaded, urdf or "", target, **options)),

@@ -1,12 +1,12 @@
-from .approaches import read_approaches as read_approaches
-from .compensated import Compensation as Compensation
+from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
 from .compensation import compensate_file as compensate_file
 from .export import export_urdf as export_urdf
-from .geometry import geometry_alone as geometry_alone
-from .identified import identified as identified
+from .export import geometry_alone as geometry_alone
+from .export import identified as identified
 from .iso9283 import Performance as Performance
 from .iso9283 import iso9283 as iso9283
+from .iso9283 import read_approaches as read_approaches
 from .monitored import Monitoring as Monitoring
 from .monitoring import monitor as monitor
 from .monitoring import read_checks as read_checks

@@ -1,4 +1,4 @@
-"""The controller's robot beside the identified one: where commands go, and what brings them where they should."""
+"""The controller's robot beside the identified one, and corrections of its commands with their uncertainty."""
 
 from __future__ import annotations
 
@@ -24,20 +24,63 @@ from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.use.arm import Arm
-from rpim_opt.use.inverse import attainable, nearest, pinned, ranges, times
+from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
 
 REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
-
-
 BANK = 2000
 TRIALS = 12
 """Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
 
 
-class Spread(NamedTuple):
-    """What the calibration knows of positions: deviations of the parameters and their covariance, or None.
+class Posterior(NamedTuple):
+    """All parameters of a robot, their deviations (p,) [SI], and the covariance (n, n) of the identified, or None."""
+
+    parameters: Parameters
+    x: Array
+    covariance: Array | None
+
+    @classmethod
+    def of(cls, result: Calibration, robot: str = "") -> Posterior:
+        """Return what a calibration identified of a robot; the other parameters do not deviate."""
+        parameters = result.problem.parameters
+        x = np.zeros(len(parameters))
+        x[parameters.identified] = result.x
+        covariance = known_covariance(result)
+        if not robot:
+            return cls(parameters, x, covariance)
+        places = parameters.places_of(robot)
+        if covariance is not None:
+            index = np.cumsum(parameters.identified) - 1
+            own = index[places[parameters.identified[places]]]
+            covariance = covariance[np.ix_(own, own)]
+        return cls(parameters.of_robot(robot), x[places], covariance)
+
+    def with_tool(self, prefix: str, tool: Sequence[float] | Array) -> Posterior:
+        """Return the same with a tool that is known exactly, (6,) x, y, z [m], roll, pitch, yaw [rad]."""
+        frame = np.asarray(tool, dtype=float)
+        if frame.shape != (6,) or not np.isfinite(frame).all():
+            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        at = [self.parameters.names.index(prefix + c) for c in FRAME]
+        nominal = self.parameters.nominal.copy()
+        nominal[at] = frame
+        identified = self.parameters.identified.copy()
+        identified[at] = False
+        x = self.x.copy()
+        x[at] = 0.0
+        covariance = self.covariance
+        if covariance is not None:
+            still = identified[self.parameters.identified]
+            covariance = covariance[np.ix_(still, still)]
+        return Posterior(replace(self.parameters, nominal=nominal, identified=identified), x, covariance)
+
+    def named(self, values: Array) -> dict[str, float]:
+        """Return values (p,) by the parameters' names."""
+        return dict(zip(self.parameters.names, values.tolist(), strict=True))
+
+
+class Uncertainty(NamedTuple):
+    """Standard uncertainty of positions, from the posterior covariance C (or None) and the robot's repeatability.
 
     ``noise`` is the covariance (3, 3) [m^2] of a reading, and ``level`` the noise's variance over it.
     """
@@ -50,10 +93,7 @@ class Spread(NamedTuple):
     level: float
 
     def at(self, q: Array, torque: Array | None, payload: Array | None) -> Array:
-        """Return the standard uncertainty of the position that is reached at commands, (N,) [m].
-
-        sqrt(tr (J C J' + R)), R the robot's own scatter.
-        """
+        """Return sqrt(tr (J C J' + R)) (N,) [m] of the positions reached at commands; R is the repeatability's."""
         if self.covariance is None:
             return np.full(len(q), np.inf)
         data = Dataset.of(q, np.zeros((len(q), 3)), self.noise, measurement=position)
@@ -65,78 +105,18 @@ class Spread(NamedTuple):
         C = np.where(np.outer(known, known), self.covariance, 0.0)
         variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
         variance += np.trace(scattered(problem, self.level).robot[0], axis1=1, axis2=2)
-        unseen = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
-        return np.where(unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))
-
-
-class Known(NamedTuple):
-    """All parameters, their deviations (p,) [SI], and the covariance (n, n) of the identified ones, or None."""
-
-    parameters: Parameters
-    x: Array
-    covariance: Array | None
-
-    @classmethod
-    def of(cls, result: Calibration, robot: str = "") -> Known:
-        """Return what a calibration identified of a robot; the other parameters do not deviate."""
-        parameters = result.problem.parameters
-        x = np.zeros(len(parameters))
-        x[parameters.identified] = result.x
-        covariance = known_covariance(result)
-        if not robot:
-            return cls(parameters, x, covariance)
-        places = parameters.places_of(robot)
-        if covariance is not None:
-            unknown = np.cumsum(parameters.identified) - 1
-            mine = unknown[places[parameters.identified[places]]]
-            covariance = covariance[np.ix_(mine, mine)]
-        return cls(parameters.of_robot(robot), x[places], covariance)
-
-    def holding(self, prefix: str, tool: Sequence[float] | Array) -> Known:
-        """Return the same with a tool that is known exactly, (6,) x, y, z [m], roll, pitch, yaw [rad]."""
-        own = np.asarray(tool, dtype=float)
-        if own.shape != (6,) or not np.isfinite(own).all():
-            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
-        at = [self.parameters.names.index(prefix + c) for c in FRAME]
-        nominal = self.parameters.nominal.copy()
-        nominal[at] = own
-        identified = self.parameters.identified.copy()
-        identified[at] = False
-        x = self.x.copy()
-        x[at] = 0.0
-        covariance = self.covariance
-        if covariance is not None:
-            still = identified[self.parameters.identified]
-            covariance = covariance[np.ix_(still, still)]
-        return Known(replace(self.parameters, nominal=nominal, identified=identified), x, covariance)
-
-    def named(self, values: Array) -> dict[str, float]:
-        """Return values (p,) by the parameters' names."""
-        return dict(zip(self.parameters.names, values.tolist(), strict=True))
-
-
-def _reflector(parameters: Parameters, tool: Sequence[float] | Array | None, marker: str) -> str:
-    """Return the reflector that is meant; a tool of one's own takes the first one's place."""
-    known = reflectors(parameters.names)
-    if tool is not None:
-        return known[0]
-    if marker not in known:
-        raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
-    return marker
-
-
-def _base(values: Mapping[str, float]) -> Array:
-    return numeric_frame([values[f"base_{c}"] for c in FRAME])
+        unknown = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
+        return np.where(unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
 class Cell(NamedTuple):
-    """The controller's robot, the identified one, and what the calibration knows of it."""
+    """The controller's robot, the identified one, and the uncertainty of where that is."""
 
     robot: Robot
     kind: Measurement
     nominal: Arm
-    real: Arm
-    spread: Spread
+    identified: Arm
+    uncertainty: Uncertainty
     loads: Loads
 
     @classmethod
@@ -153,33 +133,38 @@ class Cell(NamedTuple):
     ) -> Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
         robot = replace(result.problem.arms[which], gravity=gravity)
-        known = Known.of(result, which)
+        posterior = Posterior.of(result, which)
         measured = result.problem
         if which:
             measured = measured.sample().alone(which)
-        reflector = _reflector(known.parameters, tool, marker)
-        prefix = tool_prefix(reflector)
-        if tool is not None:
-            known = known.holding(prefix, tool)
-        stated = known.named(known.parameters.nominal)
-        found = known.named(known.parameters.values(known.x))
+        reflector = marker
+        known = reflectors(posterior.parameters.names)
+        if tool is not None:  # which takes the place of the first reflector
+            reflector = known[0]
+            posterior = posterior.with_tool(tool_prefix(reflector), tool)
+        elif marker not in known:
+            raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+        nominal = posterior.named(posterior.parameters.nominal)
+        identified = posterior.named(posterior.parameters.values(posterior.x))
         moved = np.eye(4)
         if base:
-            moved = np.linalg.inv(_base(stated)) @ _base(found)
-        free = known.x[known.parameters.identified]
+            moved = np.linalg.inv(_base(nominal)) @ _base(identified)
         scatter = measured.scatter
         if tool is not None and scatter is not None:
-            scatter = replace(scatter, at=known.parameters.values(known.x))
-        problem = CalibrationProblem(robot, known.parameters, measured.data, scatter=scatter)
+            scatter = replace(scatter, at=posterior.parameters.values(posterior.x))
+        problem = CalibrationProblem(robot, posterior.parameters, measured.data, scatter=scatter)
         require_same_torques(robot, problem.parameters, problem.data, torques)
         loads = loads_on(robot, problem.parameters, problem.data, torques)
+        free = posterior.x[posterior.parameters.identified]
+        noise = position_noise(measured)
+        prefix = tool_prefix(reflector)
         return cls(
             robot,
             kind,
-            nominal=Arm.of(robot, stated, stated, prefix, np.eye(4), kind, loads),
-            real=Arm.of(robot, found, stated, prefix, moved, kind, loads),
-            spread=Spread(problem, free, known.covariance, reflector, position_noise(measured), result.noise_level),
-            loads=loads,
+            Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
+            Arm.of(robot, identified, nominal, prefix, moved, kind, loads),
+            Uncertainty(problem, free, posterior.covariance, reflector, noise, result.noise_level),
+            loads,
         )
 
     def compensated(
@@ -188,28 +173,35 @@ class Cell(NamedTuple):
         """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
         N = len(np.asarray(q if poses is None else poses))
         load = self._load(N, torque, payload)
-        nominal, target, missed = self._believed(q, poses, load)
-        _, before, J = self.real.at(nominal, load, target)
+        if poses is not None:
+            commands, target = self._commands(poses, q, load), poses
+            missed = self.nominal.at(commands, load, poses)[1]
+        else:
+            commands = np.asarray(q)
+            target, error, _ = self.nominal.at(commands, load, np.zeros((N, len(self.kind.columns))))
+            missed = np.zeros_like(error)
+        _, before, J = self.identified.at(commands, load, target)
         W = attainable(J)
-        unit = ranges(self.robot, J.shape[1])
+        unit = joint_units(self.robot, J.shape[1])
         reached = self._reached(missed, W)
         due = np.where(reached[:, None], before - missed, 0.0)
-        P = pinned(W @ J * unit, times(W, due), largest)
-        low, high = self._around(nominal, largest)
-        found, left, held = nearest(self.real, load, target, nominal, low, high, unit, W, P)
+        P = correction_weights(W @ J * unit, times(W, due), largest)
         lowest, highest = self.robot.limits.T
-        at_limit = (held & ((found <= lowest) | (found >= highest))).any(axis=1)
+        inside = np.clip(commands, lowest, highest)
+        low, high = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
+        corrected, left, active = nearest(self.identified, load, target, commands, low, high, unit, W, P)
+        at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
-        place_before, turn_before = self._norms(before)
-        place, turn = self._norms(left)
+        position_before, orientation_before = self._norms(before)
+        position_error, orientation_error = self._norms(left)
         return {
-            "nominal": nominal,
-            "q": found,
-            "position_before": place_before,
-            "orientation_before": turn_before,
-            "position_error": place,
-            "orientation_error": turn,
-            "std": self.spread.at(found, torque, payload),
+            "nominal": commands,
+            "q": corrected,
+            "position_before": position_before,
+            "orientation_before": orientation_before,
+            "position_error": position_error,
+            "orientation_error": orientation_error,
+            "std": self.uncertainty.at(corrected, torque, payload),
             "status": np.select(list(cases.values()), list(cases), "near singular"),
         }
 
@@ -219,40 +211,25 @@ class Cell(NamedTuple):
         if torque is not None:
             parts.append(torque @ np.linalg.inv(self.robot.joint_map))
         if self.loads.payload:
-            carried = self.robot.gravity.payload if payload is None else payload
-            parts.append(np.broadcast_to(carried, N)[:, None])
+            mass = self.robot.gravity.payload if payload is None else payload
+            parts.append(np.broadcast_to(mass, N)[:, None])
         return np.hstack(parts)
-
-    def _believed(self, q: Array | None, poses: Array | None, load: Array) -> tuple[Array, Array, Array]:
-        """Return the controller's commands (N, dof), the targets (N, c), and by how much it misses them (N, k)."""
-        if poses is not None:
-            commands = self._commands(poses, q, load)
-            return commands, poses, self.nominal.at(commands, load, poses)[1]
-        commands = np.asarray(q)
-        believed, error, _ = self.nominal.at(commands, load, np.zeros((len(commands), len(self.kind.columns))))
-        return commands, believed, np.zeros_like(error)
-
-    def _around(self, commands: Array, largest: float) -> tuple[Array, Array]:
-        """Return the bounds (N, dof) of corrected commands."""
-        lowest, highest = self.robot.limits.T
-        inside = np.clip(commands, lowest, highest)
-        return np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
         starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]
-        found, left, _ = self._nearest(poses, load, starts[:, 0])
+        best, left, _ = self._nearest(poses, load, starts[:, 0])
         for k in range(1, starts.shape[1]):
             again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
             if not len(again):
                 break
             other, error, _ = self._nearest(poses[again], load[again], starts[again, k])
             better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
-            found[again[better]] = other[better]
+            best[again[better]] = other[better]
             left[again[better]] = error[better]
         if poses.shape[1] == 3 or self.robot.dof >= 6:
-            return found
-        return self._nearest(poses, load, found, attainable(self.nominal.at(found, load, poses)[2]))[0]
+            return best
+        return self._nearest(poses, load, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
 
     def _nearest(
         self, poses: Array, load: Array, start: Array, W: Array | None = None
@@ -266,24 +243,24 @@ class Cell(NamedTuple):
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
-        seen = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
-        distance = spatial.distance.cdist(poses[:, :3], seen[:, :3], "sqeuclidean")
+        reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
+        distance = spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
         if poses.shape[1] == 7:
-            distance += 8 * (1 - np.abs(poses[:, 3:] @ seen[:, 3:].T))  # the angle's square, nearly
+            distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
         closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
         order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
         return bank[np.take_along_axis(closest, order, axis=1)]
 
-    @property
-    def _lengths(self) -> np.ndarray:
-        return np.array([dimension == "length" for dimension in self.kind.components.values()])
-
     def _norms(self, error: Array) -> tuple[Array, Array]:
         """Return the norms of position and orientation errors; NaN where there is no orientation."""
-        turn = error[:, ~self._lengths]
-        angle = np.linalg.norm(turn, axis=1) if turn.shape[1] else np.full(len(error), np.nan)
-        return np.linalg.norm(error[:, self._lengths], axis=1), angle
+        lengths = np.array([dimension == "length" for dimension in self.kind.components.values()])
+        angle = np.full(len(error), np.nan) if lengths.all() else np.linalg.norm(error[:, ~lengths], axis=1)
+        return np.linalg.norm(error[:, lengths], axis=1), angle
 
     def _reached(self, error: Array, W: Array) -> np.ndarray:
-        place, turn = self._norms(times(W, error))
-        return (place <= REACHED) & ~(turn > REACHED)
+        distance, angle = self._norms(times(W, error))
+        return (distance <= REACHED) & ~(angle > REACHED)
+
+
+def _base(values: Mapping[str, float]) -> Array:
+    return numeric_frame([values[f"base_{c}"] for c in FRAME])

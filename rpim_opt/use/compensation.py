@@ -1,10 +1,11 @@
-"""Joint commands that bring the calibrated robot where its controller believes it to be."""
+"""Joint commands that bring the calibrated robot where its controller assumes it, and the errors that remain."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,145 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.basics.writing import write_text
+from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.models import pose, position
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.use.cell import Cell
-from rpim_opt.use.compensated import Compensation
 from rpim_opt.use.targets import Targets, checked, read_targets
 
 SMALLEST = 1e-12
 """Correction [rad or m] below which nothing is corrected."""
 BLOCK = 8192
 """Rows that are worked on together, so that what they need stays in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compensation:
+    """Corrected joint commands, and what the calibrated model says of them.
+
+    Parameters
+    ----------
+    robot
+        The nominal robot.
+    label
+        N row labels.
+    nominal, q
+        (N, dof) commands of the nominal controller, and the corrected ones [rad or m].
+    position_before, orientation_before
+        (N,) how far the nominal command misses the target [m], [rad]; NaN for an orientation that does not count.
+    position_error, orientation_error
+        (N,) the same for the corrected command.
+    std
+        (N,) root mean square distance by which the model may be wrong there [m], from the calibration's covariance
+        C: sqrt(tr J C J'), with the Jacobian J of the position in the instrument's frame, base included. Infinite
+        where the calibration has no covariance.
+    status
+        For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
+        prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
+        ``"near singular"`` (the correction would be too large, and was damped).
+    outside
+        Corrected commands beyond the joint ranges that the calibration measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
+    >>> found = ro.use.compensate(result, np.radians([[10, -80, 60, 20, 30, 0]]), label=["P1"])
+    >>> np.degrees(found.q - found.nominal).round(2), found.status
+    (array([[ 0.08,  0.86, -2.02,  1.21, -0.09, -0.04]]), ('ok',))
+    >>> sorted(found.content())
+    ['corrected', 'largest_corrections', 'nominal', 'outside', 'rows']
+    >>> print(found.csv().splitlines()[0])
+    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
+    """
+
+    robot: Robot
+    label: tuple[str, ...]
+    nominal: Array
+    q: Array
+    position_before: Array
+    orientation_before: Array
+    position_error: Array
+    orientation_error: Array
+    std: Array
+    status: tuple[str, ...]
+    outside: Outside = field(default_factory=Outside)
+
+    def __str__(self) -> str:
+        """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
+        rows = [
+            ("position [mm], nominal command", self.position_before),
+            ("position [mm], corrected command", self.position_error),
+            ("position [mm], standard uncertainty", self.std),
+            ("orientation [mrad], nominal command", self.orientation_before),
+            ("orientation [mrad], corrected command", self.orientation_error),
+        ]
+        figures = [
+            [name, *(f"{1e3 * f:.4f}" for f in (v.mean(), np.sqrt(np.mean(v**2)), v.max()))]
+            for name, v in rows
+            if np.isfinite(v).all()
+        ]
+        units = [display(dimension)[0] for dimension in self.robot.joint_dimensions]
+        changes = zip(self._largest_corrections().values(), units, strict=True)
+        largest = [f"q{i} {value:.3f} {unit}" for i, (value, unit) in enumerate(changes, start=1)]
+        lines = [
+            table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
+            f"Largest corrections: {', '.join(largest)}.",
+        ]
+        for status in ("limited", "near singular", "unreachable"):
+            at = [i for i, each in enumerate(self.status) if each == status]
+            if at:
+                named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in at])
+                lines.append(f"{status.capitalize()}: {named}.")
+        return "\n".join([*lines, *self.outside.sentences()])
+
+    def _largest_corrections(self) -> dict[str, float]:
+        """Return the largest correction of every joint, in the unit of its column."""
+        joints = joint_columns(self.robot.joint_dimensions)
+        change = np.abs(self.q - self.nominal).max(axis=0) / list(joints.values())
+        return dict(zip(joints, change.tolist(), strict=True))
+
+    def _columns(self) -> dict[str, Array]:
+        """Return the corrected commands, and what is left of the errors, by column."""
+        joints = joint_columns(self.robot.joint_dimensions)
+        columns = {name: self.q[:, i] / si for i, (name, si) in enumerate(joints.items())}
+        columns["position_error_mm"] = 1e3 * self.position_error
+        columns["orientation_error_mrad"] = 1e3 * self.orientation_error
+        columns["std_mm"] = 1e3 * self.std
+        return columns
+
+    def content(self) -> dict[str, Any]:
+        """Return the errors [mm, mrad], and a row for every target as in `csv`."""
+        columns = self._columns()
+        rows = zip(self.label, *(values.tolist() for values in columns.values()), self.status, strict=True)
+        return {
+            "nominal": _errors(self.position_before, self.orientation_before),
+            "corrected": _errors(self.position_error, self.orientation_error),
+            "largest_corrections": self._largest_corrections(),
+            "outside": [self.label[i] for i in self.outside.rows],
+            "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
+        }
+
+    def csv(self) -> str:
+        """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
+        cells = []
+        for name, values in self._columns().items():
+            digits = 6 if name.endswith(("_mm", "_mrad")) and not name.startswith("q") else 9
+            cells.append([f"{v:.{digits}f}" if np.isfinite(v) else "" for v in values])
+        return csv_text(["label", *self._columns(), "status"], zip(self.label, *cells, self.status, strict=True))
+
+
+def _errors(position: Array, orientation: Array) -> dict[str, Any]:
+    return {"position": statistics(position), "orientation": statistics(orientation, "mrad")}
 
 
 @one_blas_thread
@@ -122,20 +249,20 @@ def compensate(
     targets = checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:
         raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
-    turned = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
-    kind = pose if turned else position
+    oriented = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
+    kind = pose if oriented else position
     gravity = arm.gravity
     if payload_centre is not None:
         gravity = gravity.carrying(gravity.payload, list(payload_centre))
     cell = Cell.of(result, kind, tool, marker, base, torque is not None, gravity, robot)
-    carried = _carried(cell, payload, payload_centre, len(targets.label))
+    masses = _masses(cell, payload, payload_centre, len(targets.label))
 
     def part(start: int) -> dict[str, Array]:
         def rows(values: Array | None) -> Array | None:
             return None if values is None else values[start : start + BLOCK]
 
-        bears = (rows(targets.torque), rows(carried))
-        return cell.compensated(rows(targets.q), rows(targets.poses), *bears, largest)
+        loads = (rows(targets.torque), rows(masses))
+        return cell.compensated(rows(targets.q), rows(targets.poses), *loads, largest)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(part, range(0, len(targets.label), BLOCK)))
@@ -145,7 +272,7 @@ def compensate(
     return Compensation(arm, targets.label, **whole, outside=result.outside(commands))
 
 
-def _carried(cell: Cell, payload: float | Array | None, centre: object, N: int) -> Array | None:
+def _masses(cell: Cell, payload: float | Array | None, centre: object, N: int) -> Array | None:
     """Return the payload of every row (N,) [kg], if there is one; refuse one that has no effect."""
     if payload is None and centre is None:
         return None
@@ -186,7 +313,7 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     (18, {'ok'})
     """
     read = read_targets(targets, result.problem.robot)
-    stated = {"torque": read.torque, "payload": read.payload, "label": read.label}
-    found = compensate(result, read.q, read.poses, **(stated | options))
-    write_text(Path(out), found.csv())
-    return found
+    columns = {"torque": read.torque, "payload": read.payload, "label": read.label}
+    compensation = compensate(result, read.q, read.poses, **(columns | options))
+    write_text(Path(out), compensation.csv())
+    return compensation

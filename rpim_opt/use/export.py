@@ -1,4 +1,4 @@
-"""What a calibration identified, in other tools' files: all that were asked for or none, and what stays behind."""
+"""The identified robot, and files of other tools that hold it: all of them are written, or none."""
 
 from __future__ import annotations
 
@@ -11,13 +11,85 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import joined, listed
 from rpim_opt.basics.writing import refused, write_files
+from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
-from rpim_opt.robot.parameter_names import reflectors
+from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
 from rpim_opt.robot.ur_calibration import write_ur_calibration
 from rpim_opt.robot.urdf import read_urdf, write_urdf
-from rpim_opt.use.identified import identified
+
+
+def identified(result: Calibration, marker: str = "") -> Described:
+    """Return what a calibration identified: the robot, its base in the instrument's frame, and a reflector as tool.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    marker
+        Which reflector; the only one by default.
+
+    Raises
+    ------
+    InputError
+        Naming the identified parameters that no description of a robot holds: ratios, harmonics, backlash, what
+        gravity does (compliances, bends), terms of a user's own; for a marker that is not known.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.use.identified(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml))
+    >>> arm.base.round(2), (1e3 * arm.tool[:3]).round(1)  # [m, rad], [mm]
+    (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
+    """
+    p = result.problem.parameters
+    values = p.nominal.copy()
+    values[p.identified] = p.free.values(result.x)
+    of = dict(zip(p.names, values, strict=True))
+    extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
+    if extras:
+        accepted = "MDH parameters, base and tool: files hold nothing else; `compensate` corrects commands for them"
+        raise InputError("the calibration", listed(extras, 6), accepted)
+    prefix = tool_prefix(marker)
+    if prefix + "x" not in of:
+        raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
+    base = np.array([of["base_" + c] for c in FRAME])
+    tool = np.array([of[prefix + c] for c in FRAME])
+    return Described(result.robot, base, tool)
+
+
+def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
+    """Return the calibration without the model extensions that the evidence added, and what that costs in a sentence.
+
+    Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
+    measurements are calibrated once more.
+
+    Parameters
+    ----------
+    result
+        The calibration; returned as it is where nothing was added.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, model="auto")  # nothing was added
+    >>> ro.use.geometry_alone(result) == (result, [])
+    True
+    """
+    if result.learned is None or not result.learned.added:
+        return result, []
+    alone = replace(calibrate(result.stated, result.formulation), record=result.record)
+    data = result.record.validation
+    where = "validation" if data is not None else "identification"
+    whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
+    said = (
+        f"Files hold no {joined(result.learned.families)}: written is the geometry that the same measurements give "
+        f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
+    )
+    return alone, [said]
 
 
 def export_urdf(
@@ -67,27 +139,24 @@ def export_urdf(
     >>> (ro.read_urdf("identified.urdf").robot.mdh - arm.robot.mdh)[0, 3].round(6)  # [m]
     np.float64(0.001)
     """
-    found, several = found_by(result, marker)
-    drawn = read_urdf(source, root, tip)
-    if several and marker is None and tool is None:
+    arm = with_first_reflector(result, marker)
+    own = read_urdf(source, root, tip)
+    if marker is None and tool is None and len(reflectors(result.problem.parameters.names)) > 1:
         tool = False
-    base_place, said_of_base = _frame(result, "base", "root", base, found.base, drawn.base)
-    tool_place, said_of_tool = _frame(result, "tool", "tip", tool, found.tool, drawn.tool)
-    write_urdf(source, found.robot, target, root, tip, base_place, tool_place)
-    return [*said_of_base, *said_of_tool]
+    base_place, base_notes = _frame(result, "base", "root", base, arm.base, own.base)
+    tool_place, tool_notes = _frame(result, "tool", "tip", tool, arm.tool, own.tool)
+    write_urdf(source, arm.robot, target, root, tip, base_place, tool_place)
+    return [*base_notes, *tool_notes]
 
 
 def _frame(
-    result: Calibration, name: str, what: str, asked: bool | None, place: Array, own: Array
+    result: Calibration, name: str, what: str, stated: bool | None, place: Array, own: Array
 ) -> tuple[Array | None, list[str]]:
     """Return a frame (6,) if it is written, and a sentence on it if it was identified."""
-    identified = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
-    written = asked
-    if asked is None:
-        written = identified and same_place(place, own)
-    if written:
+    free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
+    if (free and same_place(place, own)) if stated is None else stated:
         return place, [f"URDF: its {what} is at the identified {name}, {placed(place)}."]
-    if identified:
+    if free:
         where = f"the identified {name} is not there, but at {placed(place)}"
         return None, [f"URDF: its {what} stays where it was; {where}."]
     return None, []
@@ -95,52 +164,47 @@ def _frame(
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
     """Write a ``calibration.conf``; what alpha1 and a1 say is where the controller's Base is, and is left out."""
-    found = found_by(result)[0].robot
+    robot = with_first_reflector(result).robot
     nominal = result.problem.robot
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
-    mdh = found.mdh.copy()
+    mdh = robot.mdh.copy()
     mdh[0, :2] = 0.0
-    write_ur_calibration(source, replace(found, mdh=mdh), nominal, target)
-    moved = np.array_equal(mdh, found.mdh)
-    return [] if moved else ["alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1."]
+    write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
+    if np.array_equal(mdh, robot.mdh):
+        return []
+    return ["alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1."]
 
 
-def found_by(result: Calibration, marker: str | None = None) -> tuple[Described, bool]:
-    """Return what was identified with a reflector, by default the first; and whether there are several."""
-    markers = reflectors(result.problem.parameters.names)
-    return identified(result, markers[0] if marker is None else marker), len(markers) > 1
+def with_first_reflector(result: Calibration, marker: str | None = None) -> Described:
+    """Return what was identified with a reflector, by default the first."""
+    return identified(result, reflectors(result.problem.parameters.names)[0] if marker is None else marker)
 
 
 def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]]) -> list[str]:
-    """Write several files, or none of them if one cannot be written; return what their writers say.
+    """Write several files, or none of them if one cannot be written; return the notes of their writers.
 
     Parameters
     ----------
     writers
         Targets, each with a function that writes to the path it is given.
     """
-    _require_different([target for target, _ in writers])
+    targets = [target for target, _ in writers]
+    for target in targets:
+        if target.is_dir() or targets.count(target) > 1:
+            found = "a folder" if target.is_dir() else "two files for it"
+            raise InputError("the file", found, "a name of its own for every file", target)
     notes: list[str] = []
     with TemporaryDirectory() as folder:
-        scratch = Path(folder)
-        made: dict[Path, Path] = {}
+        written: dict[Path, Path] = {}
         for number, (target, write) in enumerate(writers):
-            made[target] = path = scratch / str(number) / target.name
+            written[target] = path = Path(folder) / str(number) / target.name
             path.parent.mkdir()
             try:
                 notes += write(path) or ()
             except InputError as error:
                 file = target if error.file == path else error.file
                 raise InputError(error.where, error.found, error.accepted, file) from None
-        with refused(", ".join(str(target) for target in made)):
-            write_files({target: path.read_bytes() for target, path in made.items()})
+        with refused(", ".join(str(target) for target in written)):
+            write_files({target: path.read_bytes() for target, path in written.items()})
     return notes
-
-
-def _require_different(targets: Sequence[Path]) -> None:
-    for target in targets:
-        if target.is_dir():
-            raise InputError("the file", "a folder", "a name of its own for every file", target)
-        if targets.count(target) > 1:
-            raise InputError("the file", "two files for it", "a name of its own for every file", target)

@@ -1,9 +1,10 @@
-"""Pose accuracy and pose repeatability as ISO 9283:1998 defines them (7.2.1 and 7.2.2)."""
+"""Pose accuracy and pose repeatability as ISO 9283:1998 defines them (7.2.1 and 7.2.2), of arrays and of tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,21 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Tabled, counted
-from rpim_opt.basics.tables import csv_text
-from rpim_opt.basics.text import table
+from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
+from rpim_opt.basics.text import listed, table
+from rpim_opt.basics.units import UNITS
+from rpim_opt.data.tables.layout import read_raw
+from rpim_opt.data.tables.names import recognize
+from rpim_opt.data.tables.units import FOREIGN, dimension_of, parse_units, split
 
 CYCLES, POSES = 30, 5
 """How often the standard has how many poses approached."""
 ANGLES = ("a", "b", "c")
 """The standard's names of the rotations."""
+AXES = ("x", "y", "z")
+ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
+"""What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
+ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
 
 
 @dataclass(frozen=True)
@@ -105,12 +114,9 @@ class Performance(Tabled):
 
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, mrad]."""
-        accuracy = None
-        if self.accuracy is not None:
-            accuracy = 1e3 * self.accuracy
         return {
             "standard": "ISO 9283:1998, 7.2.1 and 7.2.2",
-            "accuracy_mm": accuracy,
+            "accuracy_mm": None if self.accuracy is None else 1e3 * self.accuracy,
             "repeatability_mm": 1e3 * self.repeatability,
             "poses": self._frame_rows(),
             "notes": self.notes(),
@@ -123,11 +129,10 @@ class Performance(Tabled):
 
     def __str__(self) -> str:
         """Return the figures as a table."""
-        rows = self._frame_rows()
-        lines = [_text(rows, "_mm"), "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP)."]
-        if any(each.RP_angles is not None for each in self.poses):
-            lines.insert(1, _text(rows, "_mrad"))
-        return "\n".join([*lines, *self.notes()])
+        tables = [self._table("_mm")]
+        if self._turned:
+            tables.append(self._table("_mrad"))
+        return "\n".join([*tables, "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP).", *self.notes()])
 
     def _short(self) -> str:
         return f"at {counted(len(self.poses), 'pose')}, RP {1e3 * self.repeatability:.4g} mm"
@@ -135,44 +140,31 @@ class Performance(Tabled):
     def _notes(self) -> list[str]:
         return self.notes()
 
+    @property
+    def _turned(self) -> bool:
+        return any(each.RP_angles is not None for each in self.poses)
+
     def _frame_rows(self) -> list[dict[str, Any]]:
-        return [self._row(each) for each in self.poses]
+        rows = []
+        for each in self.poses:
+            figures = {"AP_p_mm": each.AP}
+            figures |= {f"AP_{axis}_mm": value for axis, value in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
+            figures["RP_l_mm"] = each.RP
+            if self._turned:
+                for kind, values in (("AP", each.AP_angles), ("RP", each.RP_angles)):
+                    names = [f"{kind}_{name}_mrad" for name in self.names]
+                    figures |= dict(zip(names, values or [None] * 3, strict=True))
+            milli = {name: None if value is None else 1e3 * value for name, value in figures.items()}
+            rows.append({"pose": each.pose, "cycles": each.cycles, **milli})
+        return rows
 
-    def _row(self, each: PosePerformance) -> dict[str, Any]:
-        row: dict[str, Any] = {"pose": each.pose, "cycles": each.cycles, "AP_p_mm": _milli(each.AP)}
-        row |= {f"AP_{axis}_mm": value for axis, value in zip("xyz", _three(each.AP_axes), strict=True)}
-        row["RP_l_mm"] = _milli(each.RP)
-        if any(one.RP_angles is not None for one in self.poses):
-            row |= {f"AP_{name}_mrad": v for name, v in zip(self.names, _three(each.AP_angles), strict=True)}
-            row |= {f"RP_{name}_mrad": v for name, v in zip(self.names, _three(each.RP_angles), strict=True)}
-        return row
-
-
-def _milli(value: float | None) -> float | None:
-    if value is None:
-        return None
-    return 1e3 * value
-
-
-def _three(values: Sequence[float] | None) -> list[float | None]:
-    if values is None:
-        return [None, None, None]
-    return [1e3 * value for value in values]
-
-
-def _text(rows: list[dict[str, Any]], unit: str) -> str:
-    """Return the figures of a unit as a table, without what no pose has."""
-    kept = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
-    head = [key.replace(unit, f" [{unit[1:]}]") for key in kept]
-    return table(["pose", "cycles", *head], [[_cell(row[key]) for key in ("pose", "cycles", *kept)] for row in rows])
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float):
-        return f"{value:.4f}"
-    return str(value)
+    def _table(self, unit: str) -> str:
+        """Return the figures of a unit as a table, without what no pose has."""
+        rows = self._frame_rows()
+        shown = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
+        head = ["pose", "cycles", *(key.replace(unit, f" [{unit[1:]}]") for key in shown)]
+        cells = [["-" if row[key] is None else f"{row[key]:.4f}" for key in shown] for row in rows]
+        return table(head, [[row["pose"], str(row["cycles"]), *more] for row, more in zip(rows, cells, strict=True)])
 
 
 def iso9283(
@@ -221,68 +213,152 @@ def iso9283(
     2.51
     """
     N = len(pose)
-    reached = _numbers(position, N, "positions")
-    commanded = _optional(command, N, "commanded positions")
-    turned = _optional(angles, N, "angles")
-    commanded_angles = _optional(command_angles, N, "commanded angles")
     if not N:
         raise InputError("iso9283", "no approach", "at least two of a pose")
-    found: list[PosePerformance] = []
+    arrays = {"positions": position, "commanded positions": command, "angles": angles}
+    arrays["commanded angles"] = command_angles
+    checked = {what: _rows(values, N, what) for what, values in arrays.items()}
+    poses: list[PosePerformance] = []
     for name in dict.fromkeys(pose):
         at = np.array([each == name for each in pose])
         if at.sum() < 2:
             raise InputError(f"pose '{name}'", "one approach", f"two or more, {CYCLES} by the standard")
-        goal = _one(commanded, at, name, "position")
-        goal_angles = _one(commanded_angles, at, name, "orientation")
-        found.append(_of_pose(name, reached[at], goal, None if turned is None else turned[at], goal_angles))
-    return Performance(tuple(found), names)
+        poses.append(_of_pose(name, **{what.replace(" ", "_"): v[at] for what, v in checked.items() if v is not None}))
+    return Performance(tuple(poses), names)
 
 
 def _of_pose(
-    name: str, reached: Array, goal: Array | None, turned: Array | None, goal_angles: Array | None
+    name: str,
+    positions: Array,
+    commanded_positions: Array | None = None,
+    angles: Array | None = None,
+    commanded_angles: Array | None = None,
 ) -> PosePerformance:
-    centre = reached.mean(axis=0)
-    length = np.linalg.norm(reached - centre, axis=1)
-    RP = float(length.mean() + 3 * length.std(ddof=1))
-    off = None
-    if goal is not None:
-        off = centre - goal
-    RP_angles = None
-    AP_angles = None
-    if turned is not None:
-        start = turned[0] if goal_angles is None else goal_angles
-        beside = (turned - start + np.pi) % (2 * np.pi) - np.pi
+    barycentre = positions.mean(axis=0)
+    length = np.linalg.norm(positions - barycentre, axis=1)
+    AP = AP_axes = AP_angles = RP_angles = None
+    if commanded_positions is not None:
+        offset = barycentre - _command(commanded_positions, name, "position")
+        AP, AP_axes = float(np.linalg.norm(offset)), _triple(offset)
+    start = None
+    if commanded_angles is not None:
+        start = _command(commanded_angles, name, "orientation")
+    if angles is not None:
+        beside = (angles - (angles[0] if start is None else start) + np.pi) % (2 * np.pi) - np.pi
         RP_angles = _triple(3 * beside.std(axis=0, ddof=1))
-        if goal_angles is not None:
+        if start is not None:
             AP_angles = _triple(beside.mean(axis=0))
-    if off is None:
-        return PosePerformance(name, len(reached), None, None, RP, AP_angles, RP_angles)
-    return PosePerformance(name, len(reached), float(np.linalg.norm(off)), _triple(off), RP, AP_angles, RP_angles)
+    RP = float(length.mean() + 3 * length.std(ddof=1))
+    return PosePerformance(name, len(positions), AP, AP_axes, RP, AP_angles, RP_angles)
 
 
 def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
+    x, y, z = values.tolist()
     return x, y, z
 
 
-def _one(values: Array | None, at: np.ndarray, name: str, what: str) -> Array | None:
-    """Return the command of a pose, which all its rows repeat."""
-    if values is None:
-        return None
-    of = values[at]
-    if np.ptp(of, axis=0).max() > 1e-9:
+def _command(values: Array, name: str, what: str) -> Array:
+    """Return the command of a pose (3,), which all its rows repeat."""
+    if np.ptp(values, axis=0).max() > 1e-9:
         raise InputError(f"pose '{name}'", f"commands of more than one {what}", "one command a pose")
-    return of[0]
+    return values[0]
 
 
-def _optional(values: Array | None, N: int, what: str) -> Array | None:
+def _rows(values: Array | None, N: int, what: str) -> Array | None:
     if values is None:
         return None
-    return _numbers(values, N, what)
+    array = np.asarray(values, dtype=float)
+    if array.shape != (N, 3) or not np.isfinite(array).all():
+        raise InputError(what, f"shape {array.shape}", f"finite numbers of shape {(N, 3)}")
+    return array
 
 
-def _numbers(values: Array, N: int, what: str) -> Array:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (N, 3) or not np.isfinite(found).all():
-        raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {(N, 3)}")
-    return found
+# --- tables ------------------------------------------------------------------------------------------------
+
+
+def read_approaches(source: Any, units: str = "") -> Performance:
+    """Return pose accuracy and repeatability of a table of repeated approaches (`iso9283`).
+
+    Parameters
+    ----------
+    source
+        A text, Excel or Parquet file, or columns by name: ``pose``, attained ``x_mm, y_mm, z_mm``, commanded
+        ``command_x_mm, ...`` (or Nominal X, Target X, ...), and angles ``rx_deg, ry_deg, rz_deg`` likewise.
+    units
+        Units of columns whose name carries none, ``"deg,mm"``.
+
+    Raises
+    ------
+    InputError
+        For columns that are missing or without unit, cells that are no numbers, and what `iso9283` refuses.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> columns = {"pose": ["P1", "P1"], "X [mm]": [1.0, 3.0], "Y [mm]": [0.0, 0.0], "Z [mm]": [0.0, 0.0]}
+    >>> columns |= {f"Nominal {axis} [mm]": [0.0, 0.0] for axis in "XYZ"}
+    >>> found = ro.use.read_approaches(columns)
+    >>> round(1e3 * found.accuracy, 3), round(1e3 * found.repeatability, 3)
+    (2.0, 1.0)
+    """
+    file = source if isinstance(source, str | Path) else None
+    try:
+        columns: Mapping[str, Sequence[Any]] = read_columns(source) if file is None else read_raw(Path(file)).columns
+        return _performance(columns, parse_units(units))
+    except InputError as error:
+        raise error.within(file) from None
+
+
+def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str]) -> Performance:
+    """Return the performance of a table whose columns are recognized by their names."""
+    poses: dict[str, str] = {}
+    found: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
+    for name in columns:
+        stem, unit = split(name)
+        meaning = recognize(stem)
+        of = found.get(meaning.kind or "measured")
+        if meaning.stem in ("configuration", "label"):
+            poses.setdefault(meaning.stem, name)
+        elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
+            if meaning.stem in of:
+                raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
+            of[meaning.stem] = name, _size(name, "length" if meaning.stem in AXES else "angle", unit, units)
+    attained, commanded = found.values()
+    pose = poses.get("configuration", poses.get("label"))
+    if pose is None or not set(AXES) <= set(attained):
+        raise InputError("the header", listed(list(columns), 6), ACCEPTED)
+    angles = next((group for group in ROTATIONS if set(group) <= set(attained)), None)
+    return iso9283(
+        texts(columns[pose], pose),
+        np.column_stack([_values(columns, *attained[axis]) for axis in AXES]),
+        _if_there(columns, commanded, AXES),
+        _if_there(columns, attained, angles),
+        _if_there(columns, commanded, angles),
+        angles or ROTATIONS[0],
+    )
+
+
+def _size(name: str, dimension: str, unit: str, units: Mapping[str, str]) -> float:
+    """Return the size of a column's unit in SI."""
+    unit = unit or units.get(dimension, "")
+    if not unit or dimension_of(unit) != dimension:
+        raise InputError("the header", f"column '{name}' without a unit of {dimension}", "x_mm, or --units deg,mm")
+    if unit in FOREIGN:
+        return FOREIGN[unit].size * UNITS[FOREIGN[unit].unit].si
+    return UNITS[unit].si
+
+
+def _if_there(
+    columns: Mapping[str, Sequence[Any]], of: Mapping[str, tuple[str, float]], stems: tuple[str, ...] | None
+) -> Array | None:
+    """Return columns side by side (N, 3), or None where the table has none of them."""
+    if stems is None or not set(stems) & set(of):
+        return None
+    missing = [stem for stem in stems if stem not in of]
+    if missing:
+        raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
+    return np.column_stack([_values(columns, *of[stem]) for stem in stems])
+
+
+def _values(columns: Mapping[str, Sequence[Any]], name: str, si: float) -> Array:
+    return si * numbers(columns[name], [str(i + 1) for i in range(len(columns[name]))], name)

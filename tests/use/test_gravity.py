@@ -117,10 +117,10 @@ def test_the_jacobian_of_commands_knows_that_every_joint_bends_the_others() -> N
     cell = Cell.of(result, position, None, "", False, False, result.problem.robot.gravity)
     q = np.random.default_rng(9).uniform(-1.5, 1.5, (5, 6))
     load = np.full((5, 1), 2.5)
-    J = cell.real.at(q, load, np.zeros((5, 3)))[2]
+    J = cell.identified.at(q, load, np.zeros((5, 3)))[2]
     h = 1e-5
     for i, step in enumerate(h * np.eye(6)):
-        ahead, behind = (cell.real.at(q + s * step, load, np.zeros((5, 3)))[0] for s in (1, -1))
+        ahead, behind = (cell.identified.at(q + s * step, load, np.zeros((5, 3)))[0] for s in (1, -1))
         # of 1e-3 that gravity makes of it, differences keep 1e-10
         assert np.abs(J[:, :, i] - (ahead - behind) / (2 * h)).max() < 1e-9
 

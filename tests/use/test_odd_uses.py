@@ -16,7 +16,7 @@ from rpim_opt.problem.scatter import Scatter
 from rpim_opt.use.changes import Cause
 from rpim_opt.use.cusum import since
 from rpim_opt.use.drifts import Drift
-from rpim_opt.use.export import _require_different, export_ur_calibration, export_urdf
+from rpim_opt.use.export import export_ur_calibration, export_urdf, write_all
 from rpim_opt.use.targets import read_targets
 from rpim_opt.use.validation import read_measurements
 from tests.simulate import ARM, simulated
@@ -217,9 +217,9 @@ def test_what_no_file_holds_is_named_and_counted() -> None:
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="a folder, accepted: a name of its own for every file"):
-        _require_different([tmp_path])
+        write_all([(tmp_path, lambda path: None)])
     with pytest.raises(ro.InputError):
-        _require_different([tmp_path / "a", tmp_path / "a"])
+        write_all([(tmp_path / "a", lambda path: None)] * 2)
 
 
 def test_validation_says_what_it_knows_and_what_not() -> None:

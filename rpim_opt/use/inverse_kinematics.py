@@ -1,0 +1,273 @@
+"""Inverse kinematics of a robot whose parameters are all known, within joint limits, for many rows at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.models import Measurement
+from rpim_opt.problem.row_functions import Loads
+from rpim_opt.robot.evaluation import call_rows
+from rpim_opt.robot.joint_terms import motion
+from rpim_opt.robot.kinematics import FRAME, chain, placed, product, transforms
+from rpim_opt.robot.mdh import Robot
+
+NULL_SPACE_WEIGHT = 1e-10
+"""Weight of a correction that moves nothing, relative to the largest squared singular value."""
+STEP_TOLERANCE = 1e-10
+DECREASE_TOLERANCE = 1e-6
+"""A row has converged when its step is shorter [rad or m], or lowers the objective by a smaller part."""
+MAX_ITERATIONS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A robot with all its parameters known: poses, errors and Jacobians of rows.
+
+    ``function`` maps model joint values, loads (`Loads`) and target, side by side, to the pose, its error and J'.
+    """
+
+    function: ca.Function
+    joint_map: Array
+
+    @classmethod
+    def of(
+        cls,
+        robot: Robot,
+        values: Mapping[str, float],
+        stated: Mapping[str, float],
+        prefix: str,
+        before: Array,
+        kind: Measurement,
+        loads: Loads,
+    ) -> Arm:
+        """Build the function, once for all rows: parameters are numbers in it, so that zeros cost nothing.
+
+        ``values`` are the parameters' by name, ``stated`` their nominal ones, by which gravity acts.
+        """
+        command = loads.symbols(robot.dof, 1)
+        y = ca.SX.sym("y", len(kind.columns))
+
+        def value(name: str) -> float:
+            return values.get(name, 0.0)
+
+        posture = loads.posture(robot.joint_types, stated.__getitem__, command)
+        terms = robot.model.terms
+        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
+        flange = chain(robot.joint_types, posture, value, terms)
+        T = product([ca.SX(ca.DM(before)), *flange, *placed([value(prefix + c) for c in FRAME])])
+        joints = list(enumerate(robot.joint_types, start=1))
+        twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
+        moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))
+        # gravity bends a joint by the values of all of them
+        J = (ca.horzcat(*twists) @ ca.jacobian(moved, command.q))[: len(kind.components), :]
+        modelled = kind.model(T)
+        outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
+        return cls(ca.Function("arm", [ca.vertcat(*command, y)], outputs), robot.joint_map)
+
+    def at(self, q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
+        modelled, error, J = call_rows(self.function, [], np.hstack([q @ self.joint_map.T, load, y]))
+        return modelled[:, 0], error[:, 0], J @ self.joint_map
+
+
+def _twist(moves: str, joint: ca.SX, T: ca.SX, beta: float) -> ca.SX:
+    """Return how point and orientation of T move with a joint (6, 1), after whose link the frame ``joint`` is."""
+    axis = joint[:3, :3] @ ca.vertcat(-np.sin(beta), 0, np.cos(beta))  # z before Rot(y, beta), through the origin
+    if moves == "prismatic":
+        return ca.vertcat(axis, 0, 0, 0)
+    return ca.vertcat(ca.cross(axis, T[:3, 3] - joint[:3, 3]), axis)
+
+
+class _State(NamedTuple):
+    """Rows after steps D (N, n): the errors (N, k), the weighted ones, their slopes A (N, k, n), and the objectives."""
+
+    error: Array
+    weighted: Array
+    A: Array
+    value: Array
+
+
+class _Task(NamedTuple):
+    """Rows of `nearest`, whose arguments are described there."""
+
+    arm: Arm
+    load: Array
+    y: Array
+    start: Array
+    low: Array
+    high: Array
+    unit: Array
+    W: Array | None
+    P: Array
+
+    def q(self, rows: np.ndarray, D: Array) -> Array:
+        """Return the joint values of some rows after steps D."""
+        return np.clip(self.start[rows] + self.unit * D, self.low[rows], self.high[rows])
+
+    def at(self, rows: np.ndarray, D: Array) -> _State:
+        """Return the state of some rows after steps D."""
+        _, error, J = self.arm.at(self.q(rows, D), self.load[rows], self.y[rows])
+        weighted = error
+        A = J * self.unit
+        if self.W is not None:
+            weighted = times(self.W[rows], error)
+            A = self.W[rows] @ A
+        value = np.sum(weighted**2, axis=1) + np.sum(D * times(self.P[rows], D), axis=1)
+        return _State(error, weighted, A, value)
+
+    def descent(self, rows: np.ndarray, D: Array, here: _State) -> Array:
+        """Return half the negative gradients (len(rows), n)."""
+        return np.einsum("nki,nk->ni", here.A[rows], here.weighted[rows]) - times(self.P[rows], D[rows])
+
+    def curvature(self, rows: np.ndarray, here: _State, damping: Array) -> Array:
+        """Return damped Gauss-Newton matrices (len(rows), n, n); a trace of damping keeps every one regular."""
+        A = here.A[rows]
+        H = A.transpose(0, 2, 1) @ A + self.P[rows]
+        diagonal = np.einsum("nii->ni", H)
+        diagonal += damping[rows, None] * diagonal + 1e-14 * diagonal.mean(axis=1, keepdims=True) + 1e-300
+        return H
+
+
+def nearest(
+    arm: Arm,
+    load: Array,
+    y: Array,
+    start: Array,
+    low: Array,
+    high: Array,
+    unit: Array,
+    W: Array | None = None,
+    P: Array | None = None,
+) -> tuple[Array, Array, np.ndarray]:
+    """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + unit D, row by row.
+
+    Gauss-Newton steps in the box, damped (Levenberg-Marquardt) in rows whose step does not lower the objective.
+
+    Parameters
+    ----------
+    arm, load, y
+        The robot, what its joints bear (N, l), and the targets (N, c).
+    start, low, high, unit
+        (N, n) or (n,) joint values [rad or m], and what counts as one for every joint.
+    W, P
+        (N, k, k) and (N, n, n) weights; without W all errors count alike, without P corrections cost nothing.
+
+    Returns
+    -------
+    Joint values (N, n), their errors (N, k), and which joints are at an active limit (N, n).
+    """
+    N, n = start.shape
+    if P is None:
+        P = np.zeros((N, n, n))
+    if W is not None and len(W) != N:
+        W = None  # one projection for all rows is the identity: see `attainable`
+    low = np.broadcast_to(low, start.shape)
+    high = np.broadcast_to(high, start.shape)
+    task = _Task(arm, load, y, start, low, high, unit, W, P)
+    to_low = (low - start) / unit
+    to_high = (high - start) / unit
+    D = np.clip(0.0, to_low, to_high)
+    damping = np.zeros(N)
+    every = np.arange(N)
+    left = every
+    here = task.at(left, D)
+    for _ in range(MAX_ITERATIONS):
+        if not len(left):
+            break
+        g = task.descent(left, D, here)
+        step = _boxed(task.curvature(left, here, damping), g, to_low[left] - D[left], to_high[left] - D[left])
+        new = task.at(left, D[left] + step)
+        better = new.value <= here.value[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
+        rows = left[better]
+        D[rows] += step[better]
+        for old, values in zip(here, new, strict=True):
+            old[rows] = values[better]
+        damping[rows] = np.where(damping[rows] > 1e-6, damping[rows] / 10, 0.0)
+        damping[left[~better]] = np.maximum(10 * damping[left[~better]], 1e-3)
+        long = np.abs(step).max(axis=1) > STEP_TOLERANCE
+        promising = np.sum(step * g, axis=1) > DECREASE_TOLERANCE * here.value[left]
+        left = left[long & promising & (here.value[left] > 1e-24)]
+    g = task.descent(every, D, here)
+    active = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))
+    return task.q(every, D), here.error, active
+
+
+def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly.
+
+    Entries at a bound that the gradient pushes out stay; those that leave the box are set on its border and the others
+    solved for again, until none leaves. The next step's gradient decides which bounds are active.
+    """
+    n = g.shape[1]
+    free = ~(((low >= 0) & (g < 0)) | ((high <= 0) & (g > 0)))
+    step = np.zeros_like(g)
+    rows = np.arange(len(g))
+    for _ in range(n + 1):
+        f = free[rows]
+        pairs = f[:, :, None] & f[:, None, :]
+        fixed = np.where(f, 0.0, step[rows])
+        rest = np.where(f, g[rows] - np.einsum("nij,nj->ni", H[rows], fixed), 0.0)
+        solved = np.linalg.solve(np.where(pairs, H[rows], np.eye(n)), rest[:, :, None])[:, :, 0]
+        step[rows] = np.clip(np.where(f, solved, fixed), low[rows], high[rows])
+        out = f & ((solved < low[rows]) | (solved > high[rows]))
+        free[rows] &= ~out
+        rows = rows[out.any(axis=1)]
+        if not len(rows):
+            break
+    return step
+
+
+def joint_units(robot: Robot, equations: int) -> Array:
+    """Return what counts as one for every joint: the ranges where there are more joints than equations, else 1."""
+    span = np.ptp(robot.limits, axis=1)
+    unit = np.ones(robot.dof)
+    if robot.dof > equations:
+        span[~np.isfinite(span)] = 2 * np.pi
+        for kind in set(robot.joint_types):
+            alike = np.array([k == kind for k in robot.joint_types])
+            unit[alike] = span[alike] / span[alike].min()
+    return unit
+
+
+def attainable(J: Array) -> Array:
+    """Return matrices W (N or 1, k, k) that project errors on those that count, from Jacobians (N, k, n).
+
+    With six joints or more, or positions alone, all do. With fewer position comes first: of the orientation counts what
+    can be turned without moving the point, which makes as many equations as joints.
+    """
+    k, n = J.shape[1:]
+    if n >= k or k == 3:
+        return np.eye(k)[None]
+    still = np.linalg.svd(J[:, :3])[2][:, 3:]
+    U, s, _ = np.linalg.svd(J[:, 3:] @ still.transpose(0, 2, 1), full_matrices=False)
+    U = U * (s > 1e-6)[:, None]
+    W = np.tile(np.eye(k), (len(J), 1, 1))
+    W[:, 3:, 3:] = U @ U.transpose(0, 2, 1)
+    return W
+
+
+def times(W: Array, vectors: Array) -> Array:
+    """Return matrices (N, k, k) times vectors (N, k), row by row."""
+    return (W @ vectors[:, :, None])[:, :, 0]
+
+
+def correction_weights(A: Array, due: Array, largest: float) -> Array:
+    """Return the weights P (N, n, n) of corrections.
+
+    With A = U diag(s) V', the correction in direction v_i would be e_i / s_i, e = U' due; see `compensate`.
+    """
+    n = A.shape[2]
+    U, s, Vt = np.linalg.svd(A, full_matrices=True)
+    some = s.shape[1]
+    e = np.zeros((len(A), n))
+    e[:, :some] = np.einsum("nij,ni->nj", U, due)[:, :some]
+    s = np.pad(s, ((0, 0), (0, n - some)))
+    p = np.maximum((e / largest) ** 2 - s**2, 0.0)
+    p += NULL_SPACE_WEIGHT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
+    return np.einsum("nki,nk,nkj->nij", Vt, p, Vt)
