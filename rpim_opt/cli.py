@@ -471,7 +471,7 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        from rpim_opt.data.models import pose
+        from rpim_opt.data.measurements.pose import pose
         from rpim_opt.data.tables.layout import read_raw
         from rpim_opt.data.tables.naming import rename
         from rpim_opt.data.tables.units import parse_units

@@ -157,7 +157,6 @@ ELSEWHERE = {
     "rpim_opt.convex.conflict",
     "rpim_opt.bayes.population",
     "rpim_opt.convex.sentence",
-    "rpim_opt.data.tracker",
     "rpim_opt.robot.urdf",
     "cattrs",
 }

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
 from rpim_opt.convex.interior import Found
-from rpim_opt.data.models import pose, position
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.naming import rename
 from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.chain import link_of

@@ -21,7 +21,7 @@ from rpim_opt.calibration.reaching import Reaching, Share, reaching, share
 from rpim_opt.calibration.region import Region, region_of
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 
 Verdict = Literal["accepted", "rejected", "undecided"]
 FEWEST = 5

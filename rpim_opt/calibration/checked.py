@@ -18,7 +18,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.unseen import CONFIDENCE
 from rpim_opt.calibration.unseen import judged as unseen
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 
 SURE = 1e9
 """Degrees of freedom of an uncertainty that is stated."""

@@ -38,7 +38,8 @@ from rpim_opt.convex.quadratic import ridge
 from rpim_opt.convex.select import Selection
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem

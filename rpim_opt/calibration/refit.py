@@ -8,7 +8,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.unseen import judged
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.held_out import HeldOut
+from rpim_opt.data.record import HeldOut
 
 
 def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:

@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.identified import Machine, identified_of, require_robot
 from rpim_opt.problem.workspace import in_base, markers

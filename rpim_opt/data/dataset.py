@@ -14,7 +14,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
-from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.parameter_names import session_prefix
 
 
@@ -291,6 +292,28 @@ class Dataset(Tabled):
             if len(row):
                 blocks.append(block.take(place[index[row]], row))
         return Dataset(tuple(blocks), tuple(self.label[i] for i in index), self.configuration[index])
+
+    def grouped_by_points(self) -> Dataset:
+        """Return measurements in which rows that one unknown point ties together have one number of configuration.
+
+        Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
+        configuration: a fold of a cross-validation has all of them or none.
+        """
+        group: dict[Any, Any] = {}
+
+        def root(of: Any) -> Any:
+            while group.setdefault(of, of) != of:
+                of = group[of]
+            return of
+
+        for block in self.blocks:
+            if block.touched is not None:
+                for row, names in zip(block.row, block.touched, strict=True):
+                    for name in names:
+                        group[root(("point", name))] = root(("rows", self.configuration[row]))
+        joined = [root(("rows", number)) for number in self.configuration]
+        number = {each: i for i, each in enumerate(dict.fromkeys(joined))}
+        return replace(self, configuration=np.array([number[each] for each in joined], dtype=int))
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""

@@ -14,7 +14,7 @@ from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import position
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import bearing

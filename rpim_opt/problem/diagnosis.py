@@ -17,7 +17,8 @@ from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import KNOWN, position
+from rpim_opt.data.measurements.contact import KNOWN
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.misreadings import Points, better_reading, lever_arms, misfit, placed, points_of
 from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
 from rpim_opt.problem.problem import CalibrationProblem

@@ -10,7 +10,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.shown import Brief
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import CAMERAS
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import Robot
@@ -223,11 +222,10 @@ def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
 
 def identifiable(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
     """Return the names that ``identify = "auto"`` means: geometry, Hayati's beta where it is needed, and places."""
-    kinds = {block.measurement.name for block in data.blocks}
-    turning = {"pose", *CAMERAS}
+    kinds = [block.measurement for block in data.blocks]
     patterns = [GEOMETRY]
-    if kinds & {"position", *turning}:  # distances do not tell where the robot stands
+    if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
         patterns.append(BASE)
-    patterns.append(PLACES if kinds & turning else POINTS)  # nothing else sees how a reflector is turned
+    patterns.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in patterns)
     return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

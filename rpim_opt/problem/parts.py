@@ -14,7 +14,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.data.dataset import Dataset, whole_configurations
-from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.linear import LinearModel, Reweigh, by_twos, from_triangle, reduced_models
 from rpim_opt.problem.problem import CalibrationProblem

@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
-from rpim_opt.data.models import of_fixture
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.identified import Identified, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
 from rpim_opt.problem.row_functions import Evaluation, Kept, measured_torques, require_loads, require_same_torques

@@ -15,7 +15,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import READY, Measurement, of_fixture
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.measurements.registry import READY
 from rpim_opt.robot.deflection import Statics
 from rpim_opt.robot.evaluation import SYMBOLS, evaluate_rows, write_rows
 from rpim_opt.robot.gravity import Gravity

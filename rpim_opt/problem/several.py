@@ -13,7 +13,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.patterns import fits
-from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import met
@@ -70,7 +69,7 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     for name in common:
         _require_same(name, parts)
     robots = {name: part.robot for name, part in parts.items()}
-    data = by_points(Dataset.of_robots({name: part.data for name, part in parts.items()}))
+    data = Dataset.of_robots({name: part.data for name, part in parts.items()}).grouped_by_points()
     whole = CalibrationProblem(robots, _joined(parts, common), data)
     met(whole)  # what is touched by several robots is in one place
     return whole

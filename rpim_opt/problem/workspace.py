@@ -11,8 +11,10 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import eye_in_hand, of_fixture, position, revisit
-from rpim_opt.data.projection import INTRINSICS, pixels
+from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
+from rpim_opt.data.measurements.contact import revisit
+from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.identified import Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem

@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
-    from rpim_opt.data.requirement import Requirement
+    from rpim_opt.data.record import Requirement
     from rpim_opt.data.tables.understanding import Asked
 
 # --- output ------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def carried(text: str | None) -> tuple[float | None, list[float] | None]:
 
 def required(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
     """Return the requirement of ``--limit`` [mm] and ``--box``, which replace what the problem or result states."""
-    from rpim_opt.data.requirement import Requirement
+    from rpim_opt.data.record import Requirement
 
     require_positive("--limit", limit)
     if limit is None and stated is None:

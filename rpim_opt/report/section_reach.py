@@ -12,7 +12,7 @@ from rpim_opt.basics.text import percent
 from rpim_opt.calibration.reaching import reaching
 from rpim_opt.calibration.region import Region, region_of
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report.chart import Axis, Cells, Chart, Line, Mark
 from rpim_opt.report.frame import section

@@ -16,7 +16,7 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import known_distance, known_parallel, known_square
+from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.store.result_file import figures, sets
 from rpim_opt.store.statements import FIELDS
 

@@ -23,9 +23,8 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.selection import Selector
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement
-from rpim_opt.data.record import Record
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.record import Record, Requirement
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters

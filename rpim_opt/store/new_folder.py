@@ -16,10 +16,9 @@ from rpim_opt.basics.inputs import read_text
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.units import UNITS
 from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
-from rpim_opt.data.board import Board, grid_board, on_board, read_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import CAMERAS, Measurement
-from rpim_opt.data.tables.naming import TOUCHED
+from rpim_opt.data.measurements.camera import CAMERAS, Board, grid_board, on_board, read_board
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked
 from rpim_opt.data.tables.units import parse_units
@@ -295,7 +294,7 @@ def _kind(
         return _camera(arm, target.under(found.columns))
     if not kind.touching:
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
-    column = next(name for name in TOUCHED if name in found.columns)
+    column = next(name for name in kind.names if name in found.columns)
     count = len(set(found.columns[column]))
     return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
 

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, read_columns
-from rpim_opt.data.board import Board, on_board
-from rpim_opt.data.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import CAMERAS
+from rpim_opt.data.measurements.camera import Board, on_board
+from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.robodk import robodk_columns
 from rpim_opt.store.problem_file import AngleTable, DistanceTable, Observation, ProblemTable, Stated
@@ -82,7 +81,7 @@ def _read(stated: Stated, each: Observation, file: str, tcps: dict[str, list[flo
     robodk = each.layout == "robodk"
     try:
         source: Any = robodk_columns(path, stated.robot.joint_dimensions, tcps) if robodk else path
-        if stated.board is not None and each.measurement in CAMERAS:
+        if stated.board is not None and stated.kinds[each.measurement].by_camera:
             source = _seen(path, stated.board)
         return read_data(source, stated.robot, each.noise or stated.table.noise, stated.kinds[each.measurement])
     except InputError as error:

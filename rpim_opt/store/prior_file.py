@@ -17,7 +17,7 @@ from rpim_opt.basics.units import split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.robot.overlay import JOINT_OFFSET, is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 

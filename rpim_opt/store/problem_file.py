@@ -17,9 +17,10 @@ from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.named import LEARNED
 from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.selection import require_weight
-from rpim_opt.data.board import Board, grid_board, read_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.data.measurements.camera import Board, grid_board, read_board
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, numeric_frame

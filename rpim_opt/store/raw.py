@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,20 +11,19 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.tables import Columns
-from rpim_opt.data.models import MEASUREMENTS, Measurement, eye_in_hand, pose, position, revisit
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.layout import RawTable, read_raw
-from rpim_opt.data.tables.naming import TOUCHED
 from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked, Understood, understand
-from rpim_opt.data.tables.units import split
 from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_source, read_arm
 
-COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
-"""In the name of a column that holds a measured coordinate."""
 Files = Sequence[tuple[Path, RawTable]]
 CLEARLY = 3.0
 """The right order of a quaternion leaves so many times less than the other one."""
@@ -184,7 +182,9 @@ def understand_of(
     paths = [Path(each) for each in data]
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
     files = [(path, read_raw(path, asked.layout)) for path in paths]
-    known = known or _kind_of_columns([table.columns for _, table in files])
+    if known is None:
+        columns = [table.columns for _, table in files]
+        known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
     kind = known or pose
     tables = _understood(files, arm, kind, asked)
     if known is None:
@@ -208,18 +208,6 @@ def _whole(
     except InputError as error:
         raise error.within(paths[0] if len(paths) == 1 else None) from None
     return Understanding(kind, whole.columns, tuple(tables), whole.notes, asked, str(paths[0]))
-
-
-def _kind_of_columns(tables: Sequence[Columns]) -> Measurement | None:
-    """Return what was measured where columns of pixels or touches tell it; None where names have to be read."""
-    names = [name.strip().lower() for raw in tables for name in raw]
-    if any({"u", "v"} <= {split(name)[0].strip().lower() for name in raw} for raw in tables):
-        return eye_in_hand
-    cells = [column for raw in tables for name, column in raw.items() if name.strip().lower() in TOUCHED]
-    repeated = any(len({str(cell) for cell in column}) < len(column) for column in cells)  # labels are unique
-    if repeated and not any(map(COORDINATE.search, names)):
-        return revisit
-    return None
 
 
 def _kind_of_names(tables: Sequence[Understood], path: Path) -> Measurement:

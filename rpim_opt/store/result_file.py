@@ -33,7 +33,8 @@ from rpim_opt.convex.selection import Selection
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
-from rpim_opt.data.models import READY, Measurement
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.registry import READY
 from rpim_opt.data.record import Record
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel

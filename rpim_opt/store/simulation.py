@@ -17,10 +17,10 @@ from rpim_opt.basics.inputs import inside
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import display, joint_columns, quantities
 from rpim_opt.basics.writing import write_files
-from rpim_opt.data.board import on_board
-from rpim_opt.data.contact import touches
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import Measurement, of_fixture
+from rpim_opt.data.measurements.camera import on_board
+from rpim_opt.data.measurements.contact import touches
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem

@@ -17,8 +17,8 @@ from rpim_opt.basics.units import number, quantities
 from rpim_opt.convex.constraints import Constraint, at_nominal, equal, parse, signed
 from rpim_opt.convex.drawn import BOX, WORKSPACE
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import of_fixture
-from rpim_opt.data.requirement import CONFIDENCE, Requirement, Side
+from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.record import CONFIDENCE, Requirement, Side
 from rpim_opt.robot.mdh import Robot
 
 MEASURED = "measured"

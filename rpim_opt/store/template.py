@@ -10,8 +10,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement, of_fixture
-from rpim_opt.data.projection import INTRINSICS
+from rpim_opt.data.measurements.camera import INTRINSICS
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.problem.observability import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters

@@ -15,7 +15,8 @@ from rpim_opt.calibration.intervals import position_noise, scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import Measurement, position
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import Loads, bearing, loads_on, require_same_torques

@@ -22,7 +22,8 @@ from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import pose, position
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.use.cell import Cell
 from rpim_opt.use.targets import Targets, checked, read_targets

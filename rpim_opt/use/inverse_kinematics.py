@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.problem.row_functions import Loads
 from rpim_opt.robot.evaluation import call_rows
 from rpim_opt.robot.joint_terms import motion

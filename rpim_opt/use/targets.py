@@ -13,7 +13,8 @@ from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import read_columns
 from rpim_opt.basics.units import joint_columns, split_unit
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import pose, position
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.mdh import Robot
 

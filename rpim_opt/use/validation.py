@@ -20,9 +20,10 @@ from rpim_opt.calibration.contact_words import HEADER, Scatter, contact_remarks,
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.unseen import judged
-from rpim_opt.data.board import board_of, on_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import KNOWN, Measurement
+from rpim_opt.data.measurements.camera import board_of, on_board
+from rpim_opt.data.measurements.contact import KNOWN
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.naming import rename
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked, understand

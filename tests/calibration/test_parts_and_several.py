@@ -14,7 +14,7 @@ from rpim_opt.calibration import influence, likely_causes
 from rpim_opt.calibration.baselines import gradient_descent
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.refit import refit_all
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 from rpim_opt.problem.parts import PartitionedProblem
 from tests.simulate import simulated
 

@@ -20,7 +20,7 @@ from rpim_opt.calibration.intervals import checked as interval
 from rpim_opt.calibration.lack_of_fit import LackOfFit
 from rpim_opt.calibration.left_over import Effect
 from rpim_opt.calibration.reaching import Share, share
-from rpim_opt.data.requirement import Requirement
+from rpim_opt.data.record import Requirement
 
 LIMIT = Requirement(1e-4)
 

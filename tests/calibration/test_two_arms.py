@@ -10,7 +10,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.contact_words import scatter
-from rpim_opt.data.contact import by_points
 from rpim_opt.problem.registration.frames import met
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
@@ -50,7 +49,7 @@ def pair(seed: int, identify: list[str], count: int = 4):
         x = np.where([own.startswith("base_") for own in free.names], 0.0, rng.normal(size=len(free)) * free.scale)
         parts[name] = arm.on(touched(arm, x, base, SOCKETS, count, rng))
         clean[name] = touched(arm, x, base, ELSEWHERE, 4, rng, sigma=0.0)
-    return ro.together(**parts, shared=[]), by_points(ro.Dataset.of_robots(clean))
+    return ro.together(**parts, shared=[]), ro.Dataset.of_robots(clean).grouped_by_points()
 
 
 ALL = ["theta?", "d?", "tool_[xyz]"]

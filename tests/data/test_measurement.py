@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.data.models import CAMERAS, MEASUREMENTS, of_fixture
-from rpim_opt.data.rotations import quaternion, rotation_between
-from rpim_opt.data.tracker import LaserTracker
+from rpim_opt.data.measurements.camera import CAMERAS
+from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.measurements.pose import quaternion, rotation_between
+from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.data.noise import LaserTracker
 
 KINDS = [name for name in MEASUREMENTS if name not in CAMERAS]  # whose points have to be in sight: test_camera
 TYPES = ("revolute", "prismatic")

@@ -12,7 +12,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.tables import read_grid
-from rpim_opt.data.models import pose, position
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.layout import Layout
 from rpim_opt.data.tables.understanding import Understood, understand

@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.store.problem_file import problems_folder
 from tests.simulate import ARM
 from tests.test_cli import run

@@ -18,7 +18,8 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.convex.sentence import sentence
-from rpim_opt.data.models import MEASUREMENTS, Measurement
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Asked
 from rpim_opt.data.tables.units import parse_units

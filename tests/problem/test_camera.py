@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
-from rpim_opt.data.projection import INTRINSICS, TARGET
+from rpim_opt.data.measurements.camera import INTRINSICS, TARGET
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import workspace as sight
 from rpim_opt.problem.misreadings import better_reading
 from rpim_opt.problem.registration.camera import normalized, posed, starting_camera
@@ -129,7 +129,7 @@ def test_a_view_that_shows_no_pose_is_refused(points: np.ndarray, found: str) ->
 
 
 def test_distortion_is_taken_back() -> None:
-    from rpim_opt.data.projection import pixels
+    from rpim_opt.data.measurements.camera import pixels
 
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))
     uv = np.column_stack([part.ravel() for part in pixels(x, y, 1.0, **LENS)])
@@ -215,7 +215,7 @@ def test_corners_that_were_not_found_and_those_that_vary() -> None:
 def test_a_table_says_which_point_of_which_board(kind: str) -> None:
     robot = world(kind).robot
     table = {f"q{i}_deg": ["0", "5"] for i in range(1, 7)} | {"u_px": ["1", "2"], "v_px": ["3", "4"]}
-    with pytest.raises(ro.InputError, match="the target: found nothing"):
+    with pytest.raises(ro.InputError, match=r"no column for .target_x. among .*target = .board.csv."):
         ro.read_data(table, robot, {"pixel_px": 0.1}, MEASUREMENTS[kind])
     places = {f"{stem}_mm": ["10", "20"] for stem in TARGET}
     data = ro.read_data(table | places | {"u95_px": ["0.2", "0.4"]}, robot, measurement=MEASUREMENTS[kind])

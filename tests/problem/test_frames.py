@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.registration import frames as located
 from rpim_opt.problem.registration.closed_forms import hand_eye, register, tool_from_distances
 from rpim_opt.problem.registration.frames import locate

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.row_functions import Kept, _built, _ready, asked
 
 ZERO = 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.row_functions import bearing, repeatable
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot

@@ -9,10 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.data.board import on_board
-from rpim_opt.data.contact import KnownAngle, KnownDistance, touches
-from rpim_opt.data.models import plane, pose, position
-from rpim_opt.data.spread import declared_noise
+from rpim_opt.data.measurements.camera import on_board
+from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches
+from rpim_opt.data.measurements.plane import plane
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
+from rpim_opt.data.noise import declared_noise
 from rpim_opt.problem.parts import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate

@@ -14,7 +14,7 @@ import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learning
 from rpim_opt.bayes.outliers import clustered, ratios
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.data.contact import KnownAngle, KnownDistance, touches, with_known
+from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
 from rpim_opt.problem.scatter import Scatter, stacked
 from rpim_opt.problem.touches import Plane, Touches, contrasted
 

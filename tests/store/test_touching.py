@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.models import MEASUREMENTS
+from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import postures
 from rpim_opt.store.simulation import touching_poses
 

@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.data.models import position
+from rpim_opt.data.measurements.position import position
 from rpim_opt.store.simulation import write_simulation
 from rpim_opt.use.cell import Cell
 from tests.simulate import ARM

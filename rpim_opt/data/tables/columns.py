@@ -12,8 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, numbers, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, spelled, split_unit, with_unit
-from rpim_opt.data.models import Measurement
-from rpim_opt.data.projection import TARGET
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.robot.mdh import Robot
 
 Numbers = dict[tuple[str, str], Array]
@@ -24,14 +23,8 @@ SPREADS = ("sigma", "u95")
 
 def text_columns(kind: Measurement) -> list[str]:
     """Return the columns of names that a table may have."""
-    names = ["label", "configuration", "marker", "fixture", "session"]
-    if kind.points == 2:
-        names.append("to_marker")
-    if kind.touching:
-        names += ["point", "plane"]
-    if kind.by_camera:
-        names.append("point")
-    return names
+    second = ["to_marker"] if kind.points == 2 else []
+    return ["label", "configuration", "marker", "fixture", "session", *second, *kind.names]
 
 
 def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
@@ -72,12 +65,7 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
     columns = quantities_of(table, known, text_columns(kind), label)
     for stem in _required(columns, robot, kind):
         if (stem, "") not in columns:
-            if stem in TARGET:
-                accepted = (
-                    'the target\'s points: target = "board.csv", or columns target_x_mm, target_y_mm, target_z_mm'
-                )
-                raise InputError("the target", "nothing", accepted)
-            accepted = " or ".join(with_unit(stem, known[stem][0]))
+            accepted = kind.accepted.get(stem, " or ".join(with_unit(stem, known[stem][0])))
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
     return columns
 
@@ -149,7 +137,7 @@ def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
     """Return the stems that must be there: joints, measured values, and whole groups of what is there in part."""
     joints = [f"q{i}" for i in range(1, robot.dof + 1)]
     torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
-    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in TARGET)]
+    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
     sides = [f"approach{i}" for i in range(1, robot.dof + 1)]
     groups = [torques, sides]
     if kind.points == 2:

@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import split_unit
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.understanding import Understood, row_stems
 from rpim_opt.robot.mdh import Robot
 

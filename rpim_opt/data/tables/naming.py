@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, numbers
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.layout import Head
 from rpim_opt.data.tables.names import TURNS, UR_JOINTS, Reading, dialect, recognize, ur_joint
@@ -19,8 +19,6 @@ from rpim_opt.robot.mdh import Robot
 AMBIGUOUS = ("rx", "ry", "rz")
 """Without a unit these may also be a rotation vector, as Universal Robots' are."""
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
-TOUCHED = ("point", "plane")
-"""Names of columns that say what a row touched."""
 Readings = dict[str, Reading]
 """What every column holds, by its name."""
 
@@ -75,7 +73,7 @@ def rename(
     """
     numeric = number_columns(robot, kind)
     plain = text_columns(kind)
-    read = {name: _read(name, (heads or {}).get(name), [*numeric, *plain], joints) for name in table}
+    read = {name: _read(name, (heads or {}).get(name), [*numeric, *plain], kind.names, joints) for name in table}
     read = numbered(_angles(read), table, robot.dof, quaternion)
     read = _from_one(_by_name(read, table, joints, robot.dof), robot.dof)
     if "temperature" not in units and "temperature" not in robot.model.columns:
@@ -96,7 +94,7 @@ def rename(
 # --- what every column holds ---------------------------------------------------------------------------------------
 
 
-def _read(name: str, head: Head | None, known: Sequence[str], joints: Sequence[str]) -> Reading:
+def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
     """Return what a column holds; its name as stem where that is not known."""
     text = name.partition(" #")[0]
     stem, unit = split(text)
@@ -108,7 +106,7 @@ def _read(name: str, head: Head | None, known: Sequence[str], joints: Sequence[s
             return Reading(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
     if stem in known:
         return Reading(stem, unit, "named so")
-    if stem.lower() in TOUCHED and stem.lower() in known:  # elsewhere such a column holds labels
+    if stem.lower() in names:  # elsewhere such a column holds labels
         return Reading(stem.lower(), unit, "what was touched")
     found = recognize(stem, joints)
     if head is not None and head.group and not found.why and not found.kind:

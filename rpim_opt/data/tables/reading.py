@@ -13,10 +13,10 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError
 from rpim_opt.basics.tables import Columns, read_columns, texts
-from rpim_opt.data.contact import by_points
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
-from rpim_opt.data.models import Measurement, position, revisit, revisit_plane
-from rpim_opt.data.spread import covariances, declared_noise
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
+from rpim_opt.data.noise import covariances, declared_noise
 from rpim_opt.data.tables.columns import Numbers, further_columns, labels, numeric, values_form
 from rpim_opt.robot.mdh import Robot
 
@@ -75,8 +75,7 @@ def read_data(
 
 def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Measurement) -> Dataset:
     N = len(next(iter(table.values())))
-    if kind is revisit and "plane" in table:
-        kind = revisit_plane
+    kind = next((variant for column, variant in kind.variants.items() if column in table), kind)
     label = labels(table, N)
     columns = numeric(table, robot, kind, label)
     y = _measured(columns, kind, label, N)
@@ -90,7 +89,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         payload=_payload(columns, label),
         approach=_approach(columns, robot, kind, label),
         columns=_further(columns, robot, kind),
-        point=_touched(table, kind, N),
+        point=_named_points(table, kind, N),
         session=named_sessions(texts(table.get("session", ()), "session"), N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
@@ -100,21 +99,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if {"marker", "to_marker", "fixture"} & set(table):
         blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
     data = Dataset(blocks, label, configuration)
-    if kind.touching:
-        return by_points(data)
-    return data
+    return data.grouped_by_points() if kind.touching else data
 
 
-def _touched(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
+def _named_points(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
     """Return the names (N, 1) of the points that were touched, or that a camera has seen, as far as they have some."""
-    if kind.by_camera and "point" in table:
-        return np.array(_names(table, ["point"], N), dtype=object)[:, None]
-    if not kind.touching:
-        return None
-    if ("point" in table) == ("plane" in table):
-        accepted = "a column point, or a column plane: what a row touched"
+    columns = [column for column in kind.names if column in table]
+    if kind.touching and len(columns) != 1:
+        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: what a row touched"
         raise InputError("the header", ", ".join(table), accepted)
-    return np.array(_names(table, ["point", "plane"], N), dtype=object)[:, None]
+    return np.array(_names(table, columns, N), dtype=object)[:, None] if columns else None
 
 
 def _further(columns: Numbers, robot: Robot, kind: Measurement) -> dict[str, Array]:

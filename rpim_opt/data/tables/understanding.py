@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import UNITS, split_unit
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.layout import Layout, RawTable, missing_rows, read_raw
 from rpim_opt.data.tables.names import Reading
 from rpim_opt.data.tables.naming import Renamed, rename
@@ -23,8 +23,8 @@ from rpim_opt.robot.mdh import Robot
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
          "session": "session of the measurements",
          "to_marker": "reflector of the second point", "point": "point that was touched or seen",
-         "plane": "plane that was touched", "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw",
-         "u": "measured pixel, to the right", "v": "measured pixel, downwards"}  # fmt: skip
+         "plane": "plane that was touched",
+         "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw"}  # fmt: skip
 NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
             r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
 SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
@@ -142,7 +142,7 @@ def understand(
     --------
     >>> from pathlib import Path
     >>> import numpy as np
-    >>> from rpim_opt.data.models import position
+    >>> from rpim_opt.data.measurements.position import position
     >>> from rpim_opt.data.tables.understanding import understand
     >>> from rpim_opt.robot import Robot
     >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
@@ -167,7 +167,7 @@ def understand(
         path.name,
         columns,
         {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
-        _meant(raw, found, ours, vectors),
+        _meant(raw, found, ours, vectors, kind),
         (*raw.notes, *notes, *more),
         not asked.quaternion and bool(quaternion_columns(read, robot.dof)),
     )
@@ -232,7 +232,9 @@ def _unique(labels: Sequence[str]) -> bool:
     return all(labels) and len(set(labels)) == len(labels)
 
 
-def _meant(raw: RawTable, found: Renamed, ours: Mapping[str, str], vectors: Sequence[str]) -> tuple[Meant, ...]:
+def _meant(
+    raw: RawTable, found: Renamed, ours: Mapping[str, str], vectors: Sequence[str], kind: Measurement
+) -> tuple[Meant, ...]:
     """Return what every column of the file means."""
     meant = [Meant(name, "rotation vector", "qw, qx, qy, qz", "", "--rotation vector") for name in vectors]
     for name in raw.columns:
@@ -243,7 +245,15 @@ def _meant(raw: RawTable, found: Renamed, ours: Mapping[str, str], vectors: Sequ
             why, unit_why = found.why[new]
             stem, unit = split_unit(new)
             shown = new.removeprefix(f"{stem}_") if unit else ""
-            meant.append(Meant(name, meaning(stem), new, shown, f"{why}; unit {unit_why}" if unit_why else why))
+            meant.append(
+                Meant(
+                    name,
+                    kind.words.get(stem) or meaning(stem),
+                    new,
+                    shown,
+                    f"{why}; unit {unit_why}" if unit_why else why,
+                )
+            )
     return tuple(meant)
 
 

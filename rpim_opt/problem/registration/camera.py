@@ -11,8 +11,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import CAMERAS, eye_in_hand, of_fixture, pose
-from rpim_opt.data.projection import INTRINSICS, TARGET
+from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, TARGET, eye_in_hand
+from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.measurements.pose import pose
 from rpim_opt.problem.registration.closed_forms import proper
 
 FEWEST = {True: 4, False: 6}

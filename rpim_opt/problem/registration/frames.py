@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import of_fixture
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem

@@ -1,20 +1,18 @@
-"""How uncertain measured values are: what a row states of itself, else what is declared for all."""
+"""How uncertain measured values are: what a row states of itself, else what is declared for all, or a data sheet."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, with_unit
-from rpim_opt.data.models import Measurement
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import Numbers
-
-if TYPE_CHECKING:
-    from rpim_opt.data.tracker import LaserTracker
 
 TRACKER = {
     "range": ("length", "ratio"),
@@ -27,6 +25,53 @@ TRACKER = {
 """The keys of ``[noise.tracker]`` and their dimensions."""
 DEFINITE = 1e-9
 """A correlation matrix whose smallest eigenvalue is not above this is no covariance."""
+
+
+@dataclass(frozen=True)
+class LaserTracker:
+    """The covariance of what a laser tracker measures, from the terms of its data sheet.
+
+    With u the unit vector from the tracker to the point at distance D::
+
+        C = (range + range_ppm D)^2 u u' + (transverse + angle D)^2 (1 - u u')
+
+    Parameters
+    ----------
+    range, transverse
+        Standard deviations along and across the beam at zero distance [m].
+    range_ppm
+        Growth along the beam per metre [1]: 1e-6 for 1 ppm.
+    angle
+        Growth across the beam [rad].
+    x, y, z
+        The tracker's place in the instrument's frame [m]; its origin by default.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> tracker = ro.data.LaserTracker(range=10e-6, range_ppm=1e-6, transverse=15e-6, angle=6e-6)
+    >>> covariance = tracker.covariance(np.array([[3.0, 0.0, 0.0]]))
+    >>> (1e6 * np.sqrt(np.diag(covariance[0]))).round(3)  # along x the beam, [um]
+    array([13., 33., 33.])
+    """
+
+    range: float = 0.0
+    range_ppm: float = 0.0
+    transverse: float = 0.0
+    angle: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+    def covariance(self, points: Array) -> Array:
+        """Return the covariances (N, 3, 3) [m^2] of points (N, 3) [m] in the instrument's frame."""
+        beam = points - np.array([self.x, self.y, self.z])
+        D = np.linalg.norm(beam, axis=1)
+        u = beam / np.maximum(D, 1e-9)[:, None]
+        along = ((self.range + self.range_ppm * D) ** 2)[:, None, None]
+        across = ((self.transverse + self.angle * D) ** 2)[:, None, None]
+        return across * np.eye(3) + (along - across) * (u[:, :, None] * u[:, None, :])
 
 
 def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
@@ -46,8 +91,6 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
 
 
 def _tracker(stated: Any, kind: Measurement) -> LaserTracker:
-    from rpim_opt.data.tracker import LaserTracker
-
     if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
         raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
     given = quantities(stated, TRACKER, "table noise.tracker")

@@ -1,36 +1,25 @@
-"""What an instrument sees: measurement models, symbolic in CasADi."""
+"""What a type of measurement is: columns and units, symbolic model, start values, noise, and the words for it.
+
+Every other module of this folder is one type, which `registry` finds by its ``TYPES``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
-import casadi as ca
+import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.shown import Brief
-from rpim_opt.data.projection import (
-    INTRINSICS,
-    STRETCH,
-    TARGET,
-    beside_the_robot,
-    metres_beside_the_robot,
-    metres_on_the_flange,
-    on_the_flange,
-)
-from rpim_opt.data.rotations import (
-    from_angles,
-    from_matrices,
-    quaternion,
-    rotation_between,
-    turned,
-    unit_quaternions,
-)
-from rpim_opt.data.starts import anchor_start, plane_start, sphere_start
-from rpim_opt.robot.kinematics import FRAME_DIMENSION
+from rpim_opt.basics.tables import Columns
 from rpim_opt.robot.terms import require_columns
+
+XYZ = {"x": "length", "y": "length", "z": "length"}
+"""A position's coordinates."""
 
 
 def _difference(y: Any, modelled: Any) -> Any:
@@ -88,6 +77,18 @@ class Measurement(Brief):
         the point, in the robot's own base frame.
     planar
         Whether what was touched is a plane.
+    names
+        Columns of names that a table of it may have besides, ``("point",)``; a touch has one of them.
+    variants
+        The type that it is where a table has a column of that name.
+    accepted
+        What a message says is accepted where a column of ``extra`` that it sees is missing, by the column's name.
+    words
+        What its columns are, for readers: ``{"u": "measured pixel, to the right"}``.
+    shown_by
+        ``shown_by(tables)``: whether the columns of raw tables can only be of this type, before names are understood.
+    registers, turning
+        Whether rows tell where the robot's base is, and how the tool is turned.
     metres
         ``metres(*T, **own)``: how long a unit of the residual is at the thing that was measured [m], for residuals that
         are no lengths: errors in millimetres are the residual times it. None for lengths and angles.
@@ -139,6 +140,13 @@ class Measurement(Brief):
     extra: Mapping[str, str] = field(default_factory=dict)
     touching: bool = False
     planar: bool = False
+    names: tuple[str, ...] = ()
+    variants: Mapping[str, Measurement] = field(default_factory=dict)
+    accepted: Mapping[str, str] = field(default_factory=dict)
+    words: Mapping[str, str] = field(default_factory=dict)
+    shown_by: Callable[[Sequence[Columns]], bool] | None = None
+    registers: bool = False
+    turning: bool = False
     metres: Callable[..., Any] | None = None
 
     def _short(self) -> str:
@@ -148,7 +156,8 @@ class Measurement(Brief):
     def by_camera(self) -> bool:
         """Whether a row is where a camera sees a point of a board.
 
-        >>> from rpim_opt.data.models import eye_in_hand, position
+        >>> from rpim_opt.data.measurements.camera import eye_in_hand
+        >>> from rpim_opt.data.measurements.position import position
         >>> eye_in_hand.by_camera, position.by_camera
         (True, False)
         """
@@ -167,12 +176,16 @@ class Measurement(Brief):
 
     def __reduce__(self) -> Any:
         """Ready measurements travel to other processes by name, so that they stay the same there."""
-        known = READY.get(self.name) is self
-        return (_ready, (self.name,)) if known else super().__reduce__()
+        known = _ready().get(self.name) is self
+        return (_ready_one, (self.name,)) if known else super().__reduce__()
 
 
-def _ready(name: str) -> Measurement:
-    return READY[name]
+def _ready() -> Mapping[str, Measurement]:
+    return import_module("rpim_opt.data.measurements.registry").READY
+
+
+def _ready_one(name: str) -> Measurement:
+    return _ready()[name]
 
 
 def of_fixture(parameter: str, fixture: str) -> str:
@@ -181,123 +194,14 @@ def of_fixture(parameter: str, fixture: str) -> str:
     return f"{table}_{fixture}_{rest}" if fixture else parameter
 
 
-_XYZ = {"x": "length", "y": "length", "z": "length"}
-_TURN = {"rx": "angle", "ry": "angle", "rz": "angle"}
-_MATRIX = {f"r{i}{j}": "" for i in (1, 2, 3) for j in (1, 2, 3)}
-_DISTANCE = {"distance": "length"}
-
-
-def _origin(T: Any) -> Any:
+def origin(T: Any) -> Any:
+    """Return the position (3, 1) of a transform (4, 4)."""
     return T[:3, 3]
 
 
-position = Measurement("position", _origin, _XYZ, noise={"position": "length"})
-"""A reflector's position in the instrument's frame: r = y - p."""
-
-pose = Measurement(
-    "pose",
-    model=lambda T: ca.vertcat(_origin(T), quaternion(T)),
-    columns=_XYZ | {"qw": "", "qx": "", "qy": "", "qz": ""},
-    components=_XYZ | _TURN,
-    noise={"position": "length", "orientation": "angle"},
-    minus=lambda y, m: ca.vertcat(y[:3] - m[:3], rotation_between(y[3:], m[3:])),
-    plus=turned,
-    forms=((_XYZ | _TURN, from_angles), (_XYZ | _MATRIX, from_matrices)),
-    prepare=unit_quaternions,
-)
-"""Position and orientation in the instrument's frame: r = (y - p, log(R_measured R')), about the instrument's axes."""
-
-cable = Measurement(
-    "cable",
-    model=lambda T, anchor_x, anchor_y, anchor_z, length_0: (
-        ca.norm_2(_origin(T) - ca.vertcat(anchor_x, anchor_y, anchor_z)) + length_0
-    ),
-    columns=_DISTANCE,
-    parameters={"anchor_x": "length", "anchor_y": "length", "anchor_z": "length", "length_0": "length"},
-    start=anchor_start,
-)
-"""Distance to a fixed anchor a (draw-wire, cable): r = y - |p - a| - l, with l the reading at zero distance."""
-
-distance = Measurement("distance", lambda T1, T2: ca.norm_2(_origin(T2) - _origin(T1)), _DISTANCE, points=2)
-"""Distance between two points, of two configurations or two reflectors (paper, Eq. 21; ballbar): r = y - |p2 - p1|."""
-
-plane = Measurement(
-    "plane",
-    model=lambda T, plane: ca.dot(plane[:3, 2], _origin(T) - plane[:3, 3]),
-    columns={},
-    components=_DISTANCE,
-    parameters={f"plane_{c}": d for c, d in FRAME_DIMENSION.items()},
-    frames=("plane",),
-    start=plane_start,
-)
-"""A point on a plane, given as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
-
-sphere = Measurement(
-    "sphere",
-    model=lambda T, sphere_x, sphere_y, sphere_z, sphere_r: (
-        ca.norm_2(_origin(T) - ca.vertcat(sphere_x, sphere_y, sphere_z)) - sphere_r
-    ),
-    columns={},
-    components=_DISTANCE,
-    parameters={"sphere_x": "length", "sphere_y": "length", "sphere_z": "length", "sphere_r": "length"},
-    start=sphere_start,
-)
-"""A point on a sphere of radius R about c: r = R - |p - c|."""
-
-revisit = Measurement(
-    "revisit",
-    model=_origin,
-    columns={},
-    components=_XYZ,
-    noise={"position": "length"},
-    touching=True,
-)
-"""A touch of a point that nobody measured: r_i = c - p_i, with c the mean of the positions of all touches of it."""
-
-revisit_plane = replace(revisit, name="revisit_plane", planar=True)
-"""A touch of a plane that nobody measured: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
-
-known_distance = Measurement("known_distance", lambda T1, T2: ca.norm_2(_origin(T2) - _origin(T1)), _DISTANCE, points=2)
-"""The distance that a drawing states between two touched points or parallel planes: r = y - |c2 - c1|."""
-
-known_square = Measurement(
-    "known_square", lambda T1, T2: 0 * T1[0, 0], {"angle": "angle"}, noise={"angle": "angle"}, points=2
-)
-"""Two touched planes are at right angles: r = -asin(n1'n2)."""
-
-known_parallel = Measurement(
-    "known_parallel",
-    model=lambda T1, T2: 0 * T1[:2, 0],
-    columns={"angle": "angle"},
-    components={"tilt_1": "angle", "tilt_2": "angle"},
-    noise={"angle": "angle"},
-    points=2,
-)
-"""Two touched planes are parallel: r = -(t1'n2, t2'n2), with two directions t in the first."""
-
-eye_in_hand = Measurement(
-    "eye_in_hand",
-    model=on_the_flange,
-    columns={"u": "pixel", "v": "pixel"},
-    noise={"pixel": "pixel"},
-    parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
-    | {f"board_{name}": d for name, d in STRETCH.items()},
-    sees=tuple(TARGET),
-    extra=TARGET,
-    metres=metres_on_the_flange,
-)
-"""A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
-in the board's frame, which is the instrument's."""
-
-eye_to_hand = replace(eye_in_hand, name="eye_to_hand", model=beside_the_robot, metres=metres_beside_the_robot)
-"""A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
-camera's frame, which is the instrument's."""
-
-CAMERAS = {m.name: m for m in (eye_in_hand, eye_to_hand)}
-"""Measurements by a camera."""
-MEASUREMENTS = {m.name: m for m in (position, pose, cable, distance, plane, sphere, revisit, *CAMERAS.values())}
-"""What a problem file may name."""
-KNOWN = (known_distance, known_square, known_parallel)
-"""What a drawing knows of things that were touched: no measurements, though they have equations."""
-READY = {**MEASUREMENTS, **{m.name: m for m in (revisit_plane, *KNOWN)}}
-"""All that come with the package."""
+def solve(A: Array, b: Array, what: str) -> Array:
+    """Return the least-squares solution of start values; refuse a degenerate system."""
+    x, _, rank, s = np.linalg.lstsq(A, b, rcond=None)
+    if rank < A.shape[1] or s[-1] < 1e-7 * s[0]:
+        raise InputError("data", f"{len(A)} points that do not determine {what}", "more, or better spread, points")
+    return np.asarray(x, dtype=float)

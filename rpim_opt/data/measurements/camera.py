@@ -1,4 +1,7 @@
-"""What a camera looks at: the points of a board, from a table or as a pattern, beside the rows that see them."""
+"""Cameras on the flange or beside the robot, and the boards that they look at.
+
+The pinhole has radial and tangential distortion; a board's points come from a table or are a pattern.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
@@ -14,15 +18,128 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split_unit
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.models import CAMERAS
-from rpim_opt.data.projection import TARGET
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import quantities_of, require_unique
+from rpim_opt.data.tables.units import split
 
+INTRINSICS = {
+    "fx": "pixel", "fy": "pixel", "cx": "pixel", "cy": "pixel",
+    "k1": "", "k2": "", "p1": "", "p2": "", "k3": "",
+}  # fmt: skip
+"""Focal lengths and centre, and distortion in the order of OpenCV."""
+STRETCH = {"stretch_x": "ratio", "stretch_y": "ratio"}
+"""By how much a printed board is larger than its file says, along its axes."""
+TARGET = {"target_x": "length", "target_y": "length", "target_z": "length"}
+"""Columns: where a row's point is on its board."""
 Board = Mapping[str, Sequence[float] | Array]
 """Where points are on their board, (3,) each [m], by name."""
 LEAST = 2
 MOST = 300
 """Points along either side of a pattern: beyond the larger number none has them, and they are listed one by one."""
+
+
+# --- what a camera sees --------------------------------------------------------------------------------------------
+
+
+def pixels(
+    X: Any, Y: Any, Z: Any,
+    fx: Any, fy: Any, cx: Any, cy: Any,
+    k1: Any = 0.0, k2: Any = 0.0, p1: Any = 0.0, p2: Any = 0.0, k3: Any = 0.0,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return u and v [px] of a point in the camera's frame, x right, y down, z forwards; symbols, numbers or arrays.
+
+    With x = X / Z, y = Y / Z and r^2 = x^2 + y^2 (Brown and Conrady)::
+
+        u = fx [x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)] + cx
+        v = fy [y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y] + cy
+
+    >>> from rpim_opt.data.measurements.camera import pixels
+    >>> pixels(0.1, 0.0, 1.0, fx=1000.0, fy=1000.0, cx=640.0, cy=480.0, k1=-0.1)
+    (739.9, 480.0)
+    """
+    x = X / Z
+    y = Y / Z
+    r2 = x**2 + y**2
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
+    v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+    return fx * u + cx, fy * v + cy
+
+
+def _own(**values: Any) -> tuple[dict[str, Any], ca.SX]:
+    """Return intrinsics by their short names, and the point (3, 1) on its board, stretched [m]."""
+    intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
+    x = values["target_x"] * (1 + values["board_stretch_x"])
+    y = values["target_y"] * (1 + values["board_stretch_y"])
+    return intrinsics, ca.vertcat(x, y, values["target_z"])
+
+
+def _seen(point: ca.SX, intrinsics: dict[str, Any]) -> ca.SX:
+    return ca.vertcat(*pixels(*ca.vertsplit(point), **intrinsics))
+
+
+def on_the_flange(T: Any, **values: Any) -> ca.SX:
+    """Return the pixels of a point of a board that stands in the cell, T (4, 4) the camera in the board's frame."""
+    intrinsics, point = _own(**values)
+    return _seen(T[:3, :3].T @ (point - T[:3, 3]), intrinsics)
+
+
+def beside_the_robot(T: Any, **values: Any) -> ca.SX:
+    """Return the pixels of a point of a board that the robot carries, T (4, 4) the board in the camera's frame."""
+    intrinsics, point = _own(**values)
+    return _seen(T[:3, :3] @ point + T[:3, 3], intrinsics)
+
+
+def metres_on_the_flange(T: Any, **values: Any) -> ca.SX:
+    """Return how far apart lines of sight through neighbouring pixels are at the point [m]: Z / f."""
+    intrinsics, point = _own(**values)
+    depth = ca.dot(T[:3, 2], point - T[:3, 3])
+    return depth / ca.sqrt(intrinsics["fx"] * intrinsics["fy"])
+
+
+def metres_beside_the_robot(T: Any, **values: Any) -> ca.SX:
+    """Return the same where the robot carries the board."""
+    intrinsics, point = _own(**values)
+    depth = (T[:3, :3] @ point + T[:3, 3])[2]
+    return depth / ca.sqrt(intrinsics["fx"] * intrinsics["fy"])
+
+
+def has_pixels(tables: Sequence[Columns]) -> bool:
+    """Return whether a table has columns u and v."""
+    return any({"u", "v"} <= {split(name)[0].strip().lower() for name in table} for table in tables)
+
+
+eye_in_hand = Measurement(
+    "eye_in_hand",
+    model=on_the_flange,
+    columns={"u": "pixel", "v": "pixel"},
+    noise={"pixel": "pixel"},
+    parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
+    | {f"board_{name}": d for name, d in STRETCH.items()},
+    sees=tuple(TARGET),
+    extra=TARGET,
+    names=("point",),
+    accepted=dict.fromkeys(
+        TARGET, 'the target\'s points: target = "board.csv", or columns target_x_mm, target_y_mm, target_z_mm'
+    ),
+    words={"u": "measured pixel, to the right", "v": "measured pixel, downwards"},
+    shown_by=has_pixels,
+    registers=True,
+    turning=True,
+    metres=metres_on_the_flange,
+)
+"""A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
+in the board's frame, which is the instrument's."""
+
+eye_to_hand = replace(eye_in_hand, name="eye_to_hand", model=beside_the_robot, metres=metres_beside_the_robot)
+"""A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
+camera's frame, which is the instrument's."""
+
+TYPES = (eye_in_hand, eye_to_hand)
+CAMERAS = {m.name: m for m in TYPES}
+
+
+# --- boards --------------------------------------------------------------------------------------------------------
 
 
 def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
@@ -158,7 +275,7 @@ def on_board(table: Columns, board: Board) -> Columns:
 
     Examples
     --------
-    >>> from rpim_opt.data.board import grid_board, on_board
+    >>> from rpim_opt.data.measurements.camera import grid_board, on_board
     >>> list(on_board({"point": ["3"]}, grid_board(2, 2, 0.01)).items())[1:]
     [('target_x_m', [0.01]), ('target_y_m', [0.01]), ('target_z_m', [0.0])]
     """
@@ -184,7 +301,7 @@ def board_of(data: Dataset) -> dict[str, Array]:
     """Return the points that the rows of cameras name, by name.
 
     >>> import rpim_opt as ro
-    >>> from rpim_opt.data.board import board_of
+    >>> from rpim_opt.data.measurements.camera import board_of
     >>> board_of(ro.load("paper_arm").problem.data)
     {}
     """

@@ -1,17 +1,74 @@
-"""What is known of points and planes that were touched: which rows touched one, and what a drawing says of two."""
+"""Touches of points and planes that nobody measured, and what a drawing states of two of them."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.tables import Columns
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.models import Measurement, known_distance, known_parallel, known_square, revisit, revisit_plane
+from rpim_opt.data.measurements.distance import distance
+from rpim_opt.data.measurements.measurement import XYZ, Measurement, origin
+
+COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
+"""In the name of a column that holds a measured coordinate."""
+TOUCHED = ("point", "plane")
+"""Names of columns that say what a row touched."""
+
+
+def names_touches(tables: Sequence[Columns]) -> bool:
+    """Return whether a table names what was touched twice (labels are unique), and none has a measured coordinate."""
+    named = [(name.strip().lower(), cells) for table in tables for name, cells in table.items()]
+    repeated = any(name in TOUCHED and len({str(cell) for cell in cells}) < len(cells) for name, cells in named)
+    return repeated and not any(COORDINATE.search(name) for name, _ in named)
+
+
+revisit_plane = Measurement(
+    "revisit_plane",
+    model=origin,
+    columns={},
+    components=XYZ,
+    noise={"position": "length"},
+    touching=True,
+    planar=True,
+    names=TOUCHED,
+)
+"""A touch of a plane that nobody measured: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
+
+revisit = replace(
+    revisit_plane, name="revisit", planar=False, variants={"plane": revisit_plane}, shown_by=names_touches
+)
+"""A touch of a point that nobody measured: r_i = c - p_i, with c the mean of the positions of all touches of it."""
+
+known_distance = replace(distance, name="known_distance")
+"""The distance that a drawing states between two touched points or parallel planes: r = y - |c2 - c1|."""
+
+known_square = Measurement(
+    "known_square", lambda T1, T2: 0 * T1[0, 0], {"angle": "angle"}, noise={"angle": "angle"}, points=2
+)
+"""Two touched planes are at right angles: r = -asin(n1'n2)."""
+
+known_parallel = Measurement(
+    "known_parallel",
+    model=lambda T1, T2: 0 * T1[:2, 0],
+    columns={"angle": "angle"},
+    components={"tilt_1": "angle", "tilt_2": "angle"},
+    noise={"angle": "angle"},
+    points=2,
+)
+"""Two touched planes are parallel: r = -(t1'n2, t2'n2), with two directions t in the first."""
+
+TYPES = (revisit,)
+KNOWN = (known_distance, known_square, known_parallel)
+"""What a drawing knows of things that were touched: no measurements, though they have equations."""
+UNNAMED = (revisit_plane, *KNOWN)
+"""Ready types that no problem file names as its measurement."""
 
 
 class Known(Protocol):
@@ -168,7 +225,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     label = (*data.label, *_labels(known))
     alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
     configuration = np.concatenate([data.configuration, alone])
-    return by_points(Dataset((*data.blocks, *blocks), label, configuration))
+    return Dataset((*data.blocks, *blocks), label, configuration).grouped_by_points()
 
 
 def _labels(known: Sequence[Known]) -> list[str]:
@@ -268,27 +325,4 @@ def touches(
     if len(point) != len(data):
         raise InputError("point", f"{len(point)} names", f"{len(data)}, one a touch")
     names = np.array([str(name) for name in point], dtype=object)[:, None]
-    return by_points(replace(data, blocks=(replace(data.blocks[0], point=names),)))
-
-
-def by_points(data: Dataset) -> Dataset:
-    """Return measurements in which rows that one unknown point ties together have one number of configuration.
-
-    Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
-    configuration: a fold of a cross-validation has all of them or none.
-    """
-    group: dict[Any, Any] = {}
-
-    def root(of: Any) -> Any:
-        while group.setdefault(of, of) != of:
-            of = group[of]
-        return of
-
-    for block in data.blocks:
-        if block.touched is not None:
-            for row, names in zip(block.row, block.touched, strict=True):
-                for name in names:
-                    group[root(("point", name))] = root(("rows", data.configuration[row]))
-    joined = [root(("rows", number)) for number in data.configuration]
-    number = {each: i for i, each in enumerate(dict.fromkeys(joined))}
-    return replace(data, configuration=np.array([number[each] for each in joined], dtype=int))
+    return replace(data, blocks=(replace(data.blocks[0], point=names),)).grouped_by_points()

@@ -1,4 +1,4 @@
-"""Orientations as tables state them, as a residual compares them, and as noise turns them."""
+"""Position and orientation of a reflector: as tables state them, as a residual compares them, as noise turns them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RowError
 from rpim_opt.basics.late import transform
+from rpim_opt.data.measurements.measurement import XYZ, Measurement, origin
 
 
 def quaternion(T: Any) -> Any:
@@ -91,3 +92,24 @@ def from_matrices(y: Array) -> Array:
         found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
     return np.hstack([y[:, :3], _w_first(transform.Rotation.from_matrix(R))])
+
+
+_TURN = {"rx": "angle", "ry": "angle", "rz": "angle"}
+_MATRIX = {f"r{i}{j}": "" for i in (1, 2, 3) for j in (1, 2, 3)}
+
+pose = Measurement(
+    "pose",
+    model=lambda T: ca.vertcat(origin(T), quaternion(T)),
+    columns=XYZ | {"qw": "", "qx": "", "qy": "", "qz": ""},
+    components=XYZ | _TURN,
+    noise={"position": "length", "orientation": "angle"},
+    minus=lambda y, m: ca.vertcat(y[:3] - m[:3], rotation_between(y[3:], m[3:])),
+    plus=turned,
+    forms=((XYZ | _TURN, from_angles), (XYZ | _MATRIX, from_matrices)),
+    prepare=unit_quaternions,
+    registers=True,
+    turning=True,
+)
+"""Position and orientation in the instrument's frame: r = (y - p, log(R_measured R')), about the instrument's axes."""
+
+TYPES = (pose,)

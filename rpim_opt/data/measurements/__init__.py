@@ -1,0 +1,1 @@
+"""Types of measurements: one module a type, with everything about it, found by `registry`."""
