@@ -394,7 +394,7 @@ def monitor(
     Exit code 1 if the robot drifts.
     """
     with _loaded(result) as (loaded, _):
-        from rpim_opt.report.checks_page import written_checks
+        from rpim_opt.report.page import written_checks
         from rpim_opt.use.monitoring import monitor, read_checks
 
         read = read_checks(loaded, checks, measurement, units)

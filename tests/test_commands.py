@@ -334,7 +334,7 @@ def test_a_title_without_a_source_has_no_empty_line_below(monkeypatch, capsys, m
         assert run(monkeypatch, command, str(made)) == 0
         title, empty, first, *_ = capsys.readouterr().out.splitlines()
         assert (title, empty) == ("arm", "")
-        assert first.split()[:2] in (["joint", "unit"], ["parameter", "unit"])
+        assert first.split()[:2] in (["joint", "unit"], ["On", "8"])
 
 
 def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:

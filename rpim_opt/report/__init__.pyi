@@ -1,3 +1,3 @@
 from . import plot as plot
-from .checks_page import write_checks as write_checks
+from .page import write_checks as write_checks
 from .report import write_report as write_report

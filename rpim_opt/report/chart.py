@@ -1,36 +1,39 @@
-"""A chart as a description: two axes, and what stands between them. `svg` draws it on a page, `on_axes` on paper."""
+"""Charts: one description of axes and marks, and its renderer as SVG for pages (`plot` draws it with matplotlib)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from rpim_opt.basics.arrays import Array
 
-ROOM = 0.04
+# --- the description ---------------------------------------------------------------------------------------
+
+MARGIN = 0.04
 """Between an axis's ends and its first and last values, as a part of its length."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """From values to places: linear, logarithmic, logarithmic to both sides of zero, or a place for each name.
+    """Map from values to lengths: linear, logarithmic, symmetrically logarithmic, or a place for each name.
 
     Parameters
     ----------
     label
-        What is drawn, with its unit; empty where names speak for themselves.
+        The quantity with its unit; empty for names.
     ends
-        The least and the largest value that have to be seen; what lies beyond stands at the edge.
+        Least and largest value to be shown; what lies beyond is drawn at the edge.
     log
-        Whether equal factors are equally far apart.
+        Whether the axis is logarithmic.
     linear_to
-        Up to this size values of both signs are linear, beyond it logarithmic; zero: no such axis.
+        Of a symmetrically logarithmic axis, the size up to which it is linear; zero for other axes.
     names
-        They stand at 1, 2, ...
+        Names at 1, 2, ...; on the y axis from top to bottom.
     """
 
     label: str
@@ -40,40 +43,34 @@ class Axis:
     names: Sequence[str] = ()
 
     def scaled(self, values: ArrayLike) -> Array:
-        """Return values as lengths on paper."""
+        """Return values as lengths along the axis."""
         v = np.asarray(values, dtype=float)
         if self.log:
             return np.log10(np.maximum(v, np.finfo(float).tiny))
         if not self.linear_to:
             return v
-        # as matplotlib's: the linear part is as long as a decade
+        # as matplotlib's symlog: the linear part is as long as a decade
         size = np.maximum(np.abs(v) / self.linear_to, 1e-300)
         return np.where(size <= 1, v / self.linear_to, np.sign(v) * (1 + 0.9 * np.log10(size)))
 
     @property
     def limits(self) -> tuple[float, float]:
-        """The values at the axis's ends, with room for what is drawn at the outermost ones."""
+        """Values at the axis's two ends, with a margin."""
         if self.names:
             return 0.5, len(self.names) + 0.5
         low, high = map(float, self.ends)
         if self.log:
-            room = (high / low) ** ROOM if high > low else 2.0
-            return low / room, high * room
+            factor = (high / low) ** MARGIN if high > low else 2.0
+            return low / factor, high * factor
         if self.linear_to:
-            return self._beyond(low, -1), self._beyond(high, 1)
-        room = ROOM * (high - low) or 0.5
-        if low == 0:  # counts stand on zero
-            return 0.0, high + room
-        return low - room, high + room
-
-    def _beyond(self, end: float, sign: int) -> float:
-        outwards = max(sign * end, self.linear_to)
-        return sign * 1.5 * outwards
+            return -1.5 * max(-low, self.linear_to), 1.5 * max(high, self.linear_to)
+        margin = MARGIN * (high - low) or 0.5
+        return (0.0 if low == 0 else low - margin), high + margin  # counts stand on zero
 
 
 Role = str
-"""What something drawn stands for, which decides its colour: ``before``, ``after``, ``mark``, ``other``, ``ink``,
-``zero``, ``level0`` to ``level4``, these with `` over`` where they are above a limit."""
+"""Meaning of a mark, which decides its colour: ``before``, ``after``, ``mark``, ``other``, ``ink``, ``zero``,
+``level0`` to ``level4``, these with `` over`` where they are above a limit."""
 
 Values = NDArray[np.floating[Any]] | Sequence[float]
 
@@ -91,7 +88,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight pieces from ``(x[i, 0], y[i, 0])`` to ``(x[i, 1], y[i, 1])``, both (k, 2)."""
+    """Straight lines from ``(x[i, 0], y[i, 0])`` to ``(x[i, 1], y[i, 1])``, both (k, 2)."""
 
     x: NDArray[np.floating[Any]]
     y: NDArray[np.floating[Any]]
@@ -101,10 +98,7 @@ class Segments:
 
 @dataclass(frozen=True)
 class Dots:
-    """Points (k,), each with a text that a page shows when it is pointed at.
-
-    ``each`` says that every point is one of its own, which a legend on paper names. Hollow ones are drawn as outlines.
-    """
+    """Points (k,), each with a tooltip on a page; with ``each`` the tooltips are matplotlib's legend."""
 
     x: Values
     y: Values
@@ -144,23 +138,7 @@ Mark = Line | Segments | Dots | Bars | Cells
 
 @dataclass(frozen=True)
 class Chart:
-    """Two axes, and what is drawn on them from the lowest to the topmost.
-
-    Parameters
-    ----------
-    title
-        What it shows, in a few words.
-    x, y
-        The axes; names of y go from above to below.
-    marks
-        What is drawn.
-    note
-        What has to be said of what is drawn, a sentence; empty: nothing.
-    height
-        On a page that is 420 wide.
-    alike
-        Whether a length is as long on either axis.
-    """
+    """Two axes and marks, drawn in their order; ``height`` is of a page 420 wide, ``alike`` asks for equal scales."""
 
     title: str
     x: Axis
@@ -172,5 +150,178 @@ class Chart:
 
     @property
     def legend(self) -> list[tuple[Role, str]]:
-        """What colours stand for, each once."""
+        """Roles and labels, each pair once."""
         return list(dict.fromkeys((mark.role, mark.label) for mark in self.marks if mark.label))
+
+
+# --- SVG ---------------------------------------------------------------------------------------------------
+
+WIDTH = 420
+TOP = 12
+RIGHT = 14
+TALLEST = 400.0
+"""Height of a chart with equal scales [px]."""
+LETTER = 7
+"""Mean width of a letter [px]."""
+MANY_NAMES = 30
+LONG_NAME = 12
+"""Names along x are omitted where there are more, or longer ones."""
+RADIUS = {"small": 2.5, "middle": 3.5, "large": 6.0}
+
+
+def tag(name: str, /, *children: str, **attributes: object) -> Markup:
+    """Return an element; texts and attributes are escaped, ``class_`` stands for ``class``, ``a_b`` for ``a-b``.
+
+    >>> from rpim_opt.report.chart import tag
+    >>> print(tag("text", "a < b", text_anchor="end", class_="tick"))
+    <text text-anchor="end" class="tick">a &lt; b</text>
+    """
+    named = [Markup(' {}="{}"').format(k.strip("_").replace("_", "-"), v) for k, v in attributes.items()]
+    return Markup("<{0}{1}>{2}</{0}>").format(name, Markup("").join(named), Markup("").join(children))
+
+
+class Scale:
+    """An axis on paper: pixels of its values, and its ticks."""
+
+    def __init__(self, axis: Axis):
+        self.axis = axis
+        self.low, self.high = axis.scaled(axis.limits)
+        self.start = 0.0
+        self.end = 1.0
+
+    def __call__(self, values: ArrayLike) -> Array:
+        """Return pixels; values beyond the ends are drawn at the ends."""
+        inside = np.clip(self.axis.scaled(values), self.low, self.high)
+        return np.round(self.start + (inside - self.low) * (self.end - self.start) / (self.high - self.low), 2)
+
+    def ticks(self, named: bool = True) -> list[tuple[float, str]]:
+        """Return values and texts of the ticks: names, decades, or steps of 1, 2 or 5."""
+        axis = self.axis
+        if named and axis.names:
+            return [(float(k), name) for k, name in enumerate(axis.names, start=1)]
+        if axis.log:
+            return self._powers()
+        if axis.linear_to:  # zero, and to either side the end of the linear part and at most four decades
+            low, high = axis.limits
+            decades = int(np.floor(np.log10(max(-low, high) / axis.linear_to)))
+            sizes = axis.linear_to * 10.0 ** np.arange(0, decades + 1, 1 + decades // 4)
+            return [(float(v), f"{v:g}") for v in [*-sizes[::-1], 0.0, *sizes] if low <= v <= high]
+        span = self.high - self.low
+        power = 10.0 ** np.floor(np.log10(span / 5))
+        step = next(m * power for m in (1, 2, 5, 10) if span / (m * power) <= 6)
+        steps = np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1)
+        return [(float(v), f"{v:.6g}") for v in steps * step + 0.0]
+
+    def _powers(self) -> list[tuple[float, str]]:
+        """Return decades, or 1, 2 and 5 times each where there are fewer than three."""
+        low = int(np.ceil(self.low))
+        high = int(np.floor(self.high))
+        span = self.high - self.low
+        if span >= 1.5 and high - low >= 2:
+            return [
+                (10.0**k, f"{10.0**k:g}" if -3 <= k <= 4 else f"1e{k}")
+                for k in range(low, high + 1, int(np.ceil(span / 6)))
+            ]
+        steps = [m * 10.0**k for k in range(low - 1, high + 1) for m in (1, 2, 5)]
+        return [(v, f"{v:g}") for v in steps if self.low <= np.log10(v) <= self.high]
+
+
+class Picture:
+    """A chart as SVG, 420 wide and coloured by the page's style sheet through the classes of its roles."""
+
+    def __init__(self, chart: Chart):
+        self.chart = chart
+        self.x = Scale(chart.x)
+        self.y = Scale(chart.y)
+        names = chart.x.names
+        longest = max(map(len, names), default=0)
+        self.named = len(names) <= MANY_NAMES and longest <= LONG_NAME
+        self.upright = self.named and sum(len(name) + 1 for name in names) * LETTER > WIDTH - 80
+        below = 4 + 8 * longest if self.upright else 16
+        below += 24 if chart.x.label else 8
+        self.x.start = 30.0 + LETTER * max((len(text) for _, text in self.y.ticks()), default=1)
+        self.x.end = float(WIDTH - RIGHT)
+        self.floor = float(TOP + (self._equal() if chart.alike else chart.height - below - TOP))
+        self.y.start = self.floor
+        self.y.end = float(TOP)
+        if chart.y.names:
+            self.y.start, self.y.end = self.y.end, self.y.start
+        self.height = int(np.ceil(self.floor + below))
+
+    def _equal(self) -> float:
+        """Return the height of a y axis of the same scale; x becomes longer where that is too tall."""
+        tall = (self.x.end - self.x.start) / (self.x.high - self.x.low) * (self.y.high - self.y.low)
+        if tall <= TALLEST:
+            return tall
+        middle = (self.x.low + self.x.high) / 2
+        half = (self.x.high - self.x.low) / 2 * tall / TALLEST
+        self.x.low = middle - half
+        self.x.high = middle + half
+        return TALLEST
+
+    def svg(self, *above: Markup) -> Markup:
+        """Return the picture, with other elements drawn above the chart's own."""
+        drawn = [item for mark in self.chart.marks for item in self._mark(mark)]
+        return tag(
+            "svg", *self._grid(), *drawn, *above, *self._labels(),
+            viewBox=f"0 0 {WIDTH} {self.height}", role="img", aria_label=self.chart.title,
+        )  # fmt: skip
+
+    def _grid(self) -> Iterator[Markup]:
+        for value, text in self.x.ticks(self.named):
+            at = f"{float(self.x(value)):g}"
+            if not self.chart.x.names:
+                yield tag("line", x1=at, x2=at, y1=TOP, y2=f"{self.floor:g}", class_="grid")
+            below = f"{self.floor + 10:g}"
+            placed = {"text_anchor": "middle", "dy": "6"}
+            if self.upright:
+                placed = {"transform": f"rotate(-90 {at} {below})", "text_anchor": "end", "dy": "4"}
+            yield tag("text", text, x=at, y=below, class_="tick", **placed)
+        for value, text in self.y.ticks():
+            at = f"{float(self.y(value)):g}"
+            yield tag("line", x1=f"{self.x.start:g}", x2=f"{self.x.end:g}", y1=at, y2=at, class_="grid")
+            yield tag("text", text, x=f"{self.x.start - 6:g}", y=at, dy="4", text_anchor="end", class_="tick")
+
+    def _labels(self) -> Iterator[Markup]:
+        middle = f"{(self.x.start + self.x.end) / 2:g}"
+        yield tag("text", self.chart.x.label, x=middle, y=self.height - 6, text_anchor="middle", class_="name")
+        aside = f"{(TOP + self.floor) / 2:g}"
+        turned = f"rotate(-90 12 {aside})"
+        yield tag("text", self.chart.y.label, x=12, y=aside, text_anchor="middle", transform=turned, class_="name")
+
+    def _mark(self, mark: Mark) -> Iterator[Markup]:
+        match mark:
+            case Line():
+                yield self._path([(mark.x, mark.y)], mark.role + " dashed" * mark.dashed)
+            case Segments():
+                yield self._path(zip(mark.x, mark.y, strict=True), mark.role)
+            case Dots(hints=hints) if not len(hints):
+                places = zip(self.x(mark.x), self.y(mark.y), strict=True)
+                yield tag("path", d="".join(f"M{a:g} {b:g}h0" for a, b in places), class_=f"cloud {mark.role}")
+            case Dots():
+                class_ = f"dot {mark.role}" + " hollow" * mark.hollow
+                for a, b, hint in zip(self.x(mark.x), self.y(mark.y), mark.hints, strict=True):
+                    at = {"cx": f"{a:g}", "cy": f"{b:g}"}
+                    yield tag("circle", tag("title", hint), **at, r=RADIUS[mark.size], class_=class_)
+            case Bars():
+                left, right, top = self.x(mark.left), self.x(mark.right), self.y(mark.top)
+                yield from _boxes(f"bar {mark.role}", mark.hints, left, top, right - left, self.floor - top)
+            case Cells():
+                lower = np.asarray(mark.corners)
+                upper = lower + np.asarray(mark.size)
+                left, right = self.x(lower[:, 0]), self.x(upper[:, 0])
+                bottom, top = self.y(lower[:, 1]), self.y(upper[:, 1])
+                yield from _boxes(f"cell {mark.role}", mark.hints, left, top, right - left, bottom - top)
+
+    def _path(self, lines, class_: str) -> Markup:
+        drawn = []
+        for x, y in lines:
+            drawn.append("M" + "L".join(f"{a:g},{b:g}" for a, b in zip(self.x(x), self.y(y), strict=True)))
+        return tag("path", d="".join(drawn), class_=f"line {class_}")
+
+
+def _boxes(class_: str, hints: Sequence[str], left: Array, top: Array, width: Array, height: Array) -> Iterator[Markup]:
+    sizes = zip(left, top, np.maximum(width, 0.5), np.maximum(height, 0), hints, strict=True)
+    for x, y, wide, high, hint in sizes:
+        size = {"x": f"{x:g}", "y": f"{y:g}", "width": f"{wide:g}", "height": f"{high:g}"}
+        yield tag("rect", tag("title", hint), class_=class_, **size)

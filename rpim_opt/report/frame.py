@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rpim_opt.report.markup import Element, html, table, tag
 
-STYLE = Path(__file__).resolve().parent / "page.css"
+STYLE = Path(__file__).resolve().parent / "templates" / "page.css"
 
 
 def page(

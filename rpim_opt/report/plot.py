@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,17 +13,8 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.select import compare
 from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.report.charts_result import (
-    MANY,
-    axes_chart,
-    deviations_chart,
-    histogram_chart,
-    lengths_of,
-    rows_chart,
-)  # fmt: skip
-from rpim_opt.report.charts_weight import choices_chart, l_curve_chart, picard_chart, score_chart
-from rpim_opt.report.on_axes import COLORS, Axes, axes_of, on_axes
-from rpim_opt.report.scales import magnification
+from rpim_opt.report import charts
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments
 
 __all__ = [
     "error_axes",
@@ -36,9 +28,11 @@ __all__ = [
     "selectors",
 ]
 
+Axes = Any  # matplotlib's, which is imported by whoever makes the axes
+
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw every row's error [mm] before and after, distrusted rows of the identification data marked.
+    """Draw every row's error [mm] before and after calibration; flagged rows of the identification data are marked.
 
     Parameters
     ----------
@@ -58,58 +52,35 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     >>> ax.get_ylabel(), len(ax.get_xticks())
     ('error [mm]', 16)
     """
-    return on_axes(rows_chart(result, data or result.problem.data), ax)
+    return draw(charts.rows_chart(result, data or result.problem.data), ax)
 
 
 def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw how many rows have which error [mm] before and after, over the error's logarithm.
+    """Draw a histogram of the errors [mm] before and after calibration. Arguments as for `errors`.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    data
-        The rows; the identification data by default.
-    ax
-        Matplotlib's axes; new ones by default.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.error_histogram(result)
     >>> ax.get_xlabel(), ax.get_xscale()
     ('error [mm]', 'log')
     """
-    lengths, _ = lengths_of(result, data or result.problem.data)
-    return on_axes(histogram_chart(lengths), ax)
+    return draw(charts.histogram_chart(charts.lengths_of(result, data or result.problem.data)[0]), ax)
 
 
 def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw mean (dot) and spread (95 % of the rows) of the errors [mm] along x, y, z, before and after.
+    """Draw mean (dot) and central 95 % (line) of the errors [mm] along x, y and z. Arguments as for `errors`.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    data
-        The rows; the identification data by default.
-    ax
-        Matplotlib's axes; new ones by default.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.error_axes(result)
     >>> [label.get_text() for label in ax.get_xticklabels()]
     ['x', 'y', 'z']
     """
-    return on_axes(axes_chart(result, data or result.problem.data), ax)
+    return draw(charts.axes_chart(result, data or result.problem.data), ax)
 
 
 def error_vectors(result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None) -> Axes:
-    """Draw measured positions [m] in space with their errors, enlarged as the title says.
+    """Draw measured positions [m] with their error vectors, enlarged as the title says.
 
     Parameters
     ----------
@@ -127,21 +98,20 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ro.plot.error_vectors(result, nominal=True).get_title()
-    'errors before, enlarged 100 times'
+    'nominal errors, enlarged 100 times'
     """
-    ax = axes_of(ax, projection="3d")
+    ax = _axes(ax, projection="3d")
     points = result.measured_positions(data)
     vectors = result.error_vectors(data, nominal=nominal)
-    points, vectors = (a[np.isfinite(vectors).all(axis=1)] for a in (points, vectors))
-    times = magnification(points, vectors)
-    ax.scatter(*points.T, s=6, color="0.3")
+    finite = np.isfinite(vectors).all(axis=1)
+    points, vectors = points[finite], vectors[finite]
+    times = charts.magnification(points, vectors)
     when = "before" if nominal else "after"
-    width = 1.5
-    if len(points) > MANY:
-        width = 0.5
+    width = 0.5 if len(points) > charts.MANY_ROWS else 1.5
+    ax.scatter(*points.T, s=6, color="0.3")
     ax.quiver(*points.T, *(times * vectors).T, color=COLORS[when], lw=width, arrow_length_ratio=0.2)
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
-    ax.set_title(f"errors {when}, enlarged {times:,.0f} times", fontsize=9)
+    ax.set_title(f"{charts.MODELS[when]} errors, enlarged {times:,.0f} times", fontsize=9)
     return ax
 
 
@@ -155,7 +125,7 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     dimension
         ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm].
     confidence
-        Of the intervals, which only a squared penalty, or none, has.
+        Level of the intervals, which exist for a squared penalty, or none.
     ax
         Matplotlib's axes; new ones by default.
 
@@ -170,18 +140,18 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     half = np.full(len(result.x), np.nan)
     if result.linear_penalty:
         half = np.diff(Uncertainty(result, confidence).intervals())[:, 0] / 2
-    return on_axes(deviations_chart(result, dimension, half, confidence), ax)
+    return draw(charts.deviations_chart(result, dimension, half, confidence), ax)
 
 
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the L-curve: the root of the penalty against that of the loss, over the weights, with selectors' choices.
+    """Draw the L-curve: root of the penalty against root of the loss over the weight, with the selectors' choices.
 
     The program is solved at 200 weights where it has a closed form, else at 40.
 
     Parameters
     ----------
     of
-        A program, or a result, whose own weight is marked; its penalty has to be something: InputError otherwise.
+        A program, or a result, whose own weight is marked; InputError without a penalty.
     selections
         Choices to mark, by name.
     ax
@@ -195,24 +165,22 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     >>> print(ax.get_legend().get_texts()[0].get_text())
     chosen: reml, weight 1.5
     >>> ax.get_xlabel()
-    'root of the loss (residual norm) [sigmas]'
+    'residual norm [standard deviations of the noise]'
     >>> ax.figure.savefig("l_curve.pdf")
     """
-    program, marked = _program_and_marks(of, selections)
+    program, marked = _program_and_weights(of, selections)
     path = program.path(weight_grid(program, 200 if program.closed_form else 40))
     residual, solution = np.sqrt([[e.loss, e.penalty] for e in path]).T
     chosen: dict[str, tuple[float, float]] = {}
     for name, weight in marked.items():
         (at,) = program.path([weight])
         chosen[f"{name}, weight {weight:.2g}"] = (float(np.sqrt(at.loss)), float(np.sqrt(at.penalty)))
-    own = ""
-    if isinstance(of, Calibration):
-        own = next(iter(chosen))
-    return on_axes(l_curve_chart(residual, solution, chosen, own), ax)
+    own = next(iter(chosen)) if isinstance(of, Calibration) else ""
+    return draw(charts.l_curve_chart(residual, solution, chosen, own), ax)
 
 
-def _program_and_marks(
-    of: Program | Calibration, selections: Mapping[str, Selection] | None
+def _program_and_weights(
+    of: Program | Calibration, selections: Mapping[str, Selection] | None = None
 ) -> tuple[Program, dict[str, float]]:
     """Return the program, and the weights to mark by name: of a result its own first."""
     marked = {name: choice.weight for name, choice in (selections or {}).items()}
@@ -224,12 +192,12 @@ def _program_and_marks(
 
 
 def selection(selection: Selection, ax: Axes = None) -> Axes:
-    """Draw what a selector compared over the weights, and its choice, dashed where it is at an edge.
+    """Draw a selector's score over the weights, and its choice, dashed where it is at an edge.
 
     Parameters
     ----------
     selection
-        The choice with its evidence.
+        The choice with its scores.
     ax
         Matplotlib's axes; new ones by default.
 
@@ -240,43 +208,31 @@ def selection(selection: Selection, ax: Axes = None) -> Axes:
     >>> ro.plot.selection(result.selection).get_ylabel()
     'score of reml'
     """
-    return on_axes(score_chart(selection), ax)
+    return draw(charts.score_chart(selection), ax)
 
 
 def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the weights that selectors choose; hollow: at an edge.
+    """Draw the weights that selectors choose (`compare` by default); hollow: at an edge. Arguments as for `l_curve`.
 
-    Parameters
-    ----------
-    of
-        The formulation on a linear model, or a result.
-    selections
-        Choices by name; by default those of all selectors that serve the program (`compare`).
-    ax
-        Matplotlib's axes; new ones by default.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.selectors(result)
     >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
     ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
     """
-    program, _ = _program_and_marks(of, None)
-    return on_axes(choices_chart(compare(program) if selections is None else selections), ax)
+    return draw(charts.choices_chart(compare(_program_and_weights(of)[0]) if selections is None else selections), ax)
 
 
 def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:
-    """Draw Picard's condition: singular values, what the data say along them, and the solution's coefficients.
+    """Draw Picard's condition: singular values, coefficients of the data, and coefficients of the solution.
 
     Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
-    noise; the weight takes out the directions with s below its root (Hansen 1990, BIT 30:658).
+    noise; the weight damps the directions with s below its root (Hansen 1990, BIT 30:658).
 
     Parameters
     ----------
     of
-        The formulation on a linear model, or a result.
+        A program, or a result.
     weight
         Whose root is drawn, if it is not zero; of a result its own by default.
     ax
@@ -290,5 +246,111 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
     ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'root of the weight']
     """
-    program, marked = _program_and_marks(of, None)
-    return on_axes(picard_chart(program, weight or next(iter(marked.values()), 0.0)), ax)
+    program, marked = _program_and_weights(of)
+    return draw(charts.picard_chart(program, weight or next(iter(marked.values()), 0.0)), ax)
+
+
+# --- the renderer ------------------------------------------------------------------------------------------
+
+COLORS = {
+    "before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e", "zero": "#a3adb8",
+}  # fmt: skip
+SHADES = (0.12, 0.32, 0.52, 0.74, 1.0)
+SIZES = {"small": 3.5, "middle": 5.0, "large": 9.0}
+SHAPES = "osD^v<>"
+FONT_X, FONT_Y, FONT_LEAST = 7.0, 10.0, 4.0
+"""Largest sizes of names along x and y [points], and the smallest that can be read."""
+LINE_HEIGHT = 1.25
+"""Distance of names over their size."""
+
+
+def draw(chart: Chart, ax: Axes = None) -> Axes:
+    """Draw a chart on axes, by default on new ones that are as high as its names need, and return them."""
+    ax = _axes(ax, len(chart.y.names))
+    _set_axis(ax, "x", chart.x)
+    _set_axis(ax, "y", chart.y)
+    for mark in chart.marks:
+        _draw(ax, mark)
+    if chart.alike:
+        ax.set_aspect("equal")
+    if chart.note:
+        ax.set_xlabel(f"{ax.get_xlabel()}\n{chart.note}".strip())
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8)
+    return ax
+
+
+def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
+    """Return the given axes, or new ones, as high as a number of named rows needs."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    figure, ax = pyplot.subplots(layout="constrained", subplot_kw=kwargs)
+    figure.set_figheight(max(figure.get_figheight(), 0.2 * rows + 1.2))
+    return ax
+
+
+def color_of(role: Role) -> Any:
+    """Return the colour of a role."""
+    level = role.removesuffix(" over")
+    if not level.startswith("level"):
+        return COLORS[role]
+    from matplotlib.colors import to_rgb
+
+    full = np.array(to_rgb(COLORS["mark" if level != role else "after"]))
+    return tuple(1 - SHADES[int(level[-1])] * (1 - full))
+
+
+def _set_axis(ax: Axes, which: str, axis: Axis) -> None:
+    if axis.log:
+        ax.set(**{f"{which}scale": "log"})
+    if axis.linear_to:
+        getattr(ax, f"set_{which}scale")("symlog", linthresh=axis.linear_to)
+    if axis.log or axis.linear_to:
+        getattr(ax, f"{which}axis").set_major_formatter("{x:g}")  # 0.1 in the place of powers of ten
+    limits = axis.limits
+    if axis.names:
+        _set_names(ax, which, axis.names)
+        limits = limits[::-1] if which == "y" else limits
+    ax.set(**{f"{which}lim": limits, f"{which}label": axis.label})
+
+
+def _set_names(ax: Axes, which: str, names: Sequence[str]) -> None:
+    """Write names at 1, 2, ... unless they were too small to be read."""
+    box = ax.get_window_extent()
+    length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
+    size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * len(names))
+    if size < FONT_LEAST:
+        return
+    turned = 90 if which == "x" and len(names) > 3 else 0
+    ticks = range(1, len(names) + 1)
+    getattr(ax, f"set_{which}ticks")(ticks, names, fontsize=max(min(size, largest), FONT_LEAST), rotation=turned)
+
+
+def _draw(ax: Axes, mark: Mark) -> None:
+    color = color_of(mark.role)
+    match mark:
+        case Line():
+            ax.plot(mark.x, mark.y, color=color, lw=1.5, ls="--" if mark.dashed else "-", label=mark.label)
+        case Segments():
+            gaps = np.full((len(mark.x), 1), np.nan)
+            x = np.hstack([mark.x, gaps]).ravel()
+            ax.plot(x, np.hstack([mark.y, gaps]).ravel(), color=color, lw=1.2, label=mark.label)
+        case Dots(each=True):
+            for k, (x, y, hint) in enumerate(zip(mark.x, mark.y, mark.hints, strict=True)):
+                style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8}
+                ax.plot([x], [y], ls="none", color=f"C{k}", label=hint, **style)
+        case Dots():
+            fill = "none" if mark.hollow else color
+            size = SIZES[mark.size] if len(mark.hints) else 2.0
+            ax.plot(mark.x, mark.y, "o", color=color, mfc=fill, ms=size, label=mark.label)
+        case Bars():
+            width = np.subtract(mark.right, mark.left)
+            ax.bar(mark.left, mark.top, width, align="edge", color=color, alpha=0.85, label=mark.label)
+        case Cells():
+            from matplotlib.collections import PatchCollection
+            from matplotlib.patches import Rectangle
+
+            cells = [Rectangle(tuple(corner), *mark.size) for corner in mark.corners]
+            ax.add_collection(PatchCollection(cells, facecolor=color, edgecolor="none"))

@@ -1,85 +1,154 @@
-"""The figures that a metrologist reads after a calibration, as a document and as tables."""
+"""A calibration in figures and sentences, once for the terminal, for JSON and for the report."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.statistics import statistics
-from rpim_opt.basics.text import table
+from rpim_opt.basics.text import joined, percent, table
 from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.causes import likely_causes
-from rpim_opt.calibration.contact_words import contact_remarks
+from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
-from rpim_opt.store.result_file import figures, sets
+from rpim_opt.data.record import Requirement
+from rpim_opt.report.charts import mm
+from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
 
 if TYPE_CHECKING:
     from rpim_opt.calibration.acceptance import Acceptance
+    from rpim_opt.calibration.region import Region
 
 KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
+ERROR_HEADER = ("error [mm]", "rows", "mean", "RMS", "95 % below", "max")
+ANGLE_HEADER = ("orientation error [mrad]", "rows", "mean", "RMS", "max")
+ANYWHERE = Requirement(limit=1.0)
+"""The region of a result without requirement: joints within the measured ranges."""
 
 
-def describe_times(seconds: Mapping[str, float]) -> str:
-    """Return the seconds of a calibration's phases as a table [ms]."""
-    whole = sum(seconds.values())
-    rows = [[phase, f"{1e3 * each:.2f}", f"{each / whole:.0%}"] for phase, each in seconds.items()]
-    return table(["phase", "ms", "share"], [*rows, ["all", f"{1e3 * whole:.2f}", "100%"]])
+def sets(result: Calibration) -> dict[str, Dataset]:
+    """Return the data by name: validation first, as far as there are such data."""
+    data = {"identification": result.problem.data}
+    if result.record.validation is None:
+        return data
+    return {"validation": result.record.validation, **data}
 
 
-def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
-    """Return parameters, errors, the weight and where it came from.
+# --- figures -----------------------------------------------------------------------------------------------
 
-    Parameters
-    ----------
-    result
-        The calibration, with title, source and validation data in its record.
-    published
-        Mean errors [mm] that the source prints, by role and method.
-    """
-    record = result.record
-    errors: list[dict[str, Any]] = []
-    angles: list[dict[str, Any]] = []
-    for name, data in sets(result.problem.data, record).items():
-        errors += _errors(result, name, data)
-        errors += [
-            {"what": f"  printed: {method}", "mean_mm": mean, "printed": True}
-            for method, mean in published.get(name, {}).items()
-        ]
-        turn = result.errors(data, "angle")
-        if np.isfinite(turn).any():
-            angles.append({"what": name, **statistics(turn, "mrad")})
-        stated = result.errors(data, "stated angle")
-        if np.isfinite(stated).any():
-            angles.append({"what": f"{name}, known angle", **statistics(stated, "mrad")})
-    errors += _held_out(result)
-    whole = figures(result)
-    lacking = judged(result)
-    accepted = acceptance(result)
-    causes = likely_causes(result)
-    return {
-        "title": record.title,
-        "source": record.source,
-        **{key: whole[key] for key in KEYS},
-        "errors": errors,
-        "orientation": angles,
-        "prices": [price._asdict() for price in result.prices],
-        "remarks": [*_remarks(result), *causes],
-        "likely_causes": causes,
-        "lack_of_fit": lacking and lacking.content(),
-        "details": dict(record.details),
-        "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
-    }
+
+def error_rows(result: Calibration) -> list[dict[str, Any]]:
+    """Return mean, RMS, 95th percentile and maximum [mm] of every set of errors, with nominal and identified model."""
+    rows: list[dict[str, Any]] = []
+    several = len(_kinds(result.problem.data)) > 1
+    for name, data in sets(result).items():
+        for kind, at in _kinds(data).items():
+            which = f"{name}, {kind.replace('_', ' ')}" if several else name
+            if kind in (known_square.name, known_parallel.name):
+                continue
+            dimension = "stated length" if kind == known_distance.name else "length"
+            for model, errors in (("nominal", result.nominal_errors), ("identified", result.errors)):
+                rows.append(_figures(f"{which}, {model}", errors(data, dimension)[at]))
+        if name == "identification" and result.flagged:
+            flagged = {flag.label for flag in result.flagged}
+            trusted = result.errors(data)[[label not in flagged for label in data.label]]
+            rows.append(_figures("identification, rows not flagged", trusted))
+    held = result.record.held_out
+    if held is not None:
+        what = f"held out, from {held.used} rows"
+        rows += [_figures(f"{what}, nominal", held.nominal), _figures(f"{what}, identified", held.error)]
+    return rows
+
+
+def _figures(what: str, errors: Array) -> dict[str, Any]:
+    finite = 1e3 * errors[np.isfinite(errors)]
+    high = float(np.percentile(finite, 95)) if len(finite) else None
+    return {"what": what, **statistics(errors), "p95_mm": high}
+
+
+def _kinds(data: Dataset) -> dict[str, list[int]]:
+    """Return the rows of every measurement type."""
+    kinds: dict[str, list[int]] = {}
+    for block in data.blocks:
+        kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
+    return kinds
+
+
+def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
+    """Return the same of orientations and of known angles [mrad]; empty where none were measured."""
+    rows: list[dict[str, Any]] = []
+    for name, data in sets(result).items():
+        for dimension, what in (("angle", name), ("stated angle", f"{name}, known angle")):
+            for model, errors in (("nominal", result.nominal_errors), ("identified", result.errors)):
+                angles = errors(data, dimension)
+                if np.isfinite(angles).any():
+                    rows.append({"what": f"{what}, {model}", **statistics(angles, "mrad")})
+    return rows
+
+
+def cells(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[list[str]]:
+    """Return rows of figures as text, an empty cell where one is missing."""
+    return [
+        [row["what"], str(row.get("count", "")), *("" if row.get(key) is None else f"{row[key]:.4f}" for key in keys)]
+        for row in rows
+    ]
+
+
+def error_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the rows under `ERROR_HEADER`."""
+    return cells(rows, ("mean_mm", "rms_mm", "p95_mm", "max_mm"))
+
+
+def angle_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the rows under `ANGLE_HEADER`."""
+    return cells(rows, ("mean_mrad", "rms_mrad", "max_mrad"))
+
+
+class Workspace(NamedTuple):
+    """Region, configurations (N, dof), and expanded uncertainty (N,) [m] of the position reached at each."""
+
+    region: Region
+    q: Array
+    expanded: Array
+    requirement: Requirement
+
+    def sentence(self) -> str:
+        """Say how large it is."""
+        return (
+            f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
+            f"{mm(1e3 * self.expanded.max())} mm, median {mm(1e3 * float(np.median(self.expanded)))} mm, over "
+            f"{len(self.q)} configurations of the region ({self.requirement.where})."
+        )
+
+
+def workspace(result: Calibration) -> Workspace | None:
+    """Return the expanded uncertainty over the region; None for several robots, or a formulation without covariance."""
+    from rpim_opt.calibration.reaching import reaching
+    from rpim_opt.calibration.region import region_of
+
+    requirement = result.record.requirement or ANYWHERE
+    try:
+        region = region_of(result, requirement)
+        q = region.drawn()
+        expanded = reaching(result, region, q, requirement.confidence).bound
+    except InputError:
+        return None
+    if not np.isfinite(expanded).all():
+        return None
+    return Workspace(region, q, expanded, requirement)
 
 
 def acceptance(result: Calibration) -> Acceptance | None:
-    """Return the verdict of what a result's record requires; None where nothing is required."""
+    """Return the verdict on the requirement of a result's record; None without a requirement."""
     if result.record.requirement is None:
         return None
     from rpim_opt.calibration.acceptance import accept
@@ -87,85 +156,153 @@ def acceptance(result: Calibration) -> Acceptance | None:
     return accept(result)
 
 
-def _held_out(result: Calibration) -> list[dict[str, Any]]:
-    """Return the errors of rows that were kept apart before they were used."""
+# --- sentences ---------------------------------------------------------------------------------------------
+
+
+def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
+    """Return the name of the rows that the headline is about, and their errors (N,) [m], nominal and identified."""
     held = result.record.held_out
-    if held is None:
-        return []
-    what = f"kept apart, from {held.used} rows"
-    return [
-        {"what": f"{what}, {when}", **statistics(of)}
-        for when, of in (("nominal", held.nominal), ("identified", held.error))
-    ]
+    if held is not None:
+        return "held out", held.nominal, held.error
+    name, data = next(iter(sets(result).items()))
+    return name, result.nominal_errors(data), result.errors(data)
 
 
-def _errors(result: Calibration, name: str, data: Dataset) -> list[dict[str, Any]]:
-    """Return the errors of every kind of measurement, and those of the rows that are not distrusted."""
-    errors = []
-    several = len(_kinds(result.problem.data)) > 1
-    for kind, rows in _kinds(data).items():
-        which = f"{name}, {kind.replace('_', ' ')}" if several else name
-        if kind in (known_square.name, known_parallel.name):
-            continue
-        dimension = "length"
-        if kind == known_distance.name:
-            dimension = "stated length"
-        for when, of in (("nominal", result.nominal_errors), ("identified", result.errors)):
-            errors.append({"what": f"{which}, {when}", **statistics(of(data, dimension)[rows])})
-    if name == "identification" and result.flagged:
-        distrusted = {flag.label for flag in result.flagged}
-        trusted = result.errors(data)[[label not in distrusted for label in data.label]]
-        errors.append({"what": "identification, trusted rows", **statistics(trusted)})
-    return errors
+def headline(result: Calibration) -> str:
+    """Say by how much the errors fall, on data that were not used for identification where there are some."""
+    name, nominal, identified = headline_errors(result)
+    before, after = statistics(nominal), statistics(identified)
+    n = after["count"]
+    if not n:
+        return ""
+    where = {
+        "validation": f"On {n} validation measurements, not used for identification,",
+        "held out": f"On {n} measurements that were held out",
+        "identification": f"On the {n} identification measurements themselves (there are no validation data)",
+    }[name]
+    kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
+    what = "position error" if kinds <= {"position", "pose"} else "error"
+    ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
+    falls = f"falls from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
+    times = f", by a factor of {ratio:.1f}" if ratio < 10 else f", by a factor of {ratio:.0f}"
+    if ratio <= 1:
+        falls, times = falls.replace("falls", "rises"), ""
+    sentence = f"{where} the mean {what} {falls}{times}."
+    if not result.converged:
+        return f"This calibration did not converge and should not be used. {sentence}"
+    held = result.record.held_out
+    if held is not None:
+        sentence += (
+            f" That validates the procedure, with parameters from {held.used} rows; those delivered here come from "
+            f"all {len(result.problem.labels)}."
+        )
+    if result.record.earlier:
+        last = result.record.earlier[-1]
+        changed = joined(last.let_go) or "nothing that these measurements show"
+        sentence += f" The prior is a calibration of {last.rows} rows; changed since: {changed}."
+    return sentence
 
 
-def _remarks(result: Calibration) -> list[str]:
+def identifiability(result: Calibration) -> str:
+    """Say how many combinations of the parameters the data identify."""
     model = result.program.model
-    count = f"{model.equations} equations, {len(result.x)} parameters, {model.rank} directions that the data see."
-    remarks = [
-        *turned_frames(result),
-        *weight_lines(result),
-        count,
-        *contact_remarks(result.problem.sample()),
-        *camera_remarks(result),
-        *result.noise_sentence(),
-        *result.remarks(),
-    ]
-    if result.record.held_out is not None:
-        remarks.append(result.record.held_out.sentence(len(result.problem.data)))
+    return f"{model.rank} of {len(result.x)} parameter combinations are identifiable from {model.equations} equations."
+
+
+def warnings(result: Calibration) -> list[str]:
+    """Say what a reader must know besides the figures, the worst first."""
+    lines = [line for line in result.remarks() if line != result.message or not result.converged]
+    validation = result.record.validation
+    if validation is not None:
+        lines += known_points(result.problem.sample(), validation)
+        known = {q.tobytes() for q in result.problem.data.q}
+        repeated = sum(q.tobytes() in known for q in validation.q)
+        if repeated:
+            lines.append(f"{repeated} validation rows repeat identification configurations: they validate nothing.")
+    elif result.record.held_out is None:
+        lines.append("Without validation data the accuracy elsewhere in the workspace is not verified.")
+    lines += contact_remarks(result.problem.sample())
+    lines += camera_remarks(result)
+    if result.record.simulated:
+        lines.append("The measurements are simulated.")
+    return lines
+
+
+def nominal_note(result: Calibration) -> str:
+    """Say what the nominal errors are of."""
     fitted = result.problem.parameters.placed & result.problem.parameters.identified
     if fitted.any():
-        remarks.insert(0, "Nominal: the drawing's robot, frames fitted.")
-    return remarks
+        return "Nominal: the nominal robot, with its base, tool and other frames fitted to the identification data."
+    return "Nominal: the nominal robot."
 
 
-def describe(result: Calibration, found: Mapping[str, Any]) -> str:
-    """Return the tables of a `summary`."""
-    stated = [f"{FIELDS[key]}: {text}" for key, text in found["details"].items()]
-    head = "\n".join([*filter(None, [found["title"], found["source"]]), *stated])
-    lines = [f"{head}\n", result.parameter_table(), ""]
-    lines.append(table(["error [mm]", "rows", "mean", "RMS", "max"], [_row(e, "mm") for e in found["errors"]]))
-    if found["orientation"]:
-        rows = [_row(e, "mrad") for e in found["orientation"]]
-        lines.append(table(["orientation error [mrad]", "rows", "mean", "RMS", "max"], rows))
-    lines += ["", *found["remarks"]]
-    if found["lack_of_fit"]:
-        lines += ["", *found["lack_of_fit"]["text"]]
-    if found["acceptance"]:
-        lines += ["", *found["acceptance"]["text"]]
-    return "\n".join(lines)
+# --- documents ---------------------------------------------------------------------------------------------
 
 
-def _row(e: Mapping[str, Any], unit: str) -> Sequence[str]:
-    if "printed" in e:
-        return [e["what"], "", f"{e['mean_mm']:.3f}", "", ""]
-    figures = (e[f"{key}_{unit}"] for key in ("mean", "rms", "max"))
-    return [e["what"], str(e["count"]), *("-" if v is None else f"{v:.4f}" for v in figures)]
+def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return parameters, errors, weight, verdict and sentences of a calibration as a document.
+
+    Parameters
+    ----------
+    result
+        The calibration, with title, source and validation data in its record.
+    published
+        Mean errors [mm] that the source prints, by set and method.
+    """
+    record = result.record
+    errors = error_rows(result)
+    for name, methods in published.items():
+        for method, mean in methods.items():
+            errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
+    lacking = judged(result)
+    accepted = acceptance(result)
+    causes = likely_causes(result)
+    uncertainty = workspace(result)
+    remarks = [
+        *([] if uncertainty is None else [uncertainty.sentence()]),
+        *weight_lines(result),
+        identifiability(result),
+        *result.noise_sentence(),
+        *turned_frames(result),
+        nominal_note(result),
+        *warnings(result),
+    ]
+    if result.converged:
+        remarks.append(result.message)
+    whole = figures(result)
+    return {
+        "title": record.title,
+        "source": record.source,
+        **{key: whole[key] for key in KEYS},
+        "headline": headline(result),
+        "errors": errors,
+        "orientation": orientation_rows(result),
+        "prices": [price._asdict() for price in result.prices],
+        "remarks": [*remarks, *causes],
+        "likely_causes": causes,
+        "lack_of_fit": lacking and lacking.content(),
+        "details": dict(record.details),
+        "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
+    }
 
 
-def _kinds(data: Dataset) -> dict[str, list[int]]:
-    """Return the rows of every kind of measurement."""
-    kinds: dict[str, list[int]] = {}
-    for block in data.blocks:
-        kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())
-    return kinds
+def describe(result: Calibration, document: Mapping[str, Any]) -> str:
+    """Return a `summary` as text: headline, verdict, what was estimated, warnings, and the tables."""
+    stated = [f"{FIELDS[key]}: {text}" for key, text in document["details"].items()]
+    lines = [*filter(None, [document["title"], document["source"]]), *stated, "", document["headline"]]
+    if document["acceptance"]:
+        lines += document["acceptance"]["text"]
+    lines += ["", *document["remarks"]]
+    if document["lack_of_fit"]:
+        lines += document["lack_of_fit"]["text"]
+    lines += ["", table(ERROR_HEADER, error_cells(document["errors"]))]
+    if document["orientation"]:
+        lines += ["", table(ANGLE_HEADER, angle_cells(document["orientation"]))]
+    return "\n".join([*lines, "", result.parameter_table()])
+
+
+def describe_times(seconds: Mapping[str, float]) -> str:
+    """Return the seconds of a calibration's phases as a table [ms]."""
+    whole = sum(seconds.values())
+    rows = [[phase, f"{1e3 * each:.2f}", f"{each / whole:.0%}"] for phase, each in seconds.items()]
+    return table(["phase", "ms", "share"], [*rows, ["all", f"{1e3 * whole:.2f}", "100%"]])

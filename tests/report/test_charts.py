@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
+from xml.etree import ElementTree
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.report import frame as page
-from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Segments
-from rpim_opt.report.on_axes import COLORS, color_of, on_axes
-from rpim_opt.report.svg import Picture, Scale
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Picture, Scale, Segments
+from rpim_opt.report.page import TEMPLATES
+from rpim_opt.report.plot import COLORS, color_of, draw
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -50,7 +49,7 @@ def test_values_are_at_the_same_place_on_page_and_paper(name: str, which: str) -
     on_page = (scale(values) - scale.start) / (scale.end - scale.start)
     if which == "y" and axis.names:
         on_page = 1 - on_page  # from above to below, on either
-    ax = on_axes(chart)
+    ax = draw(chart)
     drawn = ax.lines[0].get_xydata()
     on_paper = ax.transAxes.inverted().transform(ax.transData.transform(drawn))[:, "xy".index(which)]
     plt.close(ax.figure)
@@ -79,13 +78,13 @@ def test_everything_that_can_be_drawn_is_drawn_on_both() -> None:
         Cells(np.column_stack([x, x]), (0.5, 0.5), "level2 over", "cells", ["g", "h", "i"]),
     ]
     chart = Chart("all", Axis("x [mm]", (0, 4)), Axis("y", (0, 4)), marks, "A note.", alike=True)
-    svg = Picture(chart).element()
+    svg = ElementTree.fromstring(Picture(chart).svg())
     classes = [item.get("class") for item in svg]
     assert classes.count("dot after hollow") == 3
     assert classes.count("cell level2 over") == classes.count("bar before") == 3
     assert "line ink dashed" in classes
     assert [text for _, text in chart.legend] == ["line", "dots", "points", "each", "bars", "cells"]
-    ax = on_axes(chart)
+    ax = draw(chart)
     said = [text.get_text() for text in ax.get_legend().get_texts()]
     assert said == ["line", "dots", "points", "one", "two", "three", "bars"]
     assert len(ax.patches) == 3
@@ -96,7 +95,7 @@ def test_everything_that_can_be_drawn_is_drawn_on_both() -> None:
 
 
 def test_paper_has_the_colours_of_the_page_in_light() -> None:
-    style = (Path(page.__file__).parent / "page.css").read_text(encoding="utf-8")
+    style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     light = dict(re.findall(r"--(\w+): (#\w{6})", style.split("@media")[0]))
     assert {role: COLORS[role] for role in ("before", "after", "mark", "other")} == {
         role: light[role] for role in ("before", "after", "mark", "other")

@@ -50,11 +50,11 @@ def drawn(ax, label: str):
     return next(line for line in ax.lines if line.get_label() == label)
 
 
-def test_distrusted_rows_are_marked(ax) -> None:
+def test_flagged_rows_are_marked(ax) -> None:
     instance = ro.load("blunders")
     result = ro.calibrate(instance.problem, ro.robust, 1.0)
     ro.plot.errors(result, ax=ax)
-    marked = drawn(ax, "distrusted")
+    marked = drawn(ax, "flagged")
     labels = result.problem.data.label
     assert {labels[round(x) - 1] for x in marked.get_xdata()} == {flag.label for flag in result.flagged}
     assert len(marked.get_xdata()) == 5
@@ -74,7 +74,7 @@ def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
     ax.clear()
     ro.plot.error_axes(result, instance.validation, ax)
     want = 1e3 * result.error_vectors(instance.validation).mean(axis=0)
-    assert drawn(ax, "after").get_ydata() == pytest.approx(want, rel=1e-12)
+    assert drawn(ax, "identified").get_ydata() == pytest.approx(want, rel=1e-12)
     ax.clear()
     ro.plot.parameters(result, ax=ax)
     names = [text.get_text() for text in ax.get_yticklabels()]

@@ -15,11 +15,10 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.program import Program
-from rpim_opt.report import section_evidence, section_weight
-from rpim_opt.report.chart import Axis
+from rpim_opt.report import report
+from rpim_opt.report.chart import Axis, Scale
+from rpim_opt.report.charts import histogram_chart
 from rpim_opt.report.report import page
-from rpim_opt.report.scales import below
-from rpim_opt.report.svg import Scale
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
 from tests.test_cli import run
@@ -86,8 +85,8 @@ def evil() -> str:
 def test_the_report_says_the_figures_of_the_result(arm) -> None:
     text = " ".join(Reader(page(arm)).words.split())
     assert (
-        "On 16 measurements that the calibration did not see, the mean position error falls from 2.649 mm to 0.032 mm"
-        in text
+        "On 16 validation measurements, not used for identification, "
+        "the mean position error falls from 2.649 mm to 0.032 mm" in text
     )
     assert "No measurement depends on theta6." in text
     assert "T8-6" in text  # left out, with its reason
@@ -146,7 +145,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     text = page(result)
     assert "This calibration did not converge and should not be used." in text
     assert "40 validation rows repeat" in page(replace(result, record=ro.data.Record(validation=result.problem.data)))
-    assert "(none were kept apart to check it)" in text
+    assert "(there are no validation data)" in text
     assert "Without validation data" in text
     blunders = ro.load("blunders")
     result = ro.calibrate(blunders.problem, ro.robust, ro.reml)
@@ -184,7 +183,7 @@ def test_a_result_of_a_lost_formulation_has_a_report(tmp_path: Path) -> None:
     text = page(ro.load_result(tmp_path))
     assert "it cannot be solved again" in text
     assert "a function of a script, not in the file" in text
-    assert "Checked anew" in text
+    assert "Certificate, computed anew" in text
 
 
 def test_the_command(monkeypatch, capsys, tmp_path: Path) -> None:
@@ -247,7 +246,7 @@ def test_the_slider_tells_of_every_weight(opened: Browser) -> None:
     says = "document.getElementById('weight-says').textContent"
     first = opened.run(says)
     assert "(chosen)" in first
-    assert "taken by l_curve" in first
+    assert "selected by l_curve" in first
     opened.run("document.getElementById('weight').focus()")
     place = opened.run("document.getElementById('cursor').getAttribute('cx')")
     opened.press("ArrowRight")
@@ -304,12 +303,12 @@ def test_it_prints(opened: Browser, tmp_path: Path) -> None:
     assert 3 <= pages <= 12
 
 
-def test_a_robust_result_of_many_rows_is_drawn_by_what_it_trusts(monkeypatch) -> None:
+def test_a_robust_result_of_many_rows_is_drawn_by_its_quadratic_model(monkeypatch) -> None:
     problem = ro.load("blunders").problem
     result = ro.calibrate(problem, ro.robust, weight=1.0)
-    sentence = "The curve is that of the squares which the loss trusts"
+    sentence = "The curve is that of its quadratic model"
     assert sentence not in page(result)
-    monkeypatch.setattr(section_weight, "MANY", 100)  # 150 equations
+    monkeypatch.setattr(report, "MANY_EQUATIONS", 100)  # 150 equations
     asked = []
     solve = Program.solve
     monkeypatch.setattr(Program, "solve", lambda program, *a, **k: asked.append(program) or solve(program, *a, **k))
@@ -319,9 +318,9 @@ def test_a_robust_result_of_many_rows_is_drawn_by_what_it_trusts(monkeypatch) ->
     assert "reml" in text
 
 
-def test_many_distrusted_rows_are_not_all_named(monkeypatch) -> None:
+def test_many_flagged_rows_are_not_all_named(monkeypatch) -> None:
     result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
-    monkeypatch.setattr(section_evidence, "MOST", 2)
+    monkeypatch.setattr(report, "MOST_FLAGGED", 2)
     text = page(result)
     assert "and 3 more" in text
     named = [flag.label for flag in result.flagged]
@@ -333,31 +332,35 @@ def required(result: ro.calibration.Calibration, limit: float) -> ro.calibration
     return replace(result, record=record)
 
 
-@pytest.mark.parametrize(("limit", "verdict"), [(1e-3, "Accepted"), (7e-5, "Cannot be decided")])
+@pytest.mark.parametrize(("limit", "verdict"), [(1e-3, "Accepted"), (7e-5, "Inconclusive")])
 def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) -> None:
     read = Reader(page(required(result_of("position"), limit)))
     words = " ".join(read.words.split())
-    assert 0 <= words.index(f"{verdict}: the robot may be off by up to") < words.index("mean before")
+    assert (
+        0
+        <= words.index(f"{verdict}: expanded uncertainty of the position reached U =")
+        < words.index("Mean error, nominal")
+    )
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
-    assert "Largest bound" in words
+    assert "Maximum U" in words
     levels = [str(each["class"]) for each in read.all("rect") if str(each.get("class", "")).startswith("cell")]
     assert len(levels) > 100
-    assert any("over" in level for level in levels) == (verdict != "Accepted")
+    assert any("over" in level for level in levels) == (not verdict.startswith("Accepted"))
 
 
 def test_no_verdict_where_nothing_is_demanded(arm) -> None:
     read = Reader(page(arm))
     assert not any("verdict" in str(each.get("class")) for each in read.all("p"))
-    assert "How far off the robot may be" in read.words
+    assert "Expanded uncertainty in the workspace" in read.words
 
 
 def test_both_figures_are_said_where_all_rows_were_used() -> None:
     result = ro.calibration.refit_all(result_of("position"))
     words = " ".join(Reader(page(result)).words.split())
-    assert "On 40 measurements that were kept apart, the mean position error falls from" in words
+    assert "On 40 measurements that were held out the mean position error falls from" in words
     assert "with parameters from 40 rows; those delivered here come from all 80." in words
-    assert "kept apart, from 40 rows, after" in words
+    assert "held out, from 40 rows, identified" in words
 
 
 def test_only_tolerances_that_were_kept_are_shown() -> None:
@@ -372,8 +375,7 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
 def test_a_histogram_says_what_is_below_its_first_bar() -> None:
     result = result_of("position")
     errors = {"before": np.array([1.0, 2.0]), "after": np.array([1e-6, 0.1])}
-    assert below(1e-4, errors) == "The first bar holds all rows below 0.0001 mm, too: 1 after."
-    assert below(1e-7, errors) == ""
+    assert histogram_chart(errors).note == "The first bar includes the rows below 0.0002 mm: 1 identified."
     assert "The first bar" not in page(result)
 
 

@@ -12,8 +12,8 @@ function curve({ weight, residual, solution, error, of, takers, chosen, x, y }) 
     cursor.setAttribute("cx", x[k]);
     cursor.setAttribute("cy", y[k]);
     const lines = [`weight ${number(weight[k])}${k === chosen ? " (chosen)" : ""}`,
-      `residual norm ${number(residual[k], 5)} sigmas`, `deviations ${number(solution[k], 4)} scales`,
-      `mean error, ${of}: ${millimetres(error[k])}`, takers[k] ? `taken by ${takers[k]}` : "taken by no selector"];
+      `residual norm ${number(residual[k], 5)} noise standard deviations`, `deviation norm ${number(solution[k], 4)} prior scales`,
+      `mean error, ${of}: ${millimetres(error[k])}`, takers[k] ? `selected by ${takers[k]}` : "selected by no rule"];
     says.textContent = lines.join("\n");
     slider.setAttribute("aria-valuetext", lines[0]);
   };

@@ -1,0 +1,379 @@
+"""What the charts show: errors, parameters, uncertainty in the workspace, selection of the weight, checks over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import joined, percent
+from rpim_opt.basics.units import display
+from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.constraints import within_tolerance
+from rpim_opt.convex.program import Program
+from rpim_opt.convex.selection import Selection
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
+
+if TYPE_CHECKING:
+    from rpim_opt.use.monitored import Monitoring
+
+
+MODELS = {"before": "nominal", "after": "identified"}
+"""Labels of the errors before and after calibration: by which model they are."""
+
+
+def mm(value: float) -> str:
+    """Return a length in mm with the digits that matter."""
+    if value < 10:
+        return f"{value:.3f}"
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+
+
+# --- errors ------------------------------------------------------------------------------------------------
+
+MANY_ROWS = 100
+"""Rows from which each is a small point without a name."""
+LINEAR_MM = 0.1
+"""Signed errors are drawn linearly up to here, logarithmically beyond."""
+
+
+def lengths_of(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list[str]]:
+    """Return the errors [mm] before and after calibration, and the labels, of rows that measure a length."""
+    before = 1e3 * result.nominal_errors(data)
+    after = 1e3 * result.errors(data)
+    finite = np.isfinite(after)
+    labels = [data.label[i] for i in np.flatnonzero(finite)]
+    return {"before": before[finite], "after": after[finite]}, labels
+
+
+def rows_chart(result: Calibration, data: Dataset) -> Chart:
+    """Return every row's error before and after calibration; flagged rows of the identification data are marked."""
+    lengths, labels = lengths_of(result, data)
+    every = np.concatenate(list(lengths.values()))
+    low = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7)
+    place = np.arange(1.0, len(labels) + 1)
+    x = Axis("row", (1, max(len(labels), 2)))
+    marks: list[Mark] = []
+    hints: dict[str, list[str]] = {"before": [], "after": []}
+    if len(labels) <= MANY_ROWS:
+        x = Axis("row", names=labels)
+        both = np.maximum(np.column_stack(list(lengths.values())), low)
+        marks.append(Segments(np.column_stack([place, place]), both, "before"))
+        for when, errors in lengths.items():
+            named = zip(labels, errors, strict=True)
+            hints[when] = [f"{label}, {MODELS[when]}: {mm(error)} mm" for label, error in named]
+    for when, errors in lengths.items():
+        marks.append(Dots(place, np.maximum(errors, low), when, MODELS[when], hints[when]))
+    flagged: set[str] = set()
+    if data is result.problem.data:
+        flagged = {flag.label for flag in result.flagged}
+    at = [i for i, label in enumerate(labels) if label in flagged]
+    if at:
+        named = [f"{labels[i]}: flagged" for i in at]
+        marks.append(Dots(place[at], np.maximum(lengths["after"][at], low), "mark", "flagged", named))
+    cut = int(np.sum(every < low))
+    note = f"{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
+    y = Axis("error [mm]", (low, max(float(every.max()), 1e-6)), log=True)
+    return Chart("Error of every row before and after calibration", x, y, marks, note)
+
+
+def histogram_chart(lengths: Mapping[str, Array]) -> Chart:
+    """Return a histogram of the errors [mm] of each set, four decades at most."""
+    every = np.concatenate(list(lengths.values()))
+    high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
+    low = max(float(every.min(initial=high)), 1e-4 * high)
+    edges = np.geomspace(low, high, 25 if high > 1.01 * low else 2)
+    marks = []
+    most = 0
+    for when, errors in lengths.items():
+        count = np.histogram(np.maximum(errors, edges[0]), edges)[0]
+        bins = np.flatnonzero(count)
+        hints = [f"{MODELS[when]}: {count[k]} rows from {mm(edges[k])} to {mm(edges[k + 1])} mm" for k in bins]
+        marks.append(Bars(edges[bins], edges[bins + 1], count[bins], when, MODELS[when], hints))
+        most = max(most, int(count.max()))
+    below = [f"{int(np.sum(errors < low))} {MODELS[when]}" for when, errors in lengths.items() if (errors < low).any()]
+    note = f"The first bar includes the rows below {low:.2g} mm: {joined(below)}." if below else ""
+    x = Axis("error [mm]", (edges[0], edges[-1]), log=True)
+    return Chart("Distribution of the errors before and after calibration", x, Axis("rows", (0, most)), marks, note)
+
+
+def signed_errors(result: Calibration, data: Dataset) -> tuple[str, str, dict[str, Array]]:
+    """Return whose axes positions are along, what the errors are, and these (N, 3) [mm] before and after."""
+    frame, what = "the instrument", "measured minus modelled"
+    if any(block.measurement.touching for block in data.blocks):  # there is no instrument
+        frame, what = "the robot's base", "mean of the point minus touch"
+    before = 1e3 * result.error_vectors(data, nominal=True)
+    after = 1e3 * result.error_vectors(data)
+    finite = np.isfinite(after).all(axis=1)
+    return frame, what, {"before": before[finite], "after": after[finite]}
+
+
+def axes_chart(result: Calibration, data: Dataset) -> Chart:
+    """Return mean (dot) and central 95 % (line) of the errors of positions along x, y and z."""
+    marks: list[Mark] = [Line([0.5, 3.5], [0, 0], "zero")]
+    ends = [0.0]
+    frame, what, vectors = signed_errors(result, data)
+    for (when, each), shift in zip(vectors.items(), (-0.1, 0.1), strict=True):
+        mean = each.mean(axis=0)
+        spread = np.percentile(each, [2.5, 97.5], axis=0).T
+        place = np.arange(1, 4) + shift
+        hints = [
+            f"{axis}, {MODELS[when]}: mean {m:+z.3f} mm, 95 % of the rows from {low:+z.3f} to {high:+z.3f} mm"
+            for axis, m, (low, high) in zip("xyz", mean, spread, strict=True)
+        ]
+        marks.append(Segments(np.column_stack([place, place]), spread, when))
+        marks.append(Dots(place, mean, when, MODELS[when], hints))
+        ends += [float(spread.min()), float(spread.max())]
+    x = Axis(f"axis of {frame}", names=("x", "y", "z"))
+    y = Axis(f"{what} [mm]", (min(ends), max(ends)), linear_to=LINEAR_MM)
+    return Chart("Errors along x, y and z", x, y, marks)
+
+
+def magnification(points: Array, vectors: Array) -> float:
+    """Return the factor, 1, 2 or 5 times 10^k, by which the longest error is a sixth of the points' extent."""
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
+    decade = 10.0 ** np.floor(exponent)
+    return float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
+
+
+# --- parameters --------------------------------------------------------------------------------------------
+
+
+def active_tolerance(result: Calibration) -> Array:
+    """Return the tolerances (n,) [SI] that constrain the formulation; infinite where it has none."""
+    tolerance = result.problem.parameters.free.tolerance
+    if any(each is within_tolerance for each in result.formulation.constraints):
+        return tolerance
+    return np.full(len(tolerance), np.inf)
+
+
+def deviations_chart(result: Calibration, dimension: str, half: Array, confidence: float = 0.95) -> Chart:
+    """Return the deviations of the robot's own parameters of a dimension, with intervals and active tolerances.
+
+    Half the intervals (n,) [SI] are NaN where there are none.
+    """
+    free = result.problem.parameters.free
+    unit, si = display(dimension)
+    own = np.flatnonzero(~free.of_frames & (np.array(free.dimensions) == dimension))
+    x = result.x[own] / si
+    spread = np.nan_to_num(half[own] / si, posinf=0.0)
+    bound = active_tolerance(result)[own] / si
+    bounded = np.flatnonzero(np.isfinite(bound))
+    place = np.arange(1.0, len(own) + 1)
+    names = [free.names[i] for i in own]
+    hints = [f"{name}: {d:+z.4f} ± {s:.4f} {unit}" for name, d, s in zip(names, x, spread, strict=True)]
+    level = np.column_stack([place, place])
+    marks: list[Mark] = [
+        Line([0, 0], [0.5, len(own) + 0.5], "zero"),
+        Segments(np.column_stack([x - spread, x + spread]), level, "after"),
+        Dots(x, place, "after", f"deviation, {percent(confidence)} interval", hints),
+    ]
+    if len(bounded):
+        ends = np.concatenate([-bound[bounded], bound[bounded]])
+        height = np.tile(np.column_stack([place[bounded] - 0.35, place[bounded] + 0.35]), (2, 1))
+        marks.append(Segments(np.column_stack([ends, ends]), height, "mark", "tolerance"))
+    # an interval that ends far out would hide all others: it is cut at the chart's edge
+    reach = max(float(np.max(np.abs(x), initial=1e-9)), float(np.max(bound[bounded], initial=0.0)))
+    if len(x):
+        reach = max(reach, float(np.median(np.abs(x) + spread)))
+    reach *= 1.1
+    across = Axis(f"deviation from nominal [{unit}]", (-reach, reach))
+    cut = "Intervals beyond the edge are cut." if (np.abs(x) + spread > reach).any() else ""
+    title = f"Deviations of the {dimension} parameters"
+    return Chart(title, across, Axis("", names=names), marks, cut, 60 + 17 * len(own))
+
+
+# --- uncertainty in the workspace --------------------------------------------------------------------------
+
+CELLS = 24
+"""Cells along the longer side."""
+LEVELS = 5
+"""Shades."""
+VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
+
+
+def workspace_charts(at: Array, bound: Array, box: Array | None, limit: float | None) -> list[Chart]:
+    """Return maps of the expanded uncertainty, from above and from the side.
+
+    Parameters
+    ----------
+    at, bound
+        (N, 3) positions and (N,) expanded uncertainties [mm].
+    box
+        (3, 2) sides of the region [mm], or None.
+    limit
+        Above which a cell is marked [mm].
+    """
+    low, high = float(bound.min()), float(bound.max())
+    ends = np.linspace(low, high, LEVELS + 1)[1:]
+    decimals = 10.0 ** (int(np.ceil(-np.log10(max(high - low, 1e-3 * high)))) + 1)
+    ends = np.asarray(np.ceil(ends * decimals) / decimals, dtype=float)
+    charts = []
+    for name, across, up in VIEWS:
+        u, v = at[:, across], at[:, up]
+        largest = max(np.ptp(u), np.ptp(v)) / CELLS
+        (left, wide), (lower, tall) = _cells(u, largest), _cells(v, largest)
+        worst: dict[tuple[float, float], float] = {}
+        for a, b, value in zip(left, lower, bound, strict=True):
+            worst[a, b] = max(value, worst.get((a, b), 0.0))
+        shades: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        for place, value in worst.items():
+            shades.setdefault(_shade(ends, value, limit), []).append(place)
+        marks: list[Mark] = []
+        for (role, label), places in sorted(shades.items()):
+            hints = [f"{mm(worst[place])} mm" for place in places]
+            marks.append(Cells(np.array(places), (wide, tall), role, label, hints))
+        note = f"{name.capitalize()}."
+        if box is not None:
+            (a, b), (c, d) = box[across], box[up]
+            marks.append(Line([a, b, b, a, a], [c, c, d, d, c], "ink"))
+            note += " The frame is the box of the requirement."
+        x = Axis(f"{'xyz'[across]} [mm]", (u.min(), u.max()))
+        y = Axis(f"{'xyz'[up]} [mm]", (v.min(), v.max()))
+        title = f"Largest expanded uncertainty of the position reached, {name}"
+        charts.append(Chart(title, x, y, marks, note, alike=True))
+    return charts
+
+
+def _cells(values: Array, largest: float) -> tuple[Array, float]:
+    """Return lower ends (N,) of the values' cells, and their common width, at most the largest."""
+    count = max(int(np.ceil(np.ptp(values) / largest - 1e-9)), 1)
+    wide = float(np.ptp(values)) / count
+    number = np.minimum((values - values.min()) // max(wide, 1e-9), count - 1)
+    return values.min() + number * wide, wide
+
+
+def _shade(ends: Array, value: float, limit: float | None) -> tuple[str, str]:
+    """Return role and label of a cell."""
+    level = min(int(np.searchsorted(ends, value)), LEVELS - 1)
+    end = float(ends[level])
+    if limit is not None and value > limit:
+        return f"level{level} over", f"to {mm(end)} mm, above the limit"
+    return f"level{level}", f"to {mm(min(end, limit or np.inf))} mm"
+
+
+# --- the regularization weight -----------------------------------------------------------------------------
+
+VANISHED = 1e-4
+"""Penalties below this part of the median one are not drawn: a lasso has no deviation left there."""
+FAINT = 1e-4
+"""Coefficients of the data below this many standard deviations are not drawn."""
+
+
+def l_curve_chart(residual: Array, solution: Array, chosen: Mapping[str, tuple[float, float]], own: str) -> Chart:
+    """Return the L-curve: roots of loss and penalty (k,) over the weight, and choices by label; ``own`` is in use."""
+    drawn = solution > VANISHED * float(np.median(solution))
+    marks: list[Mark] = [Line(residual[drawn], solution[drawn], "ink")]
+    others = {name: at for name, at in chosen.items() if name != own}
+    if others:
+        x, y = np.transpose(list(others.values()))
+        marks.append(Dots(x, y, "other", "other selectors", list(others), each=True))
+    if own in chosen:
+        (x,), (y,) = np.transpose([chosen[own]])
+        marks.append(Dots([x], [y], "mark", f"chosen: {own}", [f"chosen: {own}"], size="large"))
+    across = Axis(
+        "residual norm [standard deviations of the noise]", (max(residual.min(), 1e-9), residual.max()), log=True
+    )
+    up = Axis("deviation norm [prior scales]", (solution[drawn].min(), solution.max()), log=True)
+    return Chart("L-curve: residual norm against norm of the deviations", across, up, marks, height=330)
+
+
+def score_chart(selection: Selection) -> Chart:
+    """Return a selector's score over the weights, and its choice, dashed where it is at an edge."""
+    finite = np.isfinite(selection.score)
+    weights = selection.weights[finite]
+    score = selection.score[finite]
+    every = [*weights, selection.weight]
+    y = Axis(f"score of {selection.name}", (float(score.min()), float(score.max())))
+    at = [selection.weight] * 2
+    marks = [
+        Line(weights, score, "ink"),
+        Line(at, list(y.limits), "mark", f"weight {selection.weight:.3g}", not selection.interior),
+    ]
+    x = Axis("weight", (min(every), max(every)), log=True)
+    return Chart(f"Score of {selection.name} over the weight", x, y, marks)
+
+
+def choices_chart(chosen: Mapping[str, Selection]) -> Chart:
+    """Return the weights that selectors choose, the largest on top; hollow: at an edge."""
+    ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
+    weight = np.array([each.weight for _, each in ordered])
+    interior = np.array([each.interior for _, each in ordered])
+    marks: list[Mark] = []
+    for which, hollow, label in ((interior, False, ""), (~interior, True, "at an edge")):
+        at = np.flatnonzero(which)
+        hints = [f"{ordered[k][0]}: weight {weight[k]:.3g}" for k in at]
+        if len(at):
+            marks.append(Dots(weight[at], at + 1.0, "after", label, hints, hollow=hollow))
+    names = [name for name, _ in ordered]
+    x = Axis("weight", (weight.min(), weight.max()), log=True)
+    return Chart("Weights that selectors choose", x, Axis("", names=names), marks, height=60 + 17 * len(names))
+
+
+def picard_chart(program: Program, weight: float) -> Chart:
+    """Return Picard's condition: singular values, coefficients of the data and of the solution, root of the weight."""
+    beta, s, _ = program.model.svd
+    k = np.flatnonzero(s > 0)
+    data = np.abs(beta[k])
+    solution = data / s[k]
+    level = float(np.sqrt(weight))
+    place = k + 1.0
+    last = max(len(k), 2)
+    seen = [f"direction {i + 1}: data {abs(beta[i]):.3g}, s {s[i]:.3g}" for i in k]
+    ratio = [f"direction {i + 1}: coefficient {abs(beta[i]) / s[i]:.3g}" for i in k]
+    marks: list[Mark] = [
+        Line(place, s[k], "ink", "singular value s"),
+        Dots(place, solution, "other", "coefficient |u'b| / s", ratio, size="small"),
+        Dots(place, data, "after", "data |u'b|", seen),
+    ]
+    every = np.concatenate([s[k], data])
+    if level > 0:
+        marks.append(Line([1, last], [level, level], "mark", "root of the weight", dashed=True))
+        every = np.append(every, level)
+    high = max(float(every.max(initial=1.0)), float(solution.max(initial=0.0)))
+    y = Axis("size, whitened and scaled [1]", (max(float(every.min(initial=1.0)), FAINT), high), log=True)
+    return Chart("Singular values and coefficients of the data", Axis("singular direction", (1, last)), y, marks)
+
+
+# --- checks over time --------------------------------------------------------------------------------------
+
+TIMES = ((86400.0, "days"), (3600.0, "hours"))
+"""Units of an axis of time [s]."""
+
+
+def checks_charts(found: Monitoring) -> list[Chart]:
+    """Return every check against its limit, and their cumulative sum (CUSUM) against its limit."""
+    count = len(found.label)
+    place = np.arange(1, count + 1, dtype=float)
+    axis = Axis("check", (1, max(count, 2)))
+    if found.when is not None and np.ptp(found.when) > 0:
+        span = float(np.ptp(found.when))
+        unit, name = next(((size, name) for size, name in TIMES if span > 2 * size), (1.0, "seconds"))
+        place = (found.when - found.when[0]) / unit
+        axis = Axis(f"{name} since the first check", (0.0, float(place[-1])))
+    hints = [
+        f"{label}: {sigmas:.1f} standard deviations, {mm(1e3 * error)} mm"
+        for label, sigmas, error in zip(found.label, found.sigmas, found.error, strict=True)
+    ]
+    beyond = np.isin(np.arange(count), found.beyond)
+    marks: list[Mark] = [Line(place, found.allowed, "mark", "limit, checks beyond it")]
+    for which, role, label in ((~beyond, "after", "check"), (beyond, "mark", "")):
+        at = np.flatnonzero(which)
+        if len(at):
+            marks.append(Dots(place[at], found.sigmas[at], role, label, [hints[i] for i in at]))
+    y = Axis("residual [standard deviations]", (0.0, 1.05 * float(max(found.sigmas.max(), found.allowed.max()))))
+    each = Chart("Residual of every check and its limit", axis, y, marks, "Each check on its own.")
+    sums: list[Mark] = [
+        Line(place, np.full(count, found.limit), "mark", "limit, alarm"),
+        Line(place, found.sums, "after", "sum"),
+    ]
+    if found.alarm is not None:
+        at = [found.alarm]
+        sums.append(Dots(place[at], found.sums[at], "mark", hints=[f"alarm at {found.label[found.alarm]}"]))
+    y = Axis("cumulative sum", (0.0, 1.05 * float(max(found.sums.max(), found.limit))))
+    together = Chart("Cumulative sum of the checks and its limit", axis, y, sums, "All checks together (CUSUM).")
+    return [each, together]
