@@ -567,8 +567,7 @@ def study(
     With --gate exit code 1 if a metric got worse.
     """
     from rpim_opt.basics.progress import shown
-    from rpim_opt.study.report import regressions
-    from rpim_opt.study.runner import run_study
+    from rpim_opt.study.studies import regressions, run_study
 
     with shown(name, not as_json) as say:
         report, folder = run_study(name, quick, workers, scheduler, resume, redraw, out, progress=say)
@@ -603,10 +602,14 @@ def compare(
 
     With --out every replicate is written down when it is finished, and a page index.html in the end.
     """
-    from rpim_opt.study.comparing import compare
-    from rpim_opt.study.metrics import USUAL
+    from rpim_opt.study.comparison import compare
+    from rpim_opt.study.methods import USUAL
+    from rpim_opt.study.replicates import require_package
 
-    journal = None if out is None else out / "replicates.jsonl"
+    journal = None
+    if out is not None:
+        journal = out / "replicates.sqlite"
+        require_package("matplotlib", "out")
     words, numbers = console.listed_words, console.listed_numbers
     found = compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),

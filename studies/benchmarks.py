@@ -32,8 +32,8 @@ from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.parts import ROWS, PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.study.grid import find_study, load_study
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report
+from rpim_opt.study.studies import find_study, load_study
 
 QUESTION = "How fast is a calibration with any formulation and rule, and what do a million configurations cost?"
 PART = 50_000

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
-from rpim_opt.study.figures import distributions
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "Is the certified start of hand and eye right where closed forms fail, and does it know when it is not?"
 METRICS = {

@@ -15,8 +15,7 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.baselines import levenberg_marquardt
-from rpim_opt.study.figures import distributions
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "How near do formulations come to the truth: 52 configurations, ten, or four blunders?"
 SITUATIONS = {"clean52": (52, 0), "few10": (10, 0), "blunders52": (52, 4)}

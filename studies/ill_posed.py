@@ -15,8 +15,7 @@ import rpim_opt as ro
 from rpim_opt.basics.text import markdown
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.study.figures import distributions
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 
 NOISES = (1e-1, 1e-2, 1e-3, 1e-4)
 SELECTORS = (ro.l_curve, ro.corner, ro.gcv, ro.reml, ro.discrepancy, ro.quasi_optimality, ro.leave_one_out, ro.ncp)

@@ -17,8 +17,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
-from rpim_opt.study import Metric, Report
-from rpim_opt.study.figures import geometric_mean
+from rpim_opt.study import Metric, Report, geometric_mean
 
 QUESTION = "How does the error fall with the noise and the number of configurations, and how near is it to the bound?"
 NOISES, COUNTS = (0.01, 0.03, 0.1, 0.3), (8, 12, 20, 35, 60, 100)

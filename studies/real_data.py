@@ -13,11 +13,12 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import markdown
-from rpim_opt.study.figures import distributions, geometric_mean
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report, distributions, geometric_mean
 
 QUESTION = "How accurate is a calibration on real measurements, with all configurations and with ten?"
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
+DEPENDS = [f"{FOLDER}/**"]
+"""What replicates follow from, besides the Python files of this folder."""
 SETS = (
     "franka_fr3_nadeau",
     "irb120_cable_robotcali",

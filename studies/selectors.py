@@ -19,8 +19,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
-from rpim_opt.study.figures import distributions
-from rpim_opt.study.report import Metric, Report
+from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "Which selector comes nearest to the best weight on a robot?"
 RULES = (ro.reml, ro.l_curve, ro.corner, ro.gcv, ro.leave_one_out, ro.two_step, ro.discrepancy, ro.quasi_optimality)

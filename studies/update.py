@@ -17,8 +17,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.study import Metric, Report
-from rpim_opt.study.figures import distributions
+from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "Is a change of a calibrated robot found, and what do eight points make of what was known before?"
 FIRST = 17_000

@@ -37,7 +37,8 @@ FLOORS: dict[str, set[str]] = {
     "use": {"casadi"},
     # rich: progress on a console; jinja2: pages
     "report": {"jinja2", "markupsafe", "matplotlib", "rich"},
-    "study": {"distributed", "jinja2", "joblib", "markupsafe", "matplotlib", "pyarrow"},
+    # cvxpy: expressions are hashed by their content
+    "study": {"cvxpy", "distributed", "jinja2", "joblib", "markupsafe", "matplotlib", "pyarrow"},
 }
 """Third-party packages that a folder may import besides those for all; its place is its floor."""
 EVERYWHERE = {"numpy", "scipy"}

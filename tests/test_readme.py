@@ -18,7 +18,7 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem import parts
 from rpim_opt.robot import evaluation
-from rpim_opt.study import grid
+from rpim_opt.study import studies
 from studies.gallery import pages
 from tests import ROOT
 from tests.test_cli import run
@@ -114,7 +114,7 @@ def rows_of(study: str) -> list[dict[str, Any]]:
 
 
 def test_the_main_table_is_the_studys() -> None:
-    peers = grid.load_study(grid.find_study("peers"))
+    peers = studies.load_study(studies.find_study("peers"))
     rows = peers.by_method(rows_of("peers"))
     table = README.split("## Beside other tools")[1].replace("**", "")
     head = next(line for line in table.splitlines() if line.startswith("| RMS error"))
@@ -144,7 +144,7 @@ AS_WELL = 0.03
 
 def errors_of_peers(situation: str) -> dict[str, Array]:
     """Return RMS errors of the same arms [mm] for every method, infinite where it failed."""
-    peers = grid.load_study(grid.find_study("peers"))
+    peers = studies.load_study(studies.find_study("peers"))
     rows = sorted(peers.by_method(rows_of("peers")), key=lambda row: row["seed"])
     found: dict[str, list[float]] = {}
     for row in rows:
@@ -177,7 +177,7 @@ def test_where_others_do_as_well_is_the_studys() -> None:
     errors = errors_of_peers("clean10")
     assert abs(times(errors[MAP], errors[OURS]) - 1) < AS_WELL
     assert "figaroh's priors, told the noise, do as well with ten" in README
-    told = grid.load_study(grid.find_study("peers")).METHODS
+    told = studies.load_study(studies.find_study("peers")).METHODS
     assert "noise" in told[MAP]
     assert "noise" not in told[OURS]
 

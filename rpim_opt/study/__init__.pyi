@@ -1,9 +1,11 @@
 from .arms import SimulatedArm as SimulatedArm
 from .arms import simulated_arm as simulated_arm
-from .comparing import compare as compare
 from .comparison import Comparison as Comparison
-from .metrics import Fitted as Fitted
-from .pairs import Standing as Standing
-from .report import Metric as Metric
-from .report import Report as Report
-from .standing import Summary as Summary
+from .comparison import compare as compare
+from .figures import distributions as distributions
+from .methods import Fitted as Fitted
+from .ranking import Standing as Standing
+from .ranking import Summary as Summary
+from .ranking import geometric_mean as geometric_mean
+from .studies import Metric as Metric
+from .studies import Report as Report

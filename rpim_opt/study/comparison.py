@@ -1,19 +1,250 @@
-"""What a comparison found: its replicates, and the tables, figures and pages that they become."""
+"""Comparisons: problems, formulations and selectors, one replicate each, and the tables that they become."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.progress import shown
 from rpim_opt.basics.tables import frame_of
-from rpim_opt.study.journal import Row
-from rpim_opt.study.pairs import figures, standings
-from rpim_opt.study.replicate import NUMBERS
-from rpim_opt.study.standing import Summary, notes_of
+from rpim_opt.basics.writing import refused
+from rpim_opt.study.methods import USUAL, Method, measure, methods_of, metrics_of
+from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
+from rpim_opt.study.provenance import package_code, provenance
+from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED, WITH_FIGURES, Summary, figures, summarize
+from rpim_opt.study.replicates import Row, open_journal, require_package
+
+MOST_DRAWS = 100_000
+"""Each is a calibration of its own, and is listed before the first begins."""
+LARGEST_FACTOR = float(np.finfo(float).max)
+"""Whole numbers may be larger than any double."""
+
+
+def compare(
+    problems: Any,
+    formulations: Any = "tikhonov",
+    selectors: Any = "learned",
+    *,
+    methods: Any = (),
+    splits: Any = FOLDER,
+    counts: Any = None,
+    noise: Any = 1.0,
+    seeds: int | Iterable[int] = 1,
+    metrics: Any = USUAL,
+    options: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    scheduler: Any = None,
+    journal: str | Path | None = None,
+    resume: bool | None = True,
+    progress: bool | Callable[[int, int], None] = True,
+) -> Comparison:
+    """Compare formulations, selectors and anybody's methods on problems, by their errors on held-out data.
+
+    Every problem with every formulation and every selector, every split and every seed: one replicate each. What cannot
+    be (a lasso with REML) and what fails is a replicate with its reason. All methods see the same data: the same
+    configurations held out, drawn and disturbed, so that their errors are compared in pairs.
+
+    Parameters
+    ----------
+    problems
+        A folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and validation
+        data, a folder of problem folders, a family (a function of a seed that returns one of these, or a
+        `SimulatedArm`); or several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``.
+    formulations
+        Ready ones by name, objects, ``"folder"`` for the folder's own; one or several, or by names of your own.
+    selectors
+        Names, selectors, numbers, ``"learned"``, ``"folder"``; likewise. A formulation without penalty has no weight
+        and is there once, with the selector ``none``.
+    methods
+        Other methods: baselines by name (``"levenberg_marquardt"``; ``"nominal"`` fits frames alone) and functions of
+        the problem that return deviations (n,) [SI], a calibration, or a function from joint values (N, dof) to
+        positions (N, 3) [m]; in a list or by names of your own.
+    splits
+        What is held out, always whole configurations: ``"folder"``, the validation data of the problem; a part of its
+        data (``0.25``); in how many folds (``5``), one replicate a fold; or several of them.
+    counts
+        Of how many configurations to identify from, drawn from those that are not held out; all of them by default.
+    noise
+        Factors, 1 or more, on the noise of the data to fit: the missing part is added, and declared.
+    seeds
+        How many, or which: of families, of splits, of draws and of noise. What no seed changes is there once.
+    metrics
+        Of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``, ``"fit_rms_mm"``
+        (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or functions of a
+        `Fitted`, by names that carry their unit. Summaries are of the first one, of which less is better.
+    options
+        Further options of every calibration: ``{"model": "auto"}``.
+    workers
+        Processes on this machine; -1 for all processors.
+    scheduler
+        Address of a Dask scheduler to compute on instead, or a client of one.
+    journal
+        A file that every finished replicate is written to at once. A call with the same code and arguments goes on
+        with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused, and
+        so is an argument whose content cannot be hashed. Files that a function reads are not known to it.
+    resume
+        False to begin the journal anew; None refuses to drop what an interrupted run has computed.
+    progress
+        Whether a bar with the time left is shown where a person is watching; or a function that is told how many
+        replicates of how many are done.
+
+    Raises
+    ------
+    InputError
+        Before anything is computed: for unknown names, words and numbers, and a journal of something else.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.compare(["position", "seven_axis"], ["tikhonov", "lasso"], ["learned", "reml"])
+    >>> for row in found.rows[:4]:
+    ...     print(row["problem"], row["method"], row["status"], row["rms_mm"] and round(row["rms_mm"], 3))
+    position tikhonov, learned ok 0.026
+    position tikhonov, reml ok 0.026
+    position lasso, learned ok 0.026
+    position lasso, reml impossible None
+    >>> len(found.to_frame()), found.metric
+    (8, 'rms_mm')
+    """
+    grid = Grid(
+        sources_of(problems),
+        methods_of(formulations, selectors, methods, options or {}),
+        splits_of(splits),
+        (None,) if counts is None else _whole("counts", counts, 1),
+        _factors(noise),
+        _seeds(seeds),
+        metrics_of(metrics),
+        options or {},
+    )
+    made = provenance()
+    path = None
+    code: dict[str, str] = {}
+    if journal is not None:
+        path = Path(journal)
+        code = grid.code()
+        with refused(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+    with open_journal(path, grid.cases(), code, resume) as kept, shown("comparing", progress) as say:
+        kept.fill([(key, grid.task(case)) for key, case in kept.waiting], workers, scheduler, say)
+        rows = tuple(kept.rows)
+    drawn = frozenset(source.label for source in grid.sources if source.drawn)
+    return Comparison(rows, tuple(grid.metrics), drawn, grid.axes(), made)
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Axes of a comparison, checked: one entry a value of each; a count of None is all configurations."""
+
+    sources: tuple[Source, ...]
+    methods: tuple[Method, ...]
+    splits: tuple[Split, ...]
+    counts: tuple[int | None, ...]
+    factors: tuple[float, ...]
+    seeds: tuple[int, ...]
+    metrics: Mapping[str, Callable[..., Any]]
+    options: Mapping[str, Any]
+
+    def cases(self) -> list[dict[str, Any]]:
+        """Return one plain table a replicate."""
+        cases = []
+        for source, split, count, factor in product(self.sources, self.splits, self.counts, self.factors):
+            random = source.drawn or split.by_seed or count is not None or factor > 1
+            seeds = self.seeds if random else self.seeds[:1]
+            for seed, fold, method in product(seeds, range(1, split.folds + 1), self.methods):
+                case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
+                case |= {"selector": method.selector, "split": split.label, "fold": fold, "count": count}
+                cases.append({**case, "noise_factor": factor, "seed": seed})
+        return cases
+
+    def task(self, case: Mapping[str, Any]) -> Callable[[], Row]:
+        """Return what computes a case, with no more than it needs."""
+        source = next(each for each in self.sources if each.label == case["problem"])
+        split = next(each for each in self.splits if each.label == case["split"])
+        method = next(each for each in self.methods if each.label == case["method"])
+        return partial(replicate, source, split, method, self.metrics, case)
+
+    def code(self) -> dict[str, str]:
+        """Return what replicates follow from, in digests: the package, and the arguments."""
+        require_package("joblib", "journal")
+        from rpim_opt.study.content_hash import content_hash
+
+        arguments = {"problems given": self.sources, "methods": self.methods, "metrics": self.metrics}
+        digests = {f"set of {name}": content_hash(value, "journal") for name, value in arguments.items()}
+        return {**package_code(), **digests}
+
+    def axes(self) -> dict[str, str]:
+        """Return the axes in words."""
+        axes = {
+            "Problems": [source.label for source in self.sources],
+            "Methods": [method.label for method in self.methods],
+            "Held out": [split.label for split in self.splits],
+            "Configurations": ["all" if count is None else str(count) for count in self.counts],
+            "Noise factors": [f"{factor:g}" for factor in self.factors],
+            "Seeds": [str(seed) for seed in self.seeds],
+            "Metrics": list(self.metrics),
+            "Options": [f"{name} = {value}" for name, value in self.options.items()],
+        }
+        return {name: ", ".join(values) for name, values in axes.items() if values}
+
+
+def _seeds(stated: int | Iterable[int]) -> tuple[int, ...]:
+    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
+        if stated > MOST_DRAWS:
+            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
+        return _whole("seeds", range(max(int(stated), 0)), 0)
+    return _whole("seeds", stated, 0)
+
+
+def _whole(where: str, stated: Any, least: int) -> tuple[int, ...]:
+    """Return whole numbers, each once."""
+    values = list(stated) if isinstance(stated, Iterable) else [stated]
+    whole = [isinstance(v, int | np.integer) and not isinstance(v, bool) and v >= least for v in values]
+    if not values or not all(whole):
+        raise InputError(where, f"{stated!r}", f"whole numbers, {least} or more")
+    return tuple(dict.fromkeys(int(v) for v in values))
+
+
+def _factors(stated: Any) -> tuple[float, ...]:
+    values = list(stated) if isinstance(stated, Iterable) else [stated]
+    numbers = [isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values]
+    if not values or not all(numbers) or not all(1 <= v <= LARGEST_FACTOR for v in values):
+        raise InputError("noise", f"{stated!r}", "factors of 1 or more on the noise that was measured")
+    return tuple(dict.fromkeys(float(v) for v in values))
+
+
+def replicate(
+    source: Source, split: Split, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
+) -> Row:
+    """Return the figures of a method on a problem's split; whatever goes wrong becomes a status and a reason."""
+    row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
+    seed = case["seed"]
+    try:
+        instance = divide(source.instance(seed), split, case["fold"], case["count"], case["noise_factor"], seed)
+        begun = time.perf_counter()
+        answer = method.solve(instance)
+        seconds = time.perf_counter() - begun
+        values = measure(instance, answer, seconds, metrics)
+        row["configurations"] = len(np.unique(instance.problem.data.configuration))
+        row["parameters"] = len(instance.problem.parameters.free)
+        if answer.result is not None:
+            row["weight"] = float(answer.result.weight)
+            if not answer.result.converged:
+                row |= {"status": UNCONVERGED, "reason": answer.result.message}
+        return {**row, **values}
+    except InputError as error:
+        row |= {"status": IMPOSSIBLE, "reason": str(error)}
+    except Exception as error:  # somebody's function, a solver: the other replicates go on
+        row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
+    return {**row, **dict.fromkeys(metrics)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,21 +324,17 @@ class Comparison:
         InputError
             For an unknown metric or method, or where nothing has figures.
         """
-        metric = self._metric(metric)
-        reference = self.reference(metric, against)
-        every = standings(self.rows, metric, reference, self.drawn)
-        known = [each for each in every if each.median is not None]
-        known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
-        return Summary(metric, reference, tuple(known), notes_of(self.rows, known, self.drawn, reference))
+        return summarize(self.rows, self._metric(metric), self.reference(metric, against), self.drawn)
 
     def plot(self, metric: str | None = None, against: str | None = None) -> Any:
         """Return a matplotlib figure: every method's errors over the reference's, in pairs, and performance profiles.
 
         Arguments and errors as for `summary`.
         """
-        from rpim_opt.study.drawing import drawn
+        require_package("matplotlib", "plot")
+        from rpim_opt.study.figures import comparison_figure
 
-        return drawn(self.rows, self.summary(metric, against))
+        return comparison_figure(self.rows, self.summary(metric, against))
 
     def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
         """Write a page ``index.html`` that needs no network, with ``replicates.csv`` and the figure; return its path.
@@ -119,6 +346,7 @@ class Comparison:
         metric, against
             As for `summary`.
         """
+        require_package("matplotlib", "report")
         from rpim_opt.study.page import write_page
 
         return write_page(Path(folder), self.rows, self.summary(metric, against), self.asked, self.made)
@@ -126,17 +354,15 @@ class Comparison:
     def reference(self, metric: str | None = None, against: str | None = None) -> str:
         """Return the label of the method that others are compared with; arguments as for `summary`."""
         of = figures(self.rows, self._metric(metric))
+        known = [method for method, values in of.items() if values]
+        if against is None and not known:
+            first = self.rows[0]
+            raise InputError("comparison", f"no replicate with figures; {first['status']}: {first['reason']}", "one")
         if against is None:
-            known = [method for method, values in of.items() if values]
-            if not known:
-                first = self.rows[0]
-                raise InputError(
-                    "comparison", f"no replicate with figures; {first['status']}: {first['reason']}", "one"
-                )
             return known[0]
         if against not in of:
             raise InputError("against", f"'{against}'", choices(against, of))
-        if not of[against]:
+        if against not in known:
             raise InputError("against", f"'{against}', which has no figures", "a method that has some")
         return against
 
@@ -156,13 +382,13 @@ class Comparison:
 
     def __str__(self) -> str:
         """Return that line, and the summary where there is one."""
-        if any(row["status"] in NUMBERS for row in self.rows):
+        if any(row["status"] in WITH_FIGURES for row in self.rows):
             return f"{self!r}\n\n{self.summary()}"
         return repr(self)
 
     def _repr_html_(self) -> str | None:
         """Return the summary for a notebook."""
-        if any(row["status"] in NUMBERS for row in self.rows):
+        if any(row["status"] in WITH_FIGURES for row in self.rows):
             return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}"
         return None
 

@@ -1,9 +1,10 @@
-"""What a comparison compares: formulations with their weights, the baselines, and anybody's functions."""
+"""Methods of a comparison (formulations with weights, baselines, functions), and metrics of what they return."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,17 +18,15 @@ from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_o
 from rpim_opt.convex.named import LEARNED, weight_of
 from rpim_opt.convex.select import SELECTORS
 from rpim_opt.convex.selection import require_weight
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance
-from rpim_opt.study.splits import FOLDER
+from rpim_opt.study.problems import FOLDER
+from rpim_opt.use.validation import validate
 
 NONE = "none"
 """The selector of what has no weight."""
-Predictor = Callable[[Array], Array]
-"""From joint values (N, dof) to predicted positions (N, 3) [m]."""
-
-
 BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     "nominal": fitted_frames,
     **{name: getattr(baselines, name) for name in baselines.__all__},
@@ -37,77 +36,37 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method says of a problem: deviations (n,), perhaps of a problem of its own; how it predicts positions."""
+    """What a method says of a problem.
+
+    Parameters
+    ----------
+    x
+        Deviations (n,) [SI].
+    result
+        A calibration.
+    predict
+        A function from joint values (N, dof) to positions (N, 3) [m].
+    problem
+        Of which x is, where that identifies other parameters.
+    """
 
     x: Array | None = None
     result: Calibration | None = None
-    predict: Predictor | None = None
+    predict: Callable[[Array], Array] | None = None
     problem: CalibrationProblem | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Calibrating:
-    """A formulation with a weight or a selector; None where the folder's own is meant.
-
-    Parameters
-    ----------
-    formulation, selector
-        What rows call them.
-    stated, weight
-        What they are.
-    options
-        Further ones of `calibrate`.
-    """
-
-    formulation: str
-    selector: str
-    stated: Formulation | None
-    weight: Any
-    options: Mapping[str, Any]
-
-    @property
-    def label(self) -> str:
-        """What the method is called."""
-        if self.selector == NONE:
-            return self.formulation
-        if self.formulation == self.selector == FOLDER:
-            return "as the folder says"
-        return f"{self.formulation}, {self.selector}"
-
-    def __call__(self, instance: Instance) -> Answer:
-        """Return what it makes of an instance."""
-        asked: dict[str, Any] = dict(self.options)
-        if self.stated is not None:
-            asked["formulation"] = self.stated
-        if self.selector != FOLDER:
-            asked["weight"] = self.weight
-        result = instance.calibrate(**asked)
-        return Answer(result.x, result)
-
-
-@dataclass(frozen=True, eq=False)
-class Foreign:
-    """A function of a problem that somebody else wrote, or a baseline.
-
-    Parameters
-    ----------
-    label
-        What the method is called.
-    function
-        Of the problem; see `answer_of` for what it may return.
-    """
+class Method:
+    """A method by the names that rows call it, and the function of an instance that returns its `Answer`."""
 
     label: str
-    function: Callable[[CalibrationProblem], Any]
+    solve: Callable[[Instance], Answer]
     formulation: str = NONE
     selector: str = NONE
 
-    def __call__(self, instance: Instance) -> Answer:
-        """Return what it makes of an instance's problem."""
-        return answer_of(self.function(instance.problem), instance.problem, self.label)
 
-
-def answer_of(found: Any, problem: CalibrationProblem, label: str) -> Answer:
+def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
     """Return what a function of a problem returned: a calibration, a baseline, x (n,), or a function of q (N, dof).
 
     Instead of x alone it may be a problem that identifies other parameters, and x.
@@ -119,29 +78,32 @@ def answer_of(found: Any, problem: CalibrationProblem, label: str) -> Answer:
     """
     where = f"method {label}"
     own = None
-    match found:
-        case (CalibrationProblem() as own, found):
+    match returned:
+        case (CalibrationProblem() as own, returned):
             problem = own
     n = len(problem.parameters.free)
-    if isinstance(found, Calibration):
-        return Answer(found.x, found)
-    if callable(found):
-        predict: Any = found  # what it returns is checked where it is asked
+    accepted = f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
+    if isinstance(returned, Calibration):
+        return Answer(returned.x, returned)
+    if callable(returned):
+        predict: Any = returned  # what it returns is checked where it is asked
         return Answer(predict=predict)
     try:
-        x = np.asarray(getattr(found, "x", found), dtype=float)
+        x = np.asarray(getattr(returned, "x", returned), dtype=float)
     except (TypeError, ValueError):
-        raise InputError(where, f"a {type(found).__name__}", _returns(n)) from None
+        raise InputError(where, f"a {type(returned).__name__}", accepted) from None
     if x.shape != (n,) or not np.isfinite(x).all():
-        raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", _returns(n))
+        raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", accepted)
     return Answer(x, problem=own)
 
 
-def _returns(n: int) -> str:
-    return f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
+def _calibrate(instance: Instance, asked: Mapping[str, Any]) -> Answer:
+    result = instance.calibrate(**asked)
+    return Answer(result.x, result)
 
 
-Method = Calibrating | Foreign
+def _apply(instance: Instance, function: Callable[[CalibrationProblem], Any], label: str) -> Answer:
+    return answer_of(function(instance.problem), instance.problem, label)
 
 
 def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> tuple[Method, ...]:
@@ -154,56 +116,59 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
     InputError
         For an unknown name, or one that occurs twice.
     """
-    found: list[Method] = []
-    weights = _selectors(selectors)
-    for label, formulation in _formulations(formulations):
+    methods: list[Method] = []
+    weights = [_selector(label, each) for label, each in _listed(selectors)]
+    for name, formulation in (_formulation(label, each) for label, each in _listed(formulations)):
+        asked = dict(options)
+        if formulation is not None:
+            asked["formulation"] = formulation
         if formulation is not None and formulation.penalty is None:
-            found.append(Calibrating(label, NONE, formulation, 0.0, options))
-        else:
-            found += [Calibrating(label, name, formulation, weight, options) for name, weight in weights]
-    found += [Foreign(label, function) for label, function in _functions(functions)]
-    labels = [method.label for method in found]
+            methods.append(Method(name, partial(_calibrate, asked={**asked, "weight": 0.0}), name))
+            continue
+        for selector, weight in weights:
+            label = "as the folder says" if name == selector == FOLDER else f"{name}, {selector}"
+            own = asked if selector == FOLDER else {**asked, "weight": weight}
+            methods.append(Method(label, partial(_calibrate, asked=own), name, selector))
+    for label, each in _listed(functions):
+        function = each
+        if isinstance(each, str):
+            function = pick(BASELINES, each, "methods", also="a function of the problem, ")
+        elif not callable(each):
+            raise InputError("methods", f"{each!r}", f"functions of the problem, or {', '.join(BASELINES)}")
+        name = label or (each if isinstance(each, str) else _name(each))
+        methods.append(Method(name, partial(_apply, function=function, label=name)))
+    labels = [method.label for method in methods]
     for label in labels:
         if labels.count(label) > 1:
             raise InputError("methods", f"'{label}' twice", "a name of its own for each: {'a name': ...}")
-    if not found:
+    if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
-    return tuple(found)
+    return tuple(methods)
 
 
-def _listed(stated: Any) -> list[tuple[str | None, Any]]:
-    """Return what stands alone, in a list or under names, with its name."""
+def _listed(stated: Any) -> list[tuple[str, Any]]:
+    """Return what stands alone, in a list or under names, with its name, which is empty without one."""
     if isinstance(stated, Mapping):
         return [(str(label), each) for label, each in stated.items()]
     if isinstance(stated, str) or callable(stated) or not isinstance(stated, Iterable):
-        return [(None, stated)]
-    return [(None, each) for each in stated]
+        return [("", stated)]
+    return [("", each) for each in stated]
 
 
-def _formulations(stated: Any) -> list[tuple[str, Formulation | None]]:
-    found: list[tuple[str, Formulation | None]] = []
-    for label, each in _listed(stated):
-        if each == FOLDER:
-            found.append((label or FOLDER, None))
-            continue
-        formulation = formulation_of(each)
-        name = each if isinstance(each, str) else _ready_name(formulation)
-        found.append((label or name, formulation))
-    return found
+def _name(function: Any) -> str:
+    return getattr(function, "__name__", type(function).__name__)
 
 
-def _ready_name(formulation: Formulation) -> str:
-    for name, ready in FORMULATIONS.items():
-        if ready is formulation:
-            return name
-    return formulation.name
+def _formulation(label: str, each: Any) -> tuple[str, Formulation | None]:
+    """Return the name of a formulation, and what it is; None where the folder's own is meant."""
+    if each == FOLDER:
+        return label or FOLDER, None
+    formulation = formulation_of(each)
+    ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
+    return label or (each if isinstance(each, str) else ready), formulation
 
 
-def _selectors(stated: Any) -> list[tuple[str, Any]]:
-    return [_selector(label, each) for label, each in _listed(stated)]
-
-
-def _selector(label: str | None, each: Any) -> tuple[str, Any]:
+def _selector(label: str, each: Any) -> tuple[str, Any]:
     """Return the name of a selector or weight, and what it is."""
     if each is None:
         each = LEARNED
@@ -212,36 +177,138 @@ def _selector(label: str | None, each: Any) -> tuple[str, Any]:
     if isinstance(each, str):
         return label or each, weight_of(each)
     if callable(each):
-        return label or _rule_name(each), each
+        ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
+        return label or ready, each
     if isinstance(each, Mapping) and label:
         return label, each
-    weight = _weight(each)
-    return label or f"{weight:g}", weight
-
-
-def _weight(each: Any) -> float:
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
         accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
         raise InputError("selectors", f"{each!r}", accepted)
     if isinstance(each, int):
         each = number(each, "selectors")
-    return require_weight(float(each), "selectors")
+    weight = require_weight(float(each), "selectors")
+    return label or f"{weight:g}", weight
 
 
-def _rule_name(rule: Callable[..., Any]) -> str:
-    for name, ready in SELECTORS.items():
-        if ready is rule:
-            return name
-    return getattr(rule, "__name__", type(rule).__name__)
+# --- metrics ---------------------------------------------------------------------------------------------------------
 
 
-def _functions(stated: Any) -> list[tuple[str, Callable[[CalibrationProblem], Any]]]:
-    found = []
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The answer of a method, and the data that it did not see: what a metric of one's own is a function of.
+
+    Parameters
+    ----------
+    problem
+        What was fitted.
+    held_out
+        The rows that were not.
+    answer
+        The method's: ``x`` (n,) [SI], ``result``, ``predict``, whichever it has.
+    seconds
+        That it took.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> def p95_mm(fitted):
+    ...     return 1e3 * float(np.percentile(fitted.errors(), 95))
+    >>> def over_fit(fitted):
+    ...     return float(fitted.errors().mean() / fitted.fit_errors().mean())
+    >>> found = ro.compare("position", "tikhonov", "reml", metrics=[p95_mm, over_fit])
+    >>> round(found.rows[0]["p95_mm"], 3)
+    0.039
+    """
+
+    problem: CalibrationProblem
+    held_out: Dataset
+    answer: Answer
+    seconds: float
+
+    def errors(self, dimension: str = "length") -> Array:
+        """Return the errors (N,) of the rows that were held out, in m, or in rad for ``"angle"``; NaN without any."""
+        return self._errors(self.held_out, dimension)
+
+    def fit_errors(self) -> Array:
+        """Return those (N,) [m] of the rows that were fitted."""
+        return self._errors(self.problem.data, "length")
+
+    def _errors(self, data: Dataset, dimension: str) -> Array:
+        if self.answer.result is not None:
+            return self.answer.result.errors(data, dimension)
+        if self.answer.x is not None:
+            return (self.answer.problem or self.problem).on(data).errors(self.answer.x, dimension)
+        if dimension != "length":
+            return np.full(len(data), np.nan)
+        if self.answer.predict is None or len(data.blocks) != 1 or data.blocks[0].measurement.name != "position":
+            kinds = ", ".join(f"{block.measurement.name} {' '.join(block.markers)}".strip() for block in data.blocks)
+            raise InputError("predicted positions", kinds, "data of the positions of one reflector")
+        block = data.blocks[0]
+        predicted = np.asarray(self.answer.predict(block.q[:, 0]), dtype=float)
+        if predicted.shape != block.y.shape:
+            raise InputError("predicted positions", f"shape {predicted.shape}", f"{block.y.shape} [m]")
+        errors = np.empty(len(data))
+        errors[block.row] = np.linalg.norm(block.y - predicted, axis=1)
+        return errors
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def _milli(errors: Array, figure: Callable[[Array], Any]) -> float | None:
+    """Return 1000 times a figure of the errors that are numbers, which makes mm of m; None where there are none."""
+    known = errors[np.isfinite(errors)]
+    return 1e3 * float(figure(known)) if len(known) else None
+
+
+def _coverage(fitted: Fitted) -> float | None:
+    if fitted.answer.result is None:
+        return None
+    share = validate(fitted.answer.result, fitted.held_out).coverage
+    return None if share is None else 100 * share
+
+
+METRICS: dict[str, Callable[[Fitted], float | None]] = {
+    "rms_mm": lambda fitted: _milli(fitted.errors(), _rms),
+    "mean_mm": lambda fitted: _milli(fitted.errors(), np.mean),
+    "p95_mm": lambda fitted: _milli(fitted.errors(), lambda errors: np.percentile(errors, 95)),
+    "max_mm": lambda fitted: _milli(fitted.errors(), np.max),
+    "rms_mrad": lambda fitted: _milli(fitted.errors("angle"), _rms),
+    "fit_rms_mm": lambda fitted: _milli(fitted.fit_errors(), _rms),
+    "covered_percent": _coverage,
+    "seconds": lambda fitted: fitted.seconds,
+}
+"""Ready ones: errors of rows held out and of rows fitted, the share of readings in their 95 % intervals, time."""
+USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")
+
+
+def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
+    """Return metrics by their names, which are columns and carry their units.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, or what is no function.
+    """
+    metrics = {}
     for label, each in _listed(stated):
         if isinstance(each, str):
-            found.append((label or each, pick(BASELINES, each, "methods", also="a function of the problem, ")))
+            metrics[label or each] = pick(METRICS, each, "metrics", also="a function of a fit, ")
         elif callable(each):
-            found.append((label or getattr(each, "__name__", type(each).__name__), each))
+            metrics[label or _name(each)] = each
         else:
-            raise InputError("methods", f"{each!r}", f"functions of the problem, or {', '.join(BASELINES)}")
-    return found
+            raise InputError("metrics", f"{each!r}", f"functions of a fit, or {', '.join(METRICS)}")
+    if not metrics:
+        raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
+    return metrics
+
+
+def measure(instance: Instance, answer: Answer, seconds: float, metrics: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the metrics of an answer; None for one that is no number."""
+    if instance.validation is None:
+        raise InputError("splits", "nothing held out", "validation data")
+    fitted = Fitted(instance.problem, instance.validation, answer, seconds)
+    values = {name: metric(fitted) for name, metric in metrics.items()}
+    return {name: float(v) if v is not None and np.isfinite(v) else None for name, v in values.items()}

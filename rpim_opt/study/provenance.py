@@ -1,4 +1,4 @@
-"""What made replicates: the command, the code of the study and of the package, its commits, and the versions."""
+"""What figures follow from: digests of code and files, versions, and the commits that hold them."""
 
 from __future__ import annotations
 
@@ -13,31 +13,24 @@ from pathlib import Path
 
 from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.problem_file import problems_folder
-from rpim_opt.study.grid import files_of, name_of, of_checkout, studies_folder
 
 PACKAGE = Path(__file__).resolve().parents[1]
-CODE = ("rpim_opt", "studies", "problems")
-"""Folders whose files no commit may lack: an untracked study is not the commit's."""
 SHORT = 12
 """Digits of a digest that a reader compares by eye."""
-
-
-def code_of(path: Path) -> dict[str, str]:
-    """Return what a study's replicates follow from: digests of its files and of the package, and the versions."""
-    return {"set of studies": _digest(path.parent, files_of(path)), **package_code()}
 
 
 def package_code() -> dict[str, str]:
     """Return digests of the package and of its problems, and the versions of what computes."""
     problems = problems_folder()
     return {
-        "package": _digest(PACKAGE, PACKAGE.rglob("*.py")),
-        "set of problems": _digest(problems, problems.glob("*/*.*")),
+        "package": files_digest(PACKAGE, PACKAGE.rglob("*.py")),
+        "set of problems": files_digest(problems, problems.glob("*/*.*")),
         "set of versions": versions(),
     }
 
 
-def _digest(folder: Path, files: Iterable[Path]) -> str:
+def files_digest(folder: Path, files: Iterable[Path]) -> str:
+    """Return the SHA-256 of files with their names in a folder."""
     content = sha256()
     for file in sorted(files):
         content.update(sha256(str(file.relative_to(folder)).encode()).digest())
@@ -51,59 +44,34 @@ def versions() -> str:
     return f"{platform.python_implementation()} {platform.python_version()}, {packages}"
 
 
-def made_by(path: Path, quick: bool, count: int) -> str:
-    """Say which command, commit and versions make the replicates."""
-    name = name_of(path)
-    if not of_checkout(path):
-        name = path.name
-    command = f"rpim-opt study {name}"
-    if quick:
-        command += " --quick"
-    if of_checkout(path):
-        return f"Made by `{command}` from commit {_commit()}: {count} replicates, {versions()}."
-    return f"Made by `{command}`, {state_of(path)}, with {package_state()}: {count} replicates, {versions()}."
-
-
-def state_of(path: Path) -> str:
+def file_state(path: Path) -> str:
     """Say which version of a file this is: its digest, its commit, and whether that holds it as it is."""
-    return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({_tracked(path.parent, path)})"
+    return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({commit(path.parent, path)})"
 
 
 def package_state() -> str:
     """Say which version of the package computes: its number, its digest, and its commit where there is one."""
     said = f"rpim-opt {version('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]}"
     if PACKAGE.parent.joinpath("pyproject.toml").is_file():
-        return f"{said} ({_tracked(PACKAGE.parent, PACKAGE, problems_folder())})"
+        return f"{said} ({commit(PACKAGE.parent, PACKAGE, problems_folder())})"
     return f"{said} (installed)"
 
 
-def _tracked(folder: Path, *paths: Path) -> str:
-    """Say which commit some paths are of, and whether it lacks them or has other ones."""
-    names = [str(path) for path in paths]
+def commit(folder: Path, *paths: Path) -> str:
+    """Say which commit some paths are of, and whether it lacks them (``untracked``) or has other ones (``dirty``).
+
+    Results of studies count for nothing.
+    """
+    names = [*map(str, paths), ":(exclude,glob)**/results/**"]
     try:
-        commit = _git(folder, "describe", "--always")
+        said = f"commit {_git(folder, 'describe', '--always')}"
         changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *names)
-        new = _git(folder, "ls-files", "--others", "--", *names)
+        new = _git(folder, "ls-files", "--others", "--exclude-standard", "--", *names)
     except (OSError, subprocess.CalledProcessError):
         return "in no repository"
-    new = "\n".join(line for line in new.splitlines() if not line.endswith((".pyc", ".nbi", ".nbc")))
     if new:
-        return f"commit {commit}, untracked"
-    if changed:
-        return f"commit {commit}, dirty"
-    return f"commit {commit}"
-
-
-def _commit() -> str:
-    folder = studies_folder().parent
-    try:
-        commit = _git(folder, "describe", "--always")
-        # results of other studies are no change of this one
-        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!studies/results")
-        new = _git(folder, "ls-files", "--others", "--exclude-standard", "--", *CODE, ":!studies/results")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return f"{commit}-dirty" if changed or new else commit
+        return f"{said}, untracked"
+    return f"{said}, dirty" if changed else said
 
 
 def _git(folder: Path, *arguments: str) -> str:
@@ -112,7 +80,7 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def provenance() -> dict[str, str]:
-    """Return what makes a comparison: script, package, versions and time, each said in words."""
+    """Return what makes a comparison, in words: script, package, versions and time."""
     return {
         "Script": _script(),
         "Package": package_state(),
@@ -128,4 +96,4 @@ def _script() -> str:
         return "none: an interactive session"
     if Path(file).name in ("rpim-opt", "__main__.py"):
         return "rpim-opt " + " ".join(sys.argv[1:])
-    return state_of(Path(file).resolve())
+    return file_state(Path(file).resolve())

@@ -16,7 +16,7 @@ from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.report.report import write_report
 from rpim_opt.report.summary import summary
 from rpim_opt.store.problem_file import problems_folder
-from rpim_opt.study.grid import load_study
+from rpim_opt.study.studies import load_study
 
 STUDY = load_study(Path(__file__).parents[2] / "studies" / "camera.py")
 FOLDER = problems_folder() / "camera"

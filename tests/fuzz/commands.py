@@ -32,7 +32,7 @@ METRICS = {}
 def cases(quick): return [{"seed": 1}, {"seed": 2}]
 def run(seed): return {"twice": 2.0 * seed}
 def report(rows):
-    from rpim_opt.study.report import Report
+    from rpim_opt.study import Report
     return Report("Yes.", {"sum": sum(row["twice"] for row in rows)})
 """
 FILES = [

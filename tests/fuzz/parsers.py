@@ -31,7 +31,6 @@ from rpim_opt.store.prior_file import load_prior, save_prior
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
 from rpim_opt.store.raw import understand_of
 from rpim_opt.store.serialize import digest
-from rpim_opt.study.journal import Journal
 
 TWO = ro.robot.Robot("two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]))
 IDENTITY = np.zeros(6)
@@ -241,20 +240,6 @@ def prior(data: bytes, folder: Path) -> None:
     found.stated(_parameters())
 
 
-def journal(data: bytes, folder: Path) -> None:
-    """Go on with a study's journal."""
-    path = folder / "replicates.jsonl"
-    path.write_bytes(data)
-    cases = [{"seed": 1}, {"seed": 2}]
-    kept = Journal(path, cases, {"package": "a"}, resume=True)
-    for key, _ in kept.waiting:
-        kept.add(key, {"rms": 1.0})
-    require(len(kept.rows) == len(cases), "a row a case")
-    again = Journal(path, cases, {"package": "a"}, resume=True)
-    require(not again.waiting, "nothing waits")
-    require(repr(again.rows) == repr(kept.rows), "the same rows")
-
-
 def result(data: bytes, folder: Path) -> None:
     """Read a result; one with a digest of what it says, so that more than the digest is asked."""
     path = folder / "result.json"
@@ -296,7 +281,6 @@ PARSERS: dict[str, Callable[[bytes, Path], None]] = {
     "sentence": sentence_alone,
     "stated": stated,
     "prior": prior,
-    "journal": journal,
     "result": result,
     "options": options,
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tempfile
 from functools import cache
@@ -131,15 +130,6 @@ def _priors() -> list[str]:
         return [path.read_text(encoding="utf-8")]
 
 
-def journal_lines() -> list[str]:
-    lines = [
-        {"code": {"package": "a"}},
-        {"case": {"seed": 1}, "found": {"rms": 0.5}},
-        {"case": {"seed": 2}, "found": {}},
-    ]
-    return ["".join(json.dumps(line) + "\n" for line in lines)]
-
-
 def _targets() -> list[str]:
     return [
         "label,q1_deg,q2_deg\nA,0,10\nB,1,2\n",
@@ -169,7 +159,6 @@ MAKERS = {
     "sentence": lambda: list(SENTENCES),
     "stated": lambda: [*KNOWN, *SENTENCES],
     "prior": _priors,
-    "journal": journal_lines,
     "result": _results,
     "options": _options,
 }

@@ -14,7 +14,7 @@ import rpim_opt as ro
 from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.problem.registration.relaxation import lifted, relax, relaxation, rotation_constraints, smallest
-from rpim_opt.study.grid import find_study, load_study
+from rpim_opt.study.studies import find_study, load_study
 from tests import SHARED
 
 REAL = SHARED / "data"

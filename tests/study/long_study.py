@@ -10,8 +10,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from random import Random
 from time import monotonic
@@ -25,8 +27,8 @@ STUDY = f'''"""Do results depend on how often a study was killed?"""
 import os, time
 import numpy as np
 import rpim_opt as ro
-from rpim_opt.study.report import Metric, Report
-from rpim_opt.study.splits import noisier
+from rpim_opt.study import Metric, Report
+from rpim_opt.study.problems import add_noise
 
 QUESTION = "Do results depend on how often a study was killed?"
 METRICS = {{"error": Metric("lower", 0.1)}}
@@ -37,7 +39,7 @@ def cases(quick):
 def run(seed):
     time.sleep(float(os.environ.get("{WAIT}", "0")))
     instance = ro.load("position")
-    problem = instance.problem.on(noisier(instance.problem.data, 2.0, seed))
+    problem = instance.problem.on(add_noise(instance.problem.data, 2.0, seed))
     found = ro.calibrate(problem, ro.tikhonov, 1.0)
     names = [name for name, free in zip(problem.parameters.names, problem.parameters.identified) if free]
     error = float(found.errors(instance.validation).mean())
@@ -64,9 +66,9 @@ def start(study: Path, out: Path, wait: float) -> subprocess.Popen[bytes]:
 
 
 def killed(study: Path, out: Path, wait: float, moments: list[float]) -> list[int]:
-    """Run a study, killed after so many seconds each time; return how many lines its journal had then."""
+    """Run a study, killed after so many seconds each time; return how many replicates its journal had then."""
     lines = []
-    journal = out / "replicates.jsonl"
+    journal = out / "replicates.sqlite"
     for seconds in moments:
         process = start(study, out, wait)
         try:
@@ -74,12 +76,20 @@ def killed(study: Path, out: Path, wait: float, moments: list[float]) -> list[in
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            lines.append(len(journal.read_bytes().splitlines()) if journal.exists() else 0)
-            sys.stderr.write(f"killed after {seconds:.1f} s, {lines[-1]} lines in the journal\n")
+            lines.append(replicates_in(journal))
+            sys.stderr.write(f"killed after {seconds:.1f} s, {lines[-1]} replicates in the journal\n")
     process = start(study, out, wait)
     if process.wait() != 0:
         raise RuntimeError(f"the study ended with exit code {process.returncode}")
     return lines
+
+
+def replicates_in(journal: Path) -> int:
+    """Return how many replicates a journal holds; the one that a kill cut off is none."""
+    if not journal.exists():
+        return 0
+    with closing(sqlite3.connect(journal)) as base:
+        return base.execute("SELECT count(*) FROM replicates").fetchone()[0]
 
 
 def long_study(folder: Path, replicates: int, wait: float, kills: int, seed: int = 0) -> dict[str, object]:
@@ -96,7 +106,7 @@ def long_study(folder: Path, replicates: int, wait: float, kills: int, seed: int
     return {
         "replicates": replicates,
         "seconds": round(seconds),
-        "lines in the journal when killed": lines,
+        "replicates in the journal when killed": lines,
         "files": sorted(path.name for path in (folder / "whole").iterdir()),
         "different": different(folder / "killed", folder / "whole"),
     }

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study import grid
-from rpim_opt.study.runner import run_study
+from rpim_opt.study import studies
+from rpim_opt.study.studies import run_study
 from tests.test_cli import run
 
 MINE = """
@@ -41,20 +41,22 @@ def report(rows):
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a folder of somebody's with a study in a file and one in a folder, as the current one."""
-    grid.load_study.cache_clear()
-    monkeypatch.chdir(tmp_path)
+    studies.load_study.cache_clear()
+    here = tmp_path / "place"
+    here.mkdir()
+    monkeypatch.chdir(here)
     monkeypatch.setattr("sys.path", list(sys.path))
     for module in ("beside", "inside", "inside.deep"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     text = MINE.replace("QUESTION", "STOP = False\nQUESTION", 1)
-    whole = tmp_path / "whole"
-    for file, folder in (("mine.py", tmp_path), ("study.py", whole)):
+    whole = here / "whole"
+    for file, folder in (("mine.py", here), ("study.py", whole)):
         (folder / "inside").mkdir(parents=True)
         (folder / file).write_text(text)
         (folder / "beside.py").write_text("factor = 2")
         (folder / "inside" / "__init__.py").write_text("")
         (folder / "inside" / "deep.py").write_text("extra = 0")
-    return tmp_path
+    return here
 
 
 @pytest.mark.parametrize("name", ["mine", "mine.py", "./mine.py"])
@@ -94,31 +96,116 @@ def test_a_study_without_one_is_a_sentence(place: Path, monkeypatch, capsys) -> 
 
 
 def test_an_installed_package_names_no_studies_of_its_own(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def nowhere() -> Path:
-        raise ro.InputError("the studies", "no folder", "a checkout")
-
-    monkeypatch.setattr(grid, "studies_folder", nowhere)
+    monkeypatch.setattr(studies, "studies_folder", lambda: None)
     with pytest.raises(ro.InputError, match=r"accepted: a file paper.py, or a folder with study.py\.$"):
-        grid.find_study("paper")
+        studies.find_study("paper")
     assert run_study("mine", quick=True)[0].metrics == {"largest": 2}
 
 
-def test_a_journal_knows_the_files_that_a_study_imports_and_no_others(place: Path) -> None:
+def stopped(place: Path, more: str = "") -> None:
+    """Run a study that is stopped after two of four replicates, and go on would."""
     text = (place / "mine.py").read_text()
-    waiting = text.replace("STOP = False", "from pathlib import Path\nSTOP = not Path('go').exists()")
-    (place / "mine.py").write_text(waiting)
+    waiting = f"STOP = not Path({str(place.parent / 'go')!r}).exists()"
+    (place / "mine.py").write_text(f"from pathlib import Path\n{more}\n{text.replace('STOP = False', waiting)}")
     with pytest.raises(KeyboardInterrupt):
         run_study("mine.py")
-    (place / "go").touch()
-    grid.load_study.cache_clear()
-    (place / "other.py").write_text("nobody = 'imports this'")
-    for file in (place / "beside.py", place / "inside" / "deep.py"):
+    (place.parent / "go").touch()
+    studies.load_study.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["beside.py", "inside/deep.py", "data.csv", "deep/er/data.csv", "not imported.py"])
+def test_a_journal_knows_the_files_beside_a_study(place: Path, name: str) -> None:
+    """Once data.csv was changed between the kill and the second half: values 100 101 102 503 ... 507."""
+    file = place / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if not file.exists():
+        file.write_text("100")
+    (place / ".hidden").write_text("of an editor")
+    stopped(place)
+    kept = file.read_text()
+    for change in (lambda: file.write_text(kept + "\n"), file.unlink):
+        change()
+        with pytest.raises(ro.InputError, match=f"resume: found replicates of another file {name}"):
+            run_study("mine.py", resume=True)
+    file.write_text(kept)
+    (place / "new.csv").write_text("another file that it may read")
+    with pytest.raises(ro.InputError, match=r"another file new\.csv"):
+        run_study("mine.py", resume=True)
+    (place / "new.csv").unlink()
+    (place / ".hidden").unlink()
+    (place / "results" / "of others").mkdir()
+    (place / "results" / "of others" / "replicates.json").write_text("{}")
+    assert run_study("mine.py", resume=True)[0].metrics == {"largest": 6}
+
+
+def test_a_study_says_which_files_it_depends_on(place: Path) -> None:
+    elsewhere = place.parent / "elsewhere"
+    (elsewhere / "deep").mkdir(parents=True)
+    (elsewhere / "deep" / "data.csv").write_text("100")
+    for name in ("notes.txt", "table.csv"):
+        (place / name).write_text("1")
+    stopped(place, f"DEPENDS = ['table.csv', '{elsewhere}', '*.none']")
+    (place / "notes.txt").write_text("2")
+    for file in (place / "table.csv", elsewhere / "deep" / "data.csv", place / "beside.py"):
         kept = file.read_text()
-        file.write_text(kept + "\nnew = 1")
-        with pytest.raises(ro.InputError, match="resume: found replicates of another set of studies"):
+        file.write_text(kept + "\n")
+        with pytest.raises(ro.InputError, match=f"another file .*{file.name}"):
             run_study("mine.py", resume=True)
         file.write_text(kept)
-    assert run_study("mine.py", resume=True)[0].metrics == {"largest": 6}
+    _, folder = run_study("mine.py", resume=True)
+    made = (folder / "README.md").read_text()
+    assert "10 files in its folder or named by it have SHA-256" in made
+    assert "others that it reads are not known" in made
+
+
+def test_what_a_study_depends_on_is_there_and_not_endless(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (place / "mine.py").read_text()
+    (place / "mine.py").write_text(f"DEPENDS = ['table.csv']\n{text}")
+    with pytest.raises(ro.InputError, match=r"DEPENDS: found no file 'table\.csv'"):
+        run_study("mine.py")
+    monkeypatch.setattr(studies, "MOST_FILES", 3)
+    with pytest.raises(ro.InputError, match=r"more than 3 files .* DEPENDS = \[\.\.\.\] in the study"):
+        run_study("whole")
+
+
+def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("matplotlib", "joblib", "distributed"):
+        monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, "rpim_opt.study.figures", raising=False)
+    ran = place.parent / "ran"
+    text = (
+        (place / "mine.py")
+        .read_text()
+        .replace("    from inside", f"    open({str(ran)!r}, 'w').close()\n    from inside")
+    )
+    for late in ("", "\n    import matplotlib.pyplot as plt", "\n    from rpim_opt.study import distributions"):
+        studies.load_study.cache_clear()
+        head = f"{late.strip()}\n" if "distributions" in late else ""
+        (place / "mine.py").write_text(head + text.replace("def report(rows):", f"def report(rows):{late}"))
+        for asked in ({}, {"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
+            if late or asked:
+                with pytest.raises(ro.InputError, match=r"no package (matplotlib|joblib|distributed)"):
+                    run_study("mine.py", quick=True, **asked)
+                assert not ran.exists()
+    (place / "mine.py").write_text(
+        text.replace("def report(rows):", "def report(rows):\n    if not rows:\n        import joblib")
+    )
+    studies.load_study.cache_clear()
+    assert run_study("mine.py", quick=True)[0].metrics == {"largest": 2}
+
+
+def test_without_pyarrow_replicates_are_json(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, folder = run_study("mine.py")
+    assert (folder / "replicates.parquet").is_file()
+    before = (folder / "README.md").read_text()
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ro.InputError, match="redraw: found no package pyarrow"):
+        run_study("mine.py", redraw=True)
+    run_study("mine.py")
+    assert sorted(file.name for file in folder.iterdir()) == ["README.md", "metrics.json", "replicates.json"]
+    run_study("mine.py", redraw=True)
+    assert (folder / "README.md").read_text() == before
+    monkeypatch.undo()
 
 
 def test_results_say_whether_the_study_is_the_commits(place: Path) -> None:

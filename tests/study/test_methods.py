@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import Answer, answer_of, methods_of
-from rpim_opt.study.metrics import METRICS, Fitted, measured, metrics_of
+from rpim_opt.study.methods import METRICS, Answer, Fitted, answer_of, measure, methods_of, metrics_of
 
 POSITION = ro.load("position")
 OWN = ro.Formulation("squares", penalty=cp.sum_squares)
@@ -69,7 +68,7 @@ def test_what_a_method_predicts_is_measured_as_what_it_calibrates() -> None:
     assert held_out is not None
     predicts = Answer(predict=lambda q: result.forward(q)[:, :3, 3])
     of = {
-        name: measured(POSITION, answer, 2.0, METRICS)
+        name: measure(POSITION, answer, 2.0, METRICS)
         for name, answer in {"calibrates": answer_of(result, result.problem, ""), "predicts": predicts}.items()
     }
     same = ("rms_mm", "mean_mm", "p95_mm", "max_mm", "fit_rms_mm", "seconds")

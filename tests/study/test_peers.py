@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.study import grid
+from rpim_opt.study import studies
 
 CASE = {"tool": "pybotics", "situation": "clean10", "seed": 0, "quick": True}
 
@@ -45,7 +45,7 @@ class Peer:
 @pytest.fixture
 def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Return the study, with scripts and environments of its own."""
-    study = grid.load_study(grid.find_study("peers"))
+    study = studies.load_study(studies.find_study("peers"))
     shutil.copytree(study.HERE / "peer_scripts", tmp_path / "peer_scripts")
     (tmp_path / ".environments" / "pybotics").mkdir(parents=True)
     monkeypatch.setattr(study, "HERE", tmp_path)
@@ -88,7 +88,7 @@ def test_benchmarks_ask_anew(peers: ModuleType, peer: Peer) -> None:
     """Only times of one run are compared there."""
     case = CASE | {"situation": "clean52"}
     peers.run(**case)
-    benchmarks = grid.load_study(grid.find_study("benchmarks"))
+    benchmarks = studies.load_study(studies.find_study("benchmarks"))
     assert benchmarks.run("peer", count=1, tool="pybotics") == {"xyz: seconds": 2.0}
     assert peers.run(**case)["xyz: seconds"] == 2.0
     assert peer.asked == 2

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.computing import computed
-from rpim_opt.study.grid import files_of, load_study
-from rpim_opt.study.page import lead
-from rpim_opt.study.replicate import UNCONVERGED
-from rpim_opt.study.report import Report, write
-from rpim_opt.study.sources import sources
-from rpim_opt.study.splits import splits_of
-from rpim_opt.study.standing import number
+from rpim_opt.study.page import headline
+from rpim_opt.study.problems import sources_of, splits_of
+from rpim_opt.study.ranking import UNCONVERGED, number
+from rpim_opt.study.replicates import compute
+from rpim_opt.study.studies import Report, load_study, write
 from tests import ROOT
 from tests.study.test_comparison import POSITION, rows_of
 
@@ -35,7 +32,7 @@ def even(size: float) -> dict[str, float | None]:
 
 def test_a_better_method_is_named_with_its_interval() -> None:
     found = compared({"a": even(1.0), "b": even(0.5)})
-    said = lead(found.summary())
+    said = headline(found.summary())
     assert (
         said == "b has the lowest rms_mm: 0.500 times that of a in the geometric mean (95 % interval 0.500 to 0.500)."
     )
@@ -44,16 +41,16 @@ def test_a_better_method_is_named_with_its_interval() -> None:
 def test_a_difference_that_may_be_chance_is_said_to_be_none() -> None:
     sizes = [0.2, 5.0, 0.3, 2.0, 0.4, 1.0]
     found = compared({"a": even(1.0), "b": dict(zip(SIX, sizes, strict=True))})
-    assert lead(found.summary()).endswith("That is no difference that these replicates can tell from none.")
+    assert headline(found.summary()).endswith("That is no difference that these replicates can tell from none.")
 
 
 def test_without_intervals_none_is_said() -> None:
     found = compared({"a": {"p": 1.0}, "b": {"p": 0.5}})
-    assert "interval" not in lead(found.summary())
+    assert "interval" not in headline(found.summary())
     assert any("There are no intervals" in note for note in found.summary().notes)
     alone = compared({"a": {"p": 1.0}}).summary()
     assert not any("There are no intervals" in note for note in alone.notes)
-    assert lead(alone) == "No method is better than a in the geometric mean of rms_mm."
+    assert headline(alone) == "No method is better than a in the geometric mean of rms_mm."
 
 
 def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
@@ -120,19 +117,19 @@ def test_of_many_methods_the_best_have_a_profile_of_their_own() -> None:
 
 def test_problems_come_as_a_pair_or_as_a_file() -> None:
     pair = (POSITION.problem, POSITION.validation)
-    (alone,) = sources(pair)
-    assert (alone.label, alone.made(0).problem) == ("problem", POSITION.problem)
-    (file,) = sources(ROOT / "problems" / "position" / "problem.toml")
+    (alone,) = sources_of(pair)
+    assert (alone.label, alone.instance(0).problem) == ("problem", POSITION.problem)
+    (file,) = sources_of(ROOT / "problems" / "position" / "problem.toml")
     assert file.label == "position"
 
 
 def test_what_is_no_problem_is_said(tmp_path: Path) -> None:
     for given, said in (([], "problems: found none"), (tmp_path, "no problem.toml in")):
         with pytest.raises(ro.InputError, match=said):
-            sources(given)
-    (family,) = sources({"mine": lambda seed: seed})
+            sources_of(given)
+    (family,) = sources_of({"mine": lambda seed: seed})
     with pytest.raises(ro.InputError, match=r"problem mine: found a function of a seed that returns no problem \(7\)"):
-        family.made(7)
+        family.instance(7)
 
 
 def test_folds_need_as_many_configurations() -> None:
@@ -140,31 +137,17 @@ def test_folds_need_as_many_configurations() -> None:
     data = POSITION.problem.data
     few = data.take(np.flatnonzero(data.configuration < 4))
     with pytest.raises(ro.InputError, match="splits: found 4 configurations, accepted: at least 5 for 5 folds"):
-        five.held(few, 1, 0)
+        five.held_out(few, 1, 0)
     with pytest.raises(ro.InputError, match=r"splits: found \[\]"):
         splits_of([])
 
 
 def test_a_scheduler_is_an_address_or_a_client() -> None:
     with pytest.raises(ro.InputError, match="scheduler: found a int, accepted: the address of a Dask scheduler"):
-        list(computed([("a", dict)], 1, 3))
+        list(compute([("a", dict)], 1, 3))
 
 
-def test_a_study_follows_from_the_files_that_it_imports(tmp_path: Path) -> None:
-    """Whatever way they are imported, and however they import each other; no others of its folder."""
-    (tmp_path / "parts").mkdir()
-    texts = {
-        "mine.py": "import helper\nfrom parts import first\ndef run():\n    import late\n",
-        "helper.py": "import mine, numpy\n",
-        "late.py": "",
-        "parts/__init__.py": "",
-        "parts/first.py": "x = (",
-        "other.py": "",
-    }
-    for name, text in texts.items():
-        (tmp_path / name).write_text(text)
-    found = {str(file.relative_to(tmp_path)) for file in files_of(tmp_path / "mine.py")}
-    assert found == set(texts) - {"other.py"}
+def test_a_study_is_a_python_file(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="a Python file"):
         load_study(tmp_path / "study.txt")
 

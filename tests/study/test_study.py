@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import warnings
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +17,9 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.study import grid, provenance, report
-from rpim_opt.study.computing import computed
-from rpim_opt.study.runner import run_study
+from rpim_opt.study import replicates, studies
+from rpim_opt.study.replicates import compute
+from rpim_opt.study.studies import run_study
 from tests.test_cli import run
 
 TOY = """
@@ -51,13 +53,12 @@ def report(rows):
 def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "studies"
     folder.mkdir()
-    for module in (grid, provenance):
-        monkeypatch.setattr(module, "studies_folder", lambda: folder)
+    monkeypatch.setattr(studies, "studies_folder", lambda: folder)
 
     def write(stop: bool = False) -> Path:
-        grid.load_study.cache_clear()
-        log = str(folder / "log.txt")
-        flag = folder / "stop"
+        studies.load_study.cache_clear()
+        log = str(tmp_path / "log.txt")
+        flag = tmp_path / "stop"
         flag.unlink(missing_ok=True)
         if stop:
             flag.touch()
@@ -86,7 +87,7 @@ def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "one" / "metrics.json").read_text()) == one.metrics
     text = (tmp_path / "one" / "README.md").read_text()
     assert text.startswith("# Do random numbers have a mean?\n")
-    for part in ("rpim-opt study toy`", "12 replicates", "numpy", "clarabel", "commit"):
+    for part in ("rpim-opt study toy` (in no repository)", "12 replicates", "numpy", "clarabel"):
         assert part in text
 
 
@@ -104,47 +105,53 @@ def test_a_dask_cluster_gives_the_same(toy, tmp_path: Path) -> None:
     assert values(tmp_path / "here") == values(tmp_path / "there")
 
 
+def entries(journal: Path) -> list[tuple[str, str, str]]:
+    """Return what a journal holds of replicates."""
+    with closing(sqlite3.connect(journal)) as base:
+        return base.execute("SELECT key, found, digest FROM replicates").fetchall()
+
+
 def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
-    folder, out = toy(stop=True), tmp_path / "out"
+    toy(stop=True)
+    out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
-    journal = out / "replicates.jsonl"
-    assert len(journal.read_text().splitlines()) == 1 + 3
-    with journal.open("a") as stream:
-        stream.write('{"case": {"seed": 5}, "fou')  # cut off while it was written
+    journal = out / "replicates.sqlite"
+    assert len(entries(journal)) == 3
     with pytest.raises(ro.InputError, match="resume: found 3 replicates of an interrupted run"):
         run_study("toy", out=out)  # nobody has said that they may be dropped
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out, resume=True)
     toy(stop=False)
-    (folder / "log.txt").unlink()
+    (tmp_path / "log.txt").unlink()
     resumed, _ = run_study("toy", out=out, resume=True)
-    assert (folder / "log.txt").read_text().split() == [str(k) for k in range(3, 12)]
+    assert (tmp_path / "log.txt").read_text().split() == [str(k) for k in range(3, 12)]
     assert not journal.exists()
     fresh, _ = run_study("toy", out=tmp_path / "fresh")
     assert resumed.metrics == fresh.metrics
 
 
 def test_a_killed_study_begins_anew_where_that_is_said(toy, tmp_path: Path) -> None:
-    folder, out = toy(stop=True), tmp_path / "out"
+    toy(stop=True)
+    out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
     toy(stop=False)
-    (folder / "log.txt").unlink()
+    (tmp_path / "log.txt").unlink()
     run_study("toy", out=out, resume=False)
-    assert (folder / "log.txt").read_text().split() == [str(k) for k in range(12)]
+    assert (tmp_path / "log.txt").read_text().split() == [str(k) for k in range(12)]
 
 
 def test_the_gate(toy, tmp_path: Path) -> None:
     folder = toy()
     mean = run_study("toy", quick=True, out=tmp_path / "out")[0].metrics["mean"]
     with pytest.raises(ro.InputError, match="baseline: found none for 'toy-quick'"):
-        report.regressions("toy", True, {"mean": mean})
+        studies.regressions("toy", True, {"mean": mean})
     (folder / "baselines.json").write_text(json.dumps({"toy-quick": {"mean": mean}}))
-    assert report.regressions("toy", True, {"mean": 1.09 * mean}) == []
-    assert "lower is better, tolerance 10%" in report.regressions("toy", True, {"mean": 1.11 * mean})[0]
-    assert report.regressions("toy", True, {})
-    assert report.regressions("toy", True, {"mean": float("nan")})
+    assert studies.regressions("toy", True, {"mean": 1.09 * mean}) == []
+    assert "lower is better, tolerance 10%" in studies.regressions("toy", True, {"mean": 1.11 * mean})[0]
+    assert studies.regressions("toy", True, {})
+    assert studies.regressions("toy", True, {"mean": float("nan")})
 
 
 def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
@@ -163,7 +170,7 @@ def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])
 def test_peers_study_gives_every_tool_the_same_arm(seed: int, tmp_path: Path):
-    peers = grid.load_study(grid.find_study("peers"))
+    peers = studies.load_study(studies.find_study("peers"))
     peers.write_problem(tmp_path, "clean10", seed)
     known = json.loads((tmp_path / "robot.json").read_text())
     rows = np.array(known["alpha_a_theta_d"])
@@ -183,7 +190,7 @@ def test_peers_study_gives_every_tool_the_same_arm(seed: int, tmp_path: Path):
 
 
 def test_peers_study_adds_errors_to_so_many_rows_as_it_says(tmp_path: Path):
-    peers = grid.load_study(grid.find_study("peers"))
+    peers = studies.load_study(studies.find_study("peers"))
     points = {}
     for situation in ("clean52", "blunders52"):
         folder = tmp_path / situation
@@ -235,8 +242,7 @@ def report(rows):
 
 @pytest.mark.slow
 def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (grid, provenance):
-        monkeypatch.setattr(module, "studies_folder", lambda: tmp_path)
+    monkeypatch.setattr(studies, "studies_folder", lambda: tmp_path)
     (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
     here, _ = run_study("monte_carlo", out=tmp_path / "here")
     killed: list[int] = []
@@ -287,7 +293,7 @@ def cluster():
 @pytest.mark.slow
 def test_what_ends_every_worker_of_a_cluster_is_a_sentence(cluster) -> None:
     with pytest.raises(RpimError, match=r"Dask gave a replicate up: .* What was finished is kept"):
-        list(computed([("a", dies)], 1, cluster.scheduler_address))
+        list(compute([("a", dies)], 1, cluster.scheduler_address))
 
 
 @pytest.mark.slow
@@ -296,18 +302,19 @@ def test_a_scheduler_that_dies_is_a_sentence(cluster, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(Future, "result", gives_up)
     with pytest.raises(RpimError, match=r"Dask gave a replicate up: .*connection-lost"):
-        list(computed([("a", dict)], 1, cluster.scheduler_address))
+        list(compute([("a", dict)], 1, cluster.scheduler_address))
 
 
 def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
-    folder, out = toy(), tmp_path / "out"
+    toy()
+    out = tmp_path / "out"
     found, _ = run_study("toy", out=out)
     before = (out / "README.md").read_text()
-    (folder / "log.txt").unlink()
+    (tmp_path / "log.txt").unlink()
     again, _ = run_study("toy", out=out, redraw=True)
     assert again.metrics == found.metrics
     assert (out / "README.md").read_text() == before
-    assert not (folder / "log.txt").exists()  # nothing was computed
+    assert not (tmp_path / "log.txt").exists()  # nothing was computed
     with pytest.raises(ro.InputError, match="no replicates"):
         run_study("toy", out=tmp_path / "empty", redraw=True)
 
@@ -318,75 +325,132 @@ def interrupted(toy, out: Path) -> Path:
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
     toy(stop=False)
-    return out / "replicates.jsonl"
+    return out / "replicates.sqlite"
 
 
-def test_what_was_computed_after_a_cut_line_is_not_lost_at_the_next_kill(toy, tmp_path: Path) -> None:
+def change(journal: Path, statement: str) -> None:
+    with closing(sqlite3.connect(journal, isolation_level=None)) as base:
+        base.executescript(statement)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        "UPDATE replicates SET found = '{\"value\": 0.5}' WHERE key LIKE '%1%'",
+        "UPDATE replicates SET key = '{\"seed\": 7}' WHERE key LIKE '%1%'",
+        "UPDATE replicates SET digest = (SELECT max(digest) FROM replicates)",
+        "UPDATE replicates SET found = NULL",
+        "INSERT INTO replicates VALUES ('{\"seed\": 7}', '{\"value\": 0.5}', NULL)",
+    ],
+)
+def test_a_replicate_that_was_edited_is_refused(toy, tmp_path: Path, edit: str) -> None:
     journal = interrupted(toy, tmp_path / "out")
-    with journal.open("a") as stream:
-        stream.write('{"case": {"seed": 3}, "fou')
+    change(journal, edit)
+    before = journal.read_bytes()
+    with pytest.raises(ro.InputError, match="resume: found a replicate that was changed afterwards: "):
+        run_study("toy", out=tmp_path / "out", resume=True)
+    assert journal.read_bytes() == before
+    run_study("toy", out=tmp_path / "out", resume=False)  # anew
 
-    def stop(done: int, every: int) -> None:
-        if done == 6:
-            raise KeyboardInterrupt
 
+def test_replicates_of_another_journal_are_refused(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    rows = entries(journal)
+    path = tmp_path / "studies" / "toy.py"
+    text = path.read_text()
+    path.write_text(text + "# another study\n")
+    studies.load_study.cache_clear()
+    (tmp_path / "stop").touch()
     with pytest.raises(KeyboardInterrupt):
-        run_study("toy", out=tmp_path / "out", resume=True, progress=stop)
-    entries = [json.loads(line) for line in journal.read_text().splitlines()]
-    assert [entry["case"]["seed"] for entry in entries[1:]] == [0, 1, 2, 3, 4, 5]
+        run_study("toy", out=tmp_path / "other")
+    (tmp_path / "stop").unlink()
+    other = tmp_path / "other" / "replicates.sqlite"
+    with closing(sqlite3.connect(other, isolation_level=None)) as base:
+        base.executemany("REPLACE INTO replicates VALUES (?, ?, ?)", rows)
+    with pytest.raises(ro.InputError, match="a replicate that was changed afterwards"):
+        run_study("toy", out=tmp_path / "other", resume=True)
+
+
+def test_a_byte_of_a_journal_that_changed_costs_no_result(toy, tmp_path: Path) -> None:
+    """It is refused in a sentence, or what was lost is computed again."""
+    journal = interrupted(toy, tmp_path / "out")
+    before = journal.read_bytes()
+    fresh, _ = run_study("toy", out=tmp_path / "fresh")
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(40):
+        content = bytearray(before)
+        content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+        journal.write_bytes(content)
+        try:
+            resumed, _ = run_study("toy", out=tmp_path / "out", resume=True)
+        except RpimError:
+            refused += 1
+        else:
+            assert resumed.metrics == fresh.metrics
+    assert refused
+
+
+def test_a_full_disk_below_a_journal_is_a_sentence(toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what was finished before it is resumed."""
+    toy()
+    real = replicates.SCHEMA
+    monkeypatch.setattr(replicates, "SCHEMA", f"{real}\nPRAGMA max_page_count = 5;")
+    path = tmp_path / "studies" / "toy.py"
+    path.write_text(path.read_text().replace('    return {"value"', '    return {"long": 3000 * "x", "value"'))
+    with pytest.raises(RpimError, match=r"replicates.sqlite: the journal cannot be read or written: .* full"):
+        run_study("toy", out=tmp_path / "out")
+    monkeypatch.setattr(replicates, "SCHEMA", real)
+    done = [json.loads(key)["seed"] for key, _, _ in entries(tmp_path / "out" / "replicates.sqlite")]
+    assert done
+    (tmp_path / "log.txt").unlink()
+    run_study("toy", out=tmp_path / "out", resume=True)
+    assert [int(k) for k in (tmp_path / "log.txt").read_text().split()] == sorted({*range(12)} - {*done})
 
 
 def test_a_journal_of_other_code_is_refused(toy, tmp_path: Path) -> None:
     journal = interrupted(toy, tmp_path / "out")
-    before = journal.read_text()
-    path = provenance.studies_folder() / "toy.py"
+    before = journal.read_bytes()
+    path = studies.studies_folder() / "toy.py"
     path.write_text(path.read_text().replace(".uniform()", ".normal()"))
-    grid.load_study.cache_clear()
-    with pytest.raises(ro.InputError, match="replicates of another set of studies"):
+    studies.load_study.cache_clear()
+    with pytest.raises(ro.InputError, match=r"replicates of another file toy\.py"):
         run_study("toy", out=tmp_path / "out", resume=True)
-    assert journal.read_text() == before
+    assert journal.read_bytes() == before
     run_study("toy", out=tmp_path / "out", resume=False)  # anew
 
 
 ODD = {
-    "a number": "3\n",
-    "a list": "[1, 2]\n",
-    "no case": '{"found": {"value": 1.0}}\n',
-    "a case that is none": '{"case": 3, "found": {"value": 1.0}}\n',
-    "nothing found": '{"case": {"seed": 1}, "found": null}\n',
-    "no JSON": "never\n",
-    "too deep": "[" * 100_000 + "\n",
-    "too many digits": "1" * 5000 + "\n",
-    "no text": b"\xff\xfe\n",
-    "zero bytes": b"\0" * 40 + b"\n",
+    "a table": b"label,q1_deg\nA,1\n",
+    "zero bytes": b"\0" * 4096,
+    "no text": b"\xff\xfe",
+    "half a database": b"SQLite format 3\0" + b"\x10\0\1\1",
+    "a link to a device": b"",
 }
 
 
 @pytest.mark.parametrize("odd", ODD)
-@pytest.mark.parametrize("place", ["first", "last"])
-def test_odd_lines_of_a_journal_are_one_sentence(
-    toy, tmp_path: Path, monkeypatch, capsys, odd: str, place: str
-) -> None:
+def test_odd_journals_are_one_sentence(toy, tmp_path: Path, monkeypatch, capsys, odd: str) -> None:
     journal = interrupted(toy, tmp_path / "out")
-    line = ODD[odd]
-    if isinstance(line, str):
-        line = line.encode()
-    old = journal.read_bytes()
-    content = old + line
-    if place == "first":
-        content = line + old
-    journal.write_bytes(content)
+    journal.write_bytes(ODD[odd])
+    if "link" in odd:
+        journal.unlink()
+        journal.symlink_to("/dev/null")
     assert run(monkeypatch, "study", "toy", "--resume", "--out", str(tmp_path / "out")) == 2
     said = capsys.readouterr().err
-    assert f"line {1 if place == 'first' else 5}: found" in said
-    assert journal.read_bytes() == content
+    assert "replicates.sqlite" in said
+    assert said.count("\n") == 1
+    assert journal.read_bytes() == ODD[odd]
 
 
-def test_a_journal_cut_in_its_first_line_begins_anew(toy, tmp_path: Path) -> None:
+def test_a_journal_that_was_only_begun_begins_anew(toy, tmp_path: Path) -> None:
     journal = interrupted(toy, tmp_path / "out")
-    journal.write_bytes(journal.read_bytes()[:20])
-    found, _ = run_study("toy", out=tmp_path / "out", resume=True)
-    assert found.metrics == run_study("toy", out=tmp_path / "fresh")[0].metrics
+    fresh = run_study("toy", out=tmp_path / "fresh")[0].metrics
+    for content in (b"", None):
+        journal.write_bytes(b"")
+        if content is None:
+            change(journal, "CREATE TABLE code (part TEXT PRIMARY KEY, digest TEXT)")
+        assert run_study("toy", out=tmp_path / "out", resume=True)[0].metrics == fresh
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
@@ -410,14 +474,12 @@ def test_a_study_writes_all_its_results_or_none(toy, tmp_path: Path, monkeypatch
     real = os.fsync
 
     def full(handle: int) -> None:
-        if not os.readlink(f"/proc/self/fd/{handle}").endswith(".jsonl"):
-            raise OSError(28, "No space left on device")
-        real(handle)
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ro.basics.RpimError, match="No space left"):
         run_study("toy", out=out)
-    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "replicates.jsonl"}
+    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "replicates.sqlite"}
     assert after == before
     monkeypatch.setattr(os, "fsync", real)
     resumed, _ = run_study("toy", out=out, resume=True)  # nothing is computed again
@@ -431,11 +493,10 @@ def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> N
         subprocess.run(command, check=True, capture_output=True)
 
     (tmp_path / "studies").mkdir()
-    for module in (grid, provenance):
-        monkeypatch.setattr(module, "studies_folder", lambda: tmp_path / "studies")
+    monkeypatch.setattr(studies, "studies_folder", lambda: tmp_path / "studies")
 
     def made_by_toy() -> str:
-        return provenance.made_by(tmp_path / "studies" / "toy.py", False, 1)
+        return studies.made_by(tmp_path / "studies" / "toy.py", False, 1, {})
 
     git("init")
     git("commit", "--allow-empty", "-m", "first")
@@ -445,7 +506,7 @@ def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> N
     (tmp_path / "studies" / "results" / "README.md").write_text("of another study")
     assert "dirty" not in made_by_toy()
     (tmp_path / "studies" / "toy.py").write_text("QUESTION = 1")
-    assert "-dirty" in made_by_toy()
+    assert "untracked" in made_by_toy()
 
 
 def test_a_broken_table_of_replicates_is_one_sentence(toy, tmp_path: Path) -> None:

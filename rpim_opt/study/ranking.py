@@ -1,0 +1,336 @@
+"""Methods ranked by what each does on the same replicates, with intervals of what is independent."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr, stdtrit
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.tables import frame_of
+from rpim_opt.basics.text import html_table, listed, table
+
+OK = "ok"
+UNCONVERGED = "not converged"
+IMPOSSIBLE = "impossible"
+FAILED = "failed"
+WITH_FIGURES = (OK, UNCONVERGED)
+"""Statuses of replicates that have figures."""
+TIE = 0.01
+"""Errors that differ by no more than this part are a tie."""
+ENOUGH = 5
+"""Problems from which on an interval speaks of problems like them; with fewer, of these."""
+BOOTSTRAP_DRAWS = 4000
+CONFIDENCE = 0.95
+SAME_DATA = ("problem", "split", "fold", "count", "noise_factor", "seed")
+"""Columns in which two replicates of a pair agree: then they saw the same data."""
+Pair = tuple[Any, ...]
+Rows = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How a method does, and how it does against the reference on the same replicates.
+
+    Parameters
+    ----------
+    method
+        Its label.
+    replicates, missing, unconverged
+        How many there are, how many of them have no figure, and how many did not converge (their figures count).
+    median, worst
+        Of its figures.
+    ratio
+        Geometric mean of its figures over those of the reference; every problem counts the same. None without pairs.
+    low, high
+        Ends of the 95 % interval of that ratio; None where there is too little to say.
+    wins, ties, losses
+        Replicates on which it is better than the reference, as good within 1 %, or worse; one without a figure loses
+        against one with.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5)
+    >>> second = found.summary().standings[1]
+    >>> second.method, second.replicates, second.wins + second.ties + second.losses, second.different
+    ('least_squares', 5, 5, False)
+    """
+
+    method: str
+    replicates: int
+    missing: int
+    unconverged: int
+    median: float | None
+    worst: float | None
+    ratio: float | None
+    low: float | None
+    high: float | None
+    wins: int
+    ties: int
+    losses: int
+
+    @property
+    def different(self) -> bool:
+        """Whether the interval of the ratio leaves one out."""
+        return self.low is not None and self.high is not None and not self.low <= 1 <= self.high
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Methods by their figures, those that are best in the geometric mean first.
+
+    Parameters
+    ----------
+    metric
+        What is compared; less is better.
+    reference
+        The method that the others are compared with.
+    standings
+        One a method that has figures.
+    notes
+        What a reader must know: of what the intervals speak, and what has no figures, with the reason.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
+    >>> summary = found.summary(against="tikhonov, 1")
+    >>> [each.method for each in summary.standings]
+    ['tikhonov, 1', 'tikhonov, reml', 'lasso, 1']
+    >>> summary.header[:2], summary.cells()[0][3:]
+    (('method', 'median rms_mm'), ['1', 'reference', ''])
+    >>> summary.notes[-1]
+    "lasso, reml: impossible, 5 of 5 replicates. Selector reml: found formulation 'lasso', accepted: ..."
+    >>> len(summary.to_frame())
+    3
+    """
+
+    metric: str
+    reference: str
+    standings: tuple[Standing, ...]
+    notes: tuple[str, ...]
+
+    def to_frame(self) -> Any:
+        """Return the standings as a data frame (pandas, or polars where that is missing)."""
+        return frame_of([asdict(each) for each in self.standings])
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """What the columns are called."""
+        over = f"over {self.reference}"
+        columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse")
+        return (*columns, "no figure") if self._some_missing else columns
+
+    def cells(self) -> list[list[str]]:
+        """Return the table's rows as text."""
+        return [self._cells(each) for each in self.standings]
+
+    def _cells(self, each: Standing) -> list[str]:
+        interval = ""
+        if each.low is not None and each.high is not None:
+            interval = f"{number(each.low)} to {number(each.high)}{' *' if each.different else ''}"
+        against = [number(each.ratio), interval, f"{each.wins}/{each.ties}/{each.losses}"]
+        if each.method == self.reference:
+            against = ["1", "reference", ""]
+        missing = [f"{each.missing} of {each.replicates}"] if self._some_missing else []
+        return [each.method, number(each.median), number(each.worst), *against, *missing]
+
+    @property
+    def _some_missing(self) -> bool:
+        return any(each.missing for each in self.standings)
+
+    def __str__(self) -> str:
+        """Return the table and the notes."""
+        return "\n".join([table(self.header, self.cells()), "", *self.notes])
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook."""
+        return html_table(self.header, self.cells(), self.notes)
+
+
+def number(value: float | None) -> str:
+    """Return a figure with three digits; nothing for none."""
+    if value is None:
+        return ""
+    if 1e-3 <= abs(value) < 1e4:
+        power = int(f"{value:e}".partition("e")[2])
+        return f"{value:.{max(2 - power, 0)}f}"
+    return f"{value:.3g}"
+
+
+def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) -> Summary:
+    """Return the methods in their order, each against a reference; ``drawn`` are problems that a seed draws."""
+    of = figures(rows, metric)
+    known = [_standing(rows, method, of[method], of[reference], drawn) for method in of if of[method]]
+    known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
+    return Summary(metric, reference, tuple(known), _notes(rows, known, drawn, reference))
+
+
+def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
+    """Return the figures of every method, by what they were measured on."""
+    of: dict[str, dict[Pair, float]] = {}
+    for row in rows:
+        own = of.setdefault(row["method"], {})
+        if row.get(metric) is not None:
+            own[_pair(row)] = row[metric]
+    return of
+
+
+def geometric_mean(ratios: Sequence[float] | Array) -> float:
+    """Return the mean of ratios that treats twice and half alike.
+
+    Parameters
+    ----------
+    ratios
+        Positive numbers (N,).
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> round(ro.study.geometric_mean([0.5, 2.0]), 12)
+    1.0
+    """
+    return float(np.exp(np.mean(np.log(ratios))))
+
+
+def _pair(row: Mapping[str, Any]) -> Pair:
+    return tuple(row[name] for name in SAME_DATA)
+
+
+def _standing(
+    rows: Rows, method: str, own: Mapping[Pair, float], other: Mapping[Pair, float], drawn: AbstractSet[str]
+) -> Standing:
+    mine = [row for row in rows if row["method"] == method]
+    ratios = {pair: _log_ratio(own[pair], other[pair]) for pair in own if pair in other}
+    ratio, low, high = interval(ratios, drawn)
+    compared = {_pair(row) for row in mine} & (set(own) | set(other))
+    wins = sum(pair in own and (pair not in other or ratios[pair] < -TIE) for pair in compared)
+    losses = sum(pair in other and (pair not in own or ratios[pair] > TIE) for pair in compared)
+    return Standing(
+        method=method,
+        replicates=len(mine),
+        missing=len(mine) - len(own),
+        unconverged=sum(row["status"] == UNCONVERGED for row in mine),
+        median=float(np.median(list(own.values()))),
+        worst=max(own.values()),
+        ratio=ratio,
+        low=low,
+        high=high,
+        wins=wins,
+        ties=len(compared) - wins - losses,
+        losses=losses,
+    )
+
+
+def _log_ratio(one: float, other: float) -> float:
+    """Return the logarithm of a ratio; figures that are zero are as good as a rounding error."""
+    least = np.finfo(float).tiny
+    return float(np.log(max(one, least) / max(other, least)))
+
+
+def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[float | None, float | None, float | None]:
+    """Return the geometric mean of paired ratios, given as logarithms, and the ends of its 95 % interval.
+
+    Replicates of one problem have the problem in common. The mean is over problems, of each one's mean; and with five
+    problems or more it is they that are drawn anew (cluster bootstrap), so that the interval speaks of other problems
+    like these. With fewer, what is independent within each is: the arms of a family, the seeds or else the folds of a
+    measured one; then it speaks of other such arms, seeds or folds. Percentiles are those of Hesterberg (2015, The
+    American Statistician 69), wider for few.
+    """
+    if not ratios:
+        return None, None, None
+    groups = [_independent(label, ratios, drawn) for label in dict.fromkeys(pair[0] for pair in ratios)]
+    means = np.array([each.mean() for each in groups])
+    middle = float(np.exp(means.mean()))
+    rng = np.random.default_rng(0)
+    count = len(means)
+    if count >= ENOUGH:
+        drawn_means = rng.choice(means, (BOOTSTRAP_DRAWS, count)).mean(axis=1)
+    else:
+        count = min(len(each) for each in groups)
+        if count < ENOUGH:
+            return middle, None, None
+        within = [rng.choice(each, (BOOTSTRAP_DRAWS, len(each))).mean(axis=1) for each in groups]
+        drawn_means = np.mean(within, axis=0)
+    beyond = ndtr(np.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - CONFIDENCE) / 2))
+    low, high = np.quantile(drawn_means, [beyond, 1 - beyond])
+    return middle, float(np.exp(low)), float(np.exp(high))
+
+
+def _independent(label: str, ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> Array:
+    """Return the means (parts,) of what is independent in a problem: seeds, or folds where seeds are few."""
+    own = {pair: ratio for pair, ratio in ratios.items() if pair[0] == label}
+    by_seed = label in drawn or len({pair[-1] for pair in own}) >= ENOUGH
+    parts: dict[Pair, list[float]] = {}
+    for pair, ratio in own.items():
+        part = (pair[-1],) if by_seed else (pair[-1], *pair[1:3])
+        parts.setdefault(part, []).append(ratio)
+    return np.array([float(np.mean(each)) for each in parts.values()])
+
+
+def profiles(rows: Rows, metric: str) -> dict[str, Array]:
+    """Return every method's figures over the best one of the same replicate, sorted, (N,); infinite without figure.
+
+    At ratio tau, the share of these below tau is the performance profile (Dolan and Moré, Mathematical Programming 91,
+    2002).
+    """
+    of = figures(rows, metric)
+    best: dict[Pair, float] = {}
+    for own in of.values():
+        for pair, value in own.items():
+            best[pair] = min(value, best.get(pair, np.inf))
+    return {
+        method: np.sort([np.exp(_log_ratio(own[pair], best[pair])) if pair in own else np.inf for pair in best])
+        for method, own in of.items()
+    }
+
+
+def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
+    """Return what a reader must know besides the table."""
+    said = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
+    compared = sum(each.low is not None and each.method != reference for each in standings)
+    if compared:
+        said.append(_scope({row["problem"] for row in rows}, drawn, compared))
+    elif len(standings) > 1:
+        few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"
+        said.append(f"There are no intervals: {few}.")
+    late = sum(each.unconverged for each in standings)
+    if late:
+        said.append(f"{late} replicates did not converge; their figures count (column status).")
+    every = Counter(row["method"] for row in rows)
+    for (method, status, reason), problems in without_figures(rows).items():
+        where = ""
+        if len(problems) < every[method]:
+            where = f" ({listed(list(dict.fromkeys(problems)), 4)})"
+        count = f"{len(problems)} of {every[method]} replicates{where}"
+        said.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
+    return tuple(said)
+
+
+def _scope(problems: set[str], drawn: AbstractSet[str], compared: int) -> str:
+    """Say what the intervals speak of, and how many are wrong by chance."""
+    scope = f"other problems like these {len(problems)}"
+    if len(problems) < ENOUGH and problems <= drawn:
+        scope = "other arms of the same family"
+    elif len(problems) < ENOUGH:
+        scope = "these problems alone, with other seeds or folds"
+    said = f"Intervals speak of {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
+    if compared > 1:
+        chance = (1 - CONFIDENCE) * compared
+        said += f" Each is for itself: where nothing differs, {chance:.2g} of {compared} would be marked by chance."
+    return said
+
+
+def without_figures(rows: Rows) -> dict[tuple[str, str, str], list[str]]:
+    """Return the problems of replicates without figures, by method, status and reason."""
+    of: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        if row["status"] not in WITH_FIGURES:
+            of.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
+    return of

@@ -1,0 +1,383 @@
+"""Studies: a question with cases in a Python file, run in parallel, resumed, and gated against a baseline."""
+
+from __future__ import annotations
+
+import ast
+import glob
+import importlib.util
+import io
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from hashlib import sha256
+from itertools import product
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import json_text, read_json
+from rpim_opt.basics.inputs import LARGEST_DATA, require_file
+from rpim_opt.basics.writing import refused, write_files
+from rpim_opt.study.provenance import SHORT, commit, file_state, package_code, package_state, versions
+from rpim_opt.study.replicates import Progress, Row, open_journal, require_package
+
+NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
+"""What a study has: a text, a `Metric` for each figure that is held, and three functions."""
+FILE = "study.py"
+"""The study of a folder."""
+MOST_FILES = 10_000
+MOST_BYTES = 4_000_000_000
+"""Of the files beside a study, each of which is read before its replicates are resumed."""
+EXTRA = {"distributed", "joblib", "matplotlib", "pandas", "pyarrow"}
+"""Packages of the extra ``studies``."""
+REPLICATES = "replicates"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of a study that must not get worse: its direction, and by how much of the baseline it may vary.
+
+    Parameters
+    ----------
+    better
+        ``"lower"`` or ``"higher"``.
+    tolerance
+        What part of the baseline it may be worse by.
+
+    Examples
+    --------
+    >>> from rpim_opt.study import Metric
+    >>> METRICS = {"mean error [mm]": Metric("lower", 0.1)}  # of a file in the folder studies
+    """
+
+    better: str
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Report:
+    """The answer of a study.
+
+    Parameters
+    ----------
+    text
+        Markdown.
+    metrics
+        Figures that a baseline is compared with, by the names of the study's METRICS.
+    figures
+        matplotlib figures by name.
+
+    Examples
+    --------
+    >>> from rpim_opt.study import Report
+    >>> Report("The error falls with the root of the number of poses.", {"mean error [mm]": 0.03}).metrics
+    {'mean error [mm]': 0.03}
+    """
+
+    text: str
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- where a study is ------------------------------------------------------------------------------------------------
+
+
+def studies_folder() -> Path | None:
+    """Return the folder ``studies`` of the checkout; an installed package has none."""
+    folder = Path(__file__).resolve().parents[2] / "studies"
+    return folder if folder.is_dir() else None
+
+
+def find_study(name: str | Path) -> Path:
+    """Return the file of a study: of a path, of a folder with ``study.py``, or of a name.
+
+    A name is looked for among the studies of the checkout, and then in the current folder.
+    """
+    text = str(name)
+    if text.endswith(".py") or os.sep in text or "/" in text or text in (".", ".."):
+        path = Path(text)
+        if path.is_dir():
+            path = path / FILE
+        if not path.is_file():
+            raise InputError("study", f"no file '{path}'", f"a Python file with a study, or a folder with {FILE}")
+        return path.resolve()
+    own = studies_folder()
+    known = {path.stem: path for path in sorted(own.glob("*.py"))} if own else {}
+    if text in known:
+        return known[text]
+    for place in (Path(f"{text}.py"), Path(text, FILE), Path("studies", f"{text}.py"), Path("studies", text, FILE)):
+        if place.is_file():
+            return place.resolve()
+    accepted = f"a file {text}.py, or a folder with {FILE}"
+    if known:
+        accepted += f", or a study of the checkout: {choices(text, known)}"
+    raise InputError("study", f"'{text}'", accepted)
+
+
+def _name(path: Path) -> str:
+    """Return what a study is called: its file, or its folder where that holds ``study.py``."""
+    if path.name == FILE:
+        return path.parent.name
+    return path.stem
+
+
+@lru_cache(maxsize=8)
+def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
+    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case), report(rows).
+
+    If it has prepare(quick), that is called once before the first case. It may import files beside it.
+    """
+    spec = importlib.util.spec_from_file_location(f"study_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise InputError("the study", str(path), "a Python file")
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        for package in sorted(EXTRA & set(_imports(ast.parse(path.read_bytes())))):
+            require_package(package, "the study")
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise InputError(f"line {error.lineno}", str(error.msg), "Python", path) from None
+    except ModuleNotFoundError as error:
+        raise InputError("the study", f"no package {error.name}", "pip install it", path) from None
+    missing = [name for name in needed if not hasattr(module, name)]
+    if missing:
+        raise InputError("the study", f"no '{missing[0]}'", ", ".join(needed), path)
+    return module
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    """Yield the packages that are imported without a condition, also inside functions."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name.partition(".")[0] for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and not node.level:
+        yield str(node.module).partition(".")[0]
+    elif not isinstance(node, ast.If | ast.Try):
+        for child in ast.iter_child_nodes(node):
+            yield from _imports(child)
+
+
+# --- what its replicates follow from ---------------------------------------------------------------------------------
+
+
+def files_of(path: Path, study: ModuleType) -> dict[str, str]:
+    """Return digests of the files that a study's replicates follow from, by their names in its folder.
+
+    That is whatever lies in its folder. Where the study says ``DEPENDS = ["data/*.csv"]``, it is that and Python files;
+    hidden files and results of studies never count.
+    """
+    folder = path.parent
+    stated = getattr(study, "DEPENDS", None)
+    files = list(_beside(folder))
+    if stated is not None:
+        files = [file for file in files if file.suffix == ".py"]
+        for pattern in stated:
+            matches = [Path(match) for match in glob.glob(str(folder / pattern), recursive=True)]
+            if not matches and not glob.has_magic(str(pattern)):
+                raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
+            for match in matches:
+                files += _beside(match) if match.is_dir() else [match]
+    return {os.path.relpath(file, folder): _digest(file) for file in sorted(set(files))}
+
+
+def _beside(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and below it."""
+    count = 0
+    size = 0
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
+        if any(name.startswith(f"{REPLICATES}.") for name in names):  # results of a study
+            folders.clear()
+            continue
+        for file in (Path(place, name) for name in names if not name.startswith(".")):
+            if file.is_file():
+                count += 1
+                size += file.stat().st_size
+                yield file
+            if count > MOST_FILES or size > MOST_BYTES:
+                found = f"more than {MOST_FILES} files or {MOST_BYTES / 1e9:g} GB in {folder}"
+                raise InputError("DEPENDS", found, "DEPENDS = [...] in the study: names of the files that it reads")
+
+
+def _digest(file: Path) -> str:
+    try:
+        with file.open("rb") as stream:
+            content = sha256()
+            while chunk := stream.read(1 << 20):
+                content.update(chunk)
+    except OSError:  # nor can the study read it
+        return "unreadable"
+    return content.hexdigest()
+
+
+def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
+    """Say which command, commit, files and versions make the replicates."""
+    own = path.parent == studies_folder()
+    command = f"rpim-opt study {_name(path) if own else path.name}{' --quick' if quick else ''}"
+    if own:
+        root = path.parent.parent
+        source = f" ({commit(root, *(root / name for name in ('rpim_opt', 'studies', 'problems')))})"
+    else:
+        source = f", {file_state(path)}, with {package_state()}"
+    digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
+    known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
+    return f"Made by `{command}`{source}: {count} replicates, {versions()}. {known}."
+
+
+# --- a run -----------------------------------------------------------------------------------------------------------
+
+
+def run_study(
+    name: str | Path,
+    quick: bool = False,
+    workers: int = 1,
+    scheduler: Any = None,
+    resume: bool | None = None,
+    redraw: bool = False,
+    out: Path | None = None,
+    progress: Progress = lambda _done, _every: None,
+) -> tuple[Report, Path]:
+    """Run a study and write its results.
+
+    Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
+    computes them. A finished replicate is written down at once; ``resume`` takes those up.
+
+    Parameters
+    ----------
+    name
+        A file ``mine.py``, a folder with ``study.py``, or a study of the checkout without its ending.
+    quick
+        The small version.
+    workers
+        Processes on this machine (joblib).
+    scheduler
+        Address of a Dask scheduler to compute on instead, or a client of one.
+    resume
+        Go on where an interrupted run was; if false everything is computed anew. With None that is refused as long as
+        replicates of an interrupted run are there.
+    redraw
+        Compute nothing: write the report anew from the replicates of the last run, which say what made them.
+    out
+        Where results go; ``results/NAME`` or ``results/NAME-quick`` beside the study by default.
+    progress
+        Told how many replicates of how many are done.
+
+    Returns
+    -------
+    The report and the folder that holds ``README.md``, ``metrics.json``, the replicates and the figures.
+    """
+    path = find_study(name)
+    study = load_study(path)
+    folder = out or path.parent / "results" / _label(path, quick)
+    with refused(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    if redraw:
+        rows, made = read_replicates(folder)
+        report = study.report(rows)
+        write(folder, study.QUESTION, report, made, {})
+        return report, folder
+    if hasattr(study, "prepare"):
+        study.prepare(quick)
+    cases = study.cases(quick)
+    files = files_of(path, study)
+    made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
+    code = {**{f"file {file}": digest for file, digest in files.items()}, **package_code()}
+    with open_journal(folder / f"{REPLICATES}.sqlite", cases, code, resume) as journal:
+        tasks = [(key, partial(_run, path, case)) for key, case in journal.waiting]
+        journal.fill(tasks, workers, scheduler, progress)
+        report = study.report(journal.rows)
+        write(folder, study.QUESTION, report, made, replicate_file(journal.rows, made))
+        journal.remove()
+    return report, folder
+
+
+def _label(path: Path, quick: bool) -> str:
+    return f"{_name(path)}-quick" if quick else _name(path)
+
+
+def _run(path: Path, case: Mapping[str, Any]) -> Row:
+    return load_study(path).run(**case)
+
+
+def replicate_file(rows: list[Row], made: str) -> dict[str, bytes]:
+    """Return the replicates as a Parquet file, or as JSON without pyarrow, with what made them; by its name."""
+    if importlib.util.find_spec("pyarrow") is None:
+        return {f"{REPLICATES}.json": json_text({"made": made, "replicates": rows}).encode()}
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = pa.table({key: [row.get(key) for row in rows] for key in columns})
+    stream = io.BytesIO()
+    parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
+    return {f"{REPLICATES}.parquet": stream.getvalue()}
+
+
+def read_replicates(folder: Path) -> tuple[list[Row], str]:
+    """Return the replicates of an earlier run, without what a replicate does not have, and what made them."""
+    text = folder / f"{REPLICATES}.json"
+    path = folder / f"{REPLICATES}.parquet"
+    accepted = "the replicates of a study"
+    if text.exists():
+        content = read_json(text)
+        if not isinstance(content, dict) or not isinstance(content.get("replicates"), list):
+            raise InputError("redraw", "no replicates", accepted, text)
+        return content["replicates"], str(content.get("made"))
+    if not path.exists():
+        raise InputError("redraw", "no replicates", "a study that was run before", path)
+    require_file(path, LARGEST_DATA)
+    require_package("pyarrow", "redraw")
+    from pyarrow import parquet
+
+    try:
+        table = parquet.read_table(path)
+        made = (table.schema.metadata or {}).get(b"made", b"").decode()
+    except (OSError, ValueError) as error:
+        raise InputError("redraw", str(error), accepted, path) from None
+    return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made
+
+
+def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:
+    """Write ``README.md`` with the figures, ``metrics.json`` and the file of the replicates: all, or none."""
+    pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
+    text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
+    files = dict(replicates)
+    if report.figures:
+        from rpim_opt.study.figures import picture
+
+        for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
+            files[f"{title}.{kind}"] = picture(figure, title, kind)
+    files["README.md"] = (text + "\n").encode()
+    files["metrics.json"] = json_text(dict(report.metrics)).encode()
+    with refused(folder):
+        write_files({folder / name: content for name, content in files.items()})
+        for kind in ("json", "parquet"):
+            if replicates and f"{REPLICATES}.{kind}" not in replicates:
+                (folder / f"{REPLICATES}.{kind}").unlink(missing_ok=True)
+
+
+def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:
+    """Return a sentence for every metric that is worse than ``baselines.json`` beside the study allows."""
+    file = find_study(name)
+    path = file.parent / "baselines.json"
+    known: dict[str, dict[str, float]] = {}
+    if path.is_file():
+        known = read_json(path)
+    label = _label(file, quick)
+    if label not in known:
+        raise InputError("baseline", f"none for '{label}'", choices(label, known), path)
+    rules = load_study(file).METRICS
+    worse = []
+    for metric, baseline in known[label].items():
+        rule = rules[metric]
+        value = metrics.get(metric)
+        sign = 1 if rule.better == "lower" else -1
+        if value is None or not sign * (value - baseline) <= rule.tolerance * abs(baseline):
+            bound = f"{rule.better} is better, tolerance {rule.tolerance:.0%}"
+            worse.append(f"{metric}: found {value}, baseline {baseline}, {bound}")
+    return worse
