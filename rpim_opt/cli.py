@@ -367,7 +367,7 @@ def update(
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import sha256_of
-        from rpim_opt.use.updating import update
+        from rpim_opt.use.recalibration import update
         from rpim_opt.use.validation import read_measurements
 
         rows, left_out = read_measurements(loaded, data, measurement, units)

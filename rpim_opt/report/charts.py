@@ -18,7 +18,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
 
 if TYPE_CHECKING:
-    from rpim_opt.use.monitored import Monitoring
+    from rpim_opt.use.monitoring import Monitoring
 
 
 MODELS = {"before": "nominal", "after": "identified"}

@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.writing import refused, write_text
 from rpim_opt.report.chart import Chart, Picture
 from rpim_opt.report.charts import checks_charts, mm
-from rpim_opt.use.monitored import Monitoring
+from rpim_opt.use.monitoring import Monitoring
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 

@@ -1,29 +1,45 @@
-"""Checks of a calibrated robot over time, and whether it drifts."""
+"""Drift of a calibrated robot in check readings over time: each check, their cumulative sum, and every parameter."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.text import listed
+from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import misread
+from rpim_opt.calibration.intervals import scattered
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.convex.structure import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.tables.joining import seconds, time_column
-from rpim_opt.use.carried import Carried
-from rpim_opt.use.cusum import cumulative, limit
-from rpim_opt.use.drifts import likeliest
-from rpim_opt.use.innovations import innovations
-from rpim_opt.use.monitored import RARE, Monitoring
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.use.changes import Cause, Misfit, candidates
+from rpim_opt.use.recalibration import Recalibration
 from rpim_opt.use.validation import read_table
 
+FALSE_ALARM = 0.01
+"""Probability that a robot that does not drift is said to."""
 TESTS = 3
-"""Questions that checks are asked: each alone, their sum, and every parameter. Each may err by a third of `RARE`."""
+"""Each check alone, their sum, and every parameter: each test may err by a third of `FALSE_ALARM`."""
+MOMENTS = 40
+"""Checks before which a change is looked for; of more so many, evenly."""
+SMALLEST = 1e-12
+"""Probabilities are taken as no smaller: beyond 7 standard deviations nobody asks how far."""
+ALLOWANCE = 0.5
+"""CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much."""
+CELLS = 150
+"""Steps of a sum's range in the Markov chain of its distribution."""
+HIGHEST_LIMIT = 50.0
 
 
 class Checks(NamedTuple):
@@ -35,12 +51,198 @@ class Checks(NamedTuple):
     left_out: tuple[str, ...]
 
 
-def monitor(result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = ()) -> Monitoring:
-    """Compare checks over time with what a calibration predicts: each alone, and what they miss together.
+class Drift(NamedTuple):
+    """A change during checks.
 
-    A check is judged by the interval of a new reading, with what the calibration and all checks before it leave open;
-    what they miss is summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
-    some check or steadily. A robot that does not drift is accused with probability `RARE` in all.
+    Its cause, the number of the first check after it, whether it is steady from the first to the last check, and by how
+    much a single parameter moved in all, with its standard deviation [SI] (None for a frame).
+    """
+
+    cause: Cause
+    first: int
+    steady: bool
+    change: float | None
+    std: float | None
+    dimension: str
+
+    def content(self) -> dict[str, Any]:
+        """Return it as a document [mm, deg]."""
+        unit, si = display(self.dimension)
+        change = None
+        if self.change is not None and self.std is not None:
+            change = {"unit": unit, "change": self.change / si, "std": self.std / si}
+        return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": change}
+
+
+@dataclass(frozen=True, eq=False)
+class Monitoring:
+    """Checks of a robot in the order of time, against what its calibration predicts.
+
+    Parameters
+    ----------
+    label, times
+        Names of the N checks, and their times as the table states them; empty without.
+    when
+        (N,) times [s]; None without.
+    error
+        (N,) errors against the calibration [m].
+    sigmas, allowed
+        (N,) innovation of a check, beyond the calibration and the checks before it, in standard deviations of a new
+        reading, and the limit that one of all N rarely exceeds.
+    sums, limit
+        (N,) their cumulative sum (CUSUM), and the limit that it rarely exceeds.
+    drift
+        The change that explains them best; None where chance does.
+    mistake
+        The likely mistake in the checks, in a sentence; empty where there is none.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
+    >>> found.alarm, found.beyond, str(found).splitlines()[0]
+    (None, (), 'No drift in 40 checks.')
+    """
+
+    label: tuple[str, ...]
+    times: tuple[str, ...]
+    when: Array | None
+    error: Array
+    sigmas: Array
+    allowed: Array
+    sums: Array
+    limit: float
+    drift: Drift | None = None
+    mistake: str = ""
+
+    @property
+    def beyond(self) -> tuple[int, ...]:
+        """Numbers of the checks beyond the interval of a new reading."""
+        return tuple(int(i) for i in np.flatnonzero(self.sigmas > self.allowed))
+
+    @property
+    def alarm(self) -> int | None:
+        """The first check at which the sum passes its limit; None where it does not."""
+        passed = np.flatnonzero(self.sums > self.limit)
+        if not len(passed):
+            return None
+        return int(passed[0])
+
+    @property
+    def drifts(self) -> bool:
+        """Whether one check, their sum, or a parameter shows drift.
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).drifts
+        False
+        """
+        return bool(self.beyond) or self.alarm is not None or self.drift is not None
+
+    def content(self) -> dict[str, Any]:
+        """Return the figures, and the chart's points [mm].
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation).content()
+        >>> found["drifts"], found["checks"], list(found["rows"][0])
+        (False, 40, ['label', 'error_mm', 'sigmas', 'allowed_sigmas', 'sum'])
+        """
+        alarm = since = moved = None
+        if self.alarm is not None:
+            alarm, since = self.label[self.alarm], self.label[self._since(self.alarm)]
+        if self.drift is not None:
+            moved = {**self.drift.content(), "label": self.label[self.drift.first]}
+        return {
+            "drifts": self.drifts,
+            "checks": len(self.label),
+            "beyond": [self.label[i] for i in self.beyond],
+            "alarm": alarm,
+            "since": since,
+            "limit": self.limit,
+            "moved": moved,
+            "mistake": self.mistake,
+            "rows": self._rows(),
+        }
+
+    def csv(self) -> str:
+        """Return the chart's points as CSV.
+
+        >>> import rpim_opt as ro
+        >>> instance = ro.load("position")
+        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).csv().splitlines()[0]
+        'label,error_mm,sigmas,allowed_sigmas,sum'
+        """
+        rows = self._rows()
+        return csv_text(list(rows[0]), [[str(cell) for cell in row.values()] for row in rows])
+
+    def __str__(self) -> str:
+        """Return the verdict, what shows it, and the largest figures."""
+        count = f"{len(self.label)} checks"
+        worst = int(np.argmax(self.sigmas / self.allowed))
+        lines = (
+            [f"The robot is not where its calibration says, in {count}."] if self.drifts else [f"No drift in {count}."]
+        )
+        if self.beyond:
+            named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
+            lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")
+        if self.alarm is not None:
+            since = self._named(self._since(self.alarm))
+            lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
+        if self.drift is not None:
+            lines.append(self._moved(self.drift))
+        elif self.drifts:
+            lines.append("No parameter and no frame explains it alone.")
+        if self.drifts and self.mistake:
+            lines.append(self.mistake)
+        lines.append(
+            f"Largest innovation: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
+            f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
+            f"Largest sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
+        )
+        return "\n".join(lines)
+
+    def _since(self, alarm: int) -> int:
+        """Return the first check that led to an alarm: after the last sum that was zero."""
+        zeros = np.flatnonzero(self.sums[: alarm + 1] == 0)
+        return int(zeros[-1]) + 1 if len(zeros) else 0
+
+    def _moved(self, drift: Drift) -> str:
+        text = f"Best explained by {drift.cause.kind} {drift.cause.name}"
+        if drift.change is not None and drift.std is not None:
+            unit, si = display(drift.dimension)
+            text += f", {drift.change / si:+.3g} {unit} (standard deviation {drift.std / si:.2g})"
+        course = f"at once before {self._named(drift.first)}" if drift.first else "before the first check"
+        if drift.steady:
+            course = "steadily from the first to the last check"
+        return f"{text}, {course}: chi-squared falls by {drift.cause.gain:.1f}, p-value {drift.cause.p_value:.2g}."
+
+    def _named(self, i: int) -> str:
+        if self.times:
+            return f"{self.label[i]} ({self.times[i]})"
+        return f"'{self.label[i]}'"
+
+    def _rows(self) -> list[dict[str, Any]]:
+        columns: dict[str, Any] = {"label": self.label}
+        if self.times:
+            columns["time"] = self.times
+        figures = {
+            "error_mm": 1e3 * self.error,
+            "sigmas": self.sigmas,
+            "allowed_sigmas": self.allowed,
+            "sum": self.sums,
+        }
+        columns |= {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def monitor(result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = ()) -> Monitoring:
+    """Compare checks over time with the predictions of a calibration: each alone, and all together.
+
+    A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
+    innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
+    some check or steadily. A robot that does not drift is said to with probability `FALSE_ALARM` in all.
 
     Parameters
     ----------
@@ -76,23 +278,23 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         when = when[order]
         if times:
             times = tuple(times[i] for i in order)
-    carried = Carried(result)
-    problem = carried.problem(replace(data, configuration=_visits(data, when)))
+    previous = Recalibration(result)
+    problem = previous.problem(replace(data, configuration=_visits(data, when)))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
-    rare = RARE / TESTS
-    found = innovations(result, problem, rare / count)
+    level = FALSE_ALARM / TESTS
+    sigmas, deviate = innovations(result, problem, level / count)
     return Monitoring(
         label=data.label,
         times=times,
         when=when,
         error=result.errors(data),
-        sigmas=found.sigmas,
-        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - rare / count)),
-        sums=cumulative(found.deviate),
-        limit=limit(count, rare),
-        drift=likeliest(carried, problem, rare),
+        sigmas=sigmas,
+        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)),
+        sums=cusum(deviate),
+        limit=cusum_limit(count, level),
+        drift=_drift(previous, problem, level),
         mistake=misread(result, data),
     )
 
@@ -124,14 +326,164 @@ def read_checks(result: Calibration, source: Any, measurement: str | None = None
     >>> checks.times, float(checks.when[1] - checks.when[0]) / 86400
     (('2026-03-01', '2026-04-01'), 31.0)
     """
-    found = read_table(result, source, measurement, units)
-    name = time_column(found.raw)
+    table = read_table(result, source, measurement, units)
+    name = time_column(table.raw)
     if name is None:
-        return Checks(found.data, None, (), found.left_out)
-    cells = list(found.raw[name])
+        return Checks(table.data, None, (), table.left_out)
+    cells = list(table.raw[name])
     try:
         when = seconds(name, cells)
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
-    left_out = tuple(each for each in found.left_out if each != name)
-    return Checks(found.data, when, tuple(str(cell) for cell in cells), left_out)
+    left_out = tuple(each for each in table.left_out if each != name)
+    return Checks(table.data, when, tuple(str(cell) for cell in cells), left_out)
+
+
+# --- each check --------------------------------------------------------------------------------------------
+
+
+def innovations(result: Calibration, problem: CalibrationProblem, level: float = 0.0) -> tuple[Array, Array]:
+    """Return innovations of N checks in standard deviations (N,), and as standard normal deviates (N,).
+
+    The error of the calibration bends all predictions alike. A Kalman filter takes that away as checks show it, so that
+    the innovations of a robot that does not drift are independent::
+
+        e = r - J m,    S = J C J' + V,    K = C J' S^-1,    m + K e,    C - K J C
+
+    with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C what calibration and earlier checks
+    leave open. Deviates are by Fisher's F, positive where a check misses more than usual.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    problem
+        Its problem with the checks in the order of time.
+    level
+        The filter learns nothing from a check that is less probable than this.
+
+    Raises
+    ------
+    InputError
+        For a result that has no covariance.
+    """
+    C = known_covariance(result)
+    if C is None:
+        accepted = "one with a squared penalty or none, whose predictions have intervals"
+        raise InputError("monitor", f"formulation '{result.formulation.name}'", accepted)
+    known = np.isfinite(np.diag(C))
+    C = np.where(np.outer(known, known), C, 0.0)
+    own = problem.parameters.free.scale[len(C) :]  # of sessions that the calibration does not know
+    C = np.block([[C, np.zeros((len(C), len(own)))], [np.zeros((len(own), len(C))), np.diag(own**2)]])
+    m = np.zeros(len(C))
+    rows = _rows(result, problem, np.append(result.x, np.zeros(len(own))))
+    freedom = max(result.freedom, 1.0)
+    sigmas = np.zeros(len(rows))
+    p_values = np.ones(len(rows))
+    for t in range(len(rows)):
+        r, J, V = rows[t]
+        S = J @ C @ J.T + V
+        e = r - J @ m
+        gain = np.linalg.solve(S, J @ C).T
+        squares = float(e @ np.linalg.solve(S, e))
+        sigmas[t] = np.sqrt(squares)
+        p_values[t] = fdtrc(len(r), freedom, squares / len(r))
+        if p_values[t] >= level:
+            m = m + gain @ e
+            C = C - gain @ S @ gain.T
+    return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST)))
+
+
+def _rows(result: Calibration, problem: CalibrationProblem, x: Array) -> dict[int, tuple[Array, Array, Array]]:
+    """Return every row's residual (k,), slopes (k, n) and covariance (k, k) of a reading [SI]."""
+    residual, J = problem.slopes(x)
+    rows = {}
+    start = 0
+    for block, V in zip(problem.data.blocks, scattered(problem, result.noise_level).reading, strict=True):
+        k = len(block.measurement.components)
+        for i, row in enumerate(block.row):
+            part = slice(start + i * k, start + (i + 1) * k)
+            rows[int(row)] = residual[part], J[part], np.broadcast_to(V, (len(block.row), k, k))[i]
+        start += k * len(block.row)
+    return rows
+
+
+# --- their cumulative sum ----------------------------------------------------------------------------------
+
+
+def cusum(deviate: Array) -> Array:
+    """Return Page's sums (N,), S_t = max(0, S_(t-1) + u_t - `ALLOWANCE`).
+
+    >>> import numpy as np
+    >>> from rpim_opt.use.monitoring import cusum
+    >>> cusum(np.array([0.0, 2.0, 1.0, -3.0])).tolist()
+    [0.0, 1.5, 2.0, 0.0]
+    """
+    total = np.cumsum(deviate - ALLOWANCE)
+    return total - np.minimum(np.minimum.accumulate(total), 0.0)
+
+
+def cusum_limit(count: int, level: float) -> float:
+    """Return the limit that sums of so many independent standard normal deviates exceed with probability ``level``.
+
+    By Brook and Evans' Markov chain (1972), bisected.
+
+    >>> from rpim_opt.use.monitoring import cusum_limit
+    >>> cusum_limit(10, 0.01) < cusum_limit(100, 0.01) < cusum_limit(1000, 0.01)
+    True
+    """
+    low, high = 0.0, HIGHEST_LIMIT
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        if _exceeding(middle, count) > level:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def _exceeding(h: float, count: int) -> float:
+    """Return the probability that one of so many sums exceeds h > 0."""
+    width = h / CELLS
+    centre = width * (np.arange(CELLS) + 0.5)
+    # from sum i the next is in cell j where u - ALLOWANCE is within half a cell of their difference; zero is a cell
+    states = np.concatenate([[0.0], centre])
+    upper = ndtr(np.concatenate([[0.0], centre + width / 2])[None, :] - states[:, None] + ALLOWANCE)
+    step = np.diff(upper, axis=1, prepend=0.0)
+    return float(1.0 - np.linalg.matrix_power(step, count)[0].sum())
+
+
+# --- every parameter ---------------------------------------------------------------------------------------
+
+
+def _drift(previous: Recalibration, problem: CalibrationProblem, level: float) -> Drift | None:
+    """Return the change that explains checks best; None where chance does, over all changes that were tried."""
+    model = problem.linearize(previous.start(problem))
+    penalty = previous.formulation(problem, ()).penalty
+    form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
+    # rows of one configuration were read together: the first of them says when
+    numbers, first = np.unique(problem.data.configuration, return_index=True)
+    when = first[np.searchsorted(numbers, model.group)]
+    tried = list(_changes(previous.misfit(model, form), when, len(problem.data)))
+    best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
+    return best if best.cause.p_value * len(tried) < level else None
+
+
+def _changes(misfit: Misfit, when: np.ndarray, count: int) -> Iterator[Drift]:
+    """Yield all changes with their evidence: of every cause at every moment, and steadily."""
+    free = misfit.model.parameters
+    moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
+    courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
+    if count > 2:
+        courses.append((0, True, when / (count - 1)))
+    for cause in candidates(free):
+        index = [free.names.index(name) for name in cause.members]
+        scale = float(free.scale[index[0]])
+        for first, steady, course in courses:
+            g, G = misfit.of_drift(index, course)
+            gain, p_value = misfit.gain(g, G)
+            change = std = None
+            if len(g) == 1 and G[0, 0] > 0:
+                change, std = float(scale * g[0] / G[0, 0]), float(scale / np.sqrt(G[0, 0]))
+            tried = cause._replace(gain=gain, p_value=p_value)
+            yield Drift(tried, first, steady, change, std, free.dimensions[index[0]])

@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.data.tables.joining import seconds, time_column
-from rpim_opt.use.cusum import cumulative, limit, passing
+from rpim_opt.use.monitoring import cusum, cusum_limit
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -101,11 +101,10 @@ def test_times_order_the_checks() -> None:
 
 def test_the_limit_is_passed_as_rarely_as_it_says() -> None:
     """5000 draws of 30 deviates, of which one in twenty passes: within four standard deviations of that."""
-    h = limit(30, 0.05)
+    h = cusum_limit(30, 0.05)
     draws = np.random.default_rng(3).normal(size=(5000, 30))
-    passed = np.mean([cumulative(each).max() > h for each in draws])
+    passed = np.mean([cusum(each).max() > h for each in draws])
     assert abs(passed - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 5000)
-    assert passing(0.0, 5) == 1.0
 
 
 def test_times_of_tables() -> None:

@@ -14,9 +14,8 @@ import rpim_opt as ro
 from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.use.changes import Cause
-from rpim_opt.use.cusum import since
-from rpim_opt.use.drifts import Drift
 from rpim_opt.use.export import export_ur_calibration, export_urdf, write_all
+from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.targets import read_targets
 from rpim_opt.use.validation import read_measurements
 from tests.simulate import ARM, simulated
@@ -66,7 +65,7 @@ def test_an_update_says_what_came_out() -> None:
     assert "No few changes of parameters, frames or readings explain the rest: is it the same robot?" in str(lost)
     wrong = replace(found, before=unlikely(found.before), changes=(READING,), causes=(READING,))
     assert str(wrong).startswith("The robot has not changed, but readings are wrong: ")
-    assert "reading c1: chi-squared falls by 40.0, belief 0.9, left out." in str(wrong)
+    assert "reading c1: chi-squared falls by 40.0, probability 0.9, left out." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
     assert str(moved).startswith("The robot has changed: ")
@@ -92,12 +91,12 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     found = replace(quiet, sums=sums, drift=drift)
     lines = str(found).splitlines()
     assert lines[0] == "The robot is not where its calibration says, in 8 checks."
-    assert lines[1] == "What checks miss adds up: alarm at '5', since '3'."
+    assert lines[1] == "Cumulative sum above its limit: alarm at '5', since '3'."
     assert said in lines[2]
     assert found.content()["since"] == "3"
     only = replace(quiet, sigmas=quiet.sigmas + 100.0 * (np.arange(8) == 5), drift=drift)
     assert "Beyond the interval of a new reading: '6', " in str(only)
-    assert "adds up" not in str(only)
+    assert "Cumulative" not in str(only)
     assert only.content()["alarm"] is None
     moved = found.content()["moved"]
     assert (moved is None) == (drift is None)
@@ -106,7 +105,8 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
 
 
 def test_sums_that_never_were_zero_began_at_the_first_check() -> None:
-    assert since(np.array([1.0, 2.0, 5.0]), 2) == 0
+    found = replace(monitored(), sums=np.linspace(1.0, 9e9, 8))
+    assert found.content()["since"] == found.label[0]
 
 
 def test_two_checks_show_no_course() -> None:
