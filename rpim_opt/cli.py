@@ -124,7 +124,6 @@ def new(
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with console.progress():
         from rpim_opt.basics.writing import refused
-        from rpim_opt.store.new_folder import new_problem
         from rpim_opt.store.raw import understand_tables
 
         asked = console.asked_of(
@@ -135,6 +134,8 @@ def new(
             found = understand_tables(robot, data, measurement, asked, urdf_base, urdf_tip)
             console.show(found, found.content(), as_json)
             return
+        from rpim_opt.store.new_folder import new_problem
+
         with refused(folder):
             made = new_problem(
                 folder, robot, data, measurement=measurement, asked=asked, validation=validation, hold_out=hold_out,

@@ -31,8 +31,8 @@ FLOORS: dict[str, set[str]] = {
     "bayes": set(),
     # casadi: a reflector's transform is a measurement, too; pandas: a data frame, where one is asked for
     "calibration": {"casadi", "pandas"},
-    # cattrs: values as JSON and back; pydantic: the schema of problem.toml
-    "store": {"cattrs", "pydantic"},
+    # cattrs: values as JSON and back; jinja2: the text of a new problem.toml; pydantic: its schema
+    "store": {"cattrs", "jinja2", "pydantic"},
     # casadi: compensation differentiates the tool's pose
     "use": {"casadi"},
     # rich: progress on a console; jinja2: pages
