@@ -7,7 +7,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem import postures
+from rpim_opt.problem import workspace
 from rpim_opt.store.simulation import touching_poses
 
 SURFACES = ("plane", "sphere")
@@ -46,9 +46,9 @@ def test_poses_touch_within_the_limits(name: str) -> None:
 def test_a_change_in_the_last_digits_stays_there(name: str, monkeypatch) -> None:
     poses = touched(name)[0].data.blocks[0].q
     noise = np.random.default_rng(1)
-    draw = postures.random_candidates
+    draw = workspace.random_candidates
     monkeypatch.setattr(
-        postures,
+        workspace,
         "random_candidates",
         lambda *arguments: draw(*arguments) + 1e-12 * noise.normal(size=poses[:, 0].shape),
     )
