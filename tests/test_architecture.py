@@ -162,8 +162,8 @@ ELSEWHERE = {
     "cattrs",
 }
 """What a plain calibration has no use of: a limit, cameras, a drawing's words, a result file."""
-HEAVY = {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.spatial"}
-"""Libraries that a calibration without cones does not use."""
+HEAVY = {"cvxpy", "clarabel", "scipy.stats"}
+"""Libraries that a calibration without cones does not use; SciPy's optimizers estimate hyperparameters."""
 UNUSED = {
     "--version": {"numpy", "scipy", "casadi", "cvxpy"},
     "--help": {"numpy", "scipy", "casadi", "cvxpy"},

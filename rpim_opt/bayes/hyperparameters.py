@@ -1,4 +1,4 @@
-"""Variance components of a problem: prior scales and noise by marginal likelihood, alternated with relinearization."""
+"""Estimated hyperparameters: prior scales and noise by marginal likelihood, alternated with relinearization."""
 
 from __future__ import annotations
 
@@ -14,17 +14,40 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.text import joined
-from rpim_opt.bayes.evidence import FARTHEST, Believed, Evidence, Linearized, Point, alike
+from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, scale_covariance
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.scatter import Scatter
+from rpim_opt.problem.scatter import Scatter, Stack
+from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameters import Parameters
+
+MOST = 1000
+"""Configurations that hyperparameters are estimated from, drawn at random where there are more."""
+FEW = 60
+"""Configurations up to which the marginal likelihood may have several optima, and is climbed from several sides."""
+SAME_SIZE, SAME_PLACE = 0.02, 0.01
+"""Largest change of the logarithms of hyperparameters, and of deviations over their scales (RMS), at the end."""
+CLOSE = 0.1
+"""Scales (RMS) up to which the posterior mean at one linearization stands for a fit."""
+ITERATIONS = 6
+"""Of the first fit between two estimates, twice as many in every later one: the first estimates change soon."""
+DISTINCT = 0.3
+"""Logarithms of hyperparameters by which two optima differ."""
+NEARLY, APART = 6.0, 1.0
+"""By how much -2 ln L of another optimum may be worse to be named, and its logarithms must differ."""
+VAGUE = 1.0
+"""Standard deviation of a logarithm from which on a scale of the geometry is hardly identified."""
+FLATTEST = 0.05
+"""Lower bound on the second derivatives of -2 ln L."""
+Refit = Callable[[Source, Formulation, Array, int], Array]
+"""From a problem, a formulation, a start [SI] and a number of iterations to deviations (n,) near a minimum [SI]."""
 
 
 class Size(NamedTuple):
-    """A size: of a group of deviations over their scales, or of a part of the noise [m or rad].
+    """A hyperparameter: the scale of a group of deviations over the stated one, or a part of the noise [m or rad].
 
     ``spread`` is the standard deviation of its natural logarithm.
     """
@@ -34,14 +57,14 @@ class Size(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """Families of a model, and -2 ln of their restricted likelihood."""
+    """Model extensions, and -2 ln of the restricted likelihood with them."""
 
     families: tuple[str, ...]
     value: float
 
 
 class LeftOut(NamedTuple):
-    """A row that was left out as a blunder: its error [m or rad] over the median of all rows' errors."""
+    """A row that was excluded as an outlier: its error [m or rad] over the median of all rows' errors."""
 
     label: str
     ratio: float
@@ -49,35 +72,36 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Learned(Brief):
-    """What the data said of the sizes of deviations and of the noise.
+    """Hyperparameters that were estimated from the data.
 
     Parameters
     ----------
     sizes
-        Of the groups of deviations, in units of their scales.
+        Scales of the groups of deviations, over the stated ones.
     noise
-        Of the robot's scatter: ``position`` [m], ``orientation`` and ``joint`` [rad]; ``instrument`` over the stated.
+        Of the robot's repeatability: ``position`` [m], ``orientation`` and ``joint`` [rad]; ``instrument`` over the
+        stated.
     local
-        (n,) how far the data let each deviation's own scale leave that of its group; 1: as the group.
+        (n,) local scale of each deviation over that of its group; 1 without heavy tails.
     trials
-        The models that were compared, the chosen one first; empty where nothing was compared.
+        The models that were compared, the selected one first; empty where nothing was compared.
     value
         -2 ln of the restricted likelihood at the end.
     freedom
-        Degrees of freedom of the noise's variance (Satterthwaite).
+        Degrees of freedom of the variance of a reading (Satterthwaite).
     left_out
-        Rows that were left out as blunders, the worst first.
+        Outliers that were excluded, the worst first.
     covariance
         (s, s) of the logarithms of ``sizes`` and ``noise``.
     stated
         (n,) the scales that were stated for what is identified [SI].
     drift
-        (n, s + h) by what the deviations move where the sizes are others, and where tails let them [SI]: D, with D D'
-        what that adds to the covariance that ordinary Tikhonov has at the learned scales. Deviations are the same.
+        (n, s + h) by what the deviations move with the hyperparameters, and with their tails [SI]: D, with D D' what
+        that adds to the covariance that ordinary Tikhonov has at the estimated scales. Deviations are the same.
     added
-        Parameters of families that were added to those that were to be identified.
+        Parameters of model extensions that were added to those that were to be identified.
     notes
-        Sentences on how far the evidence decides.
+        Sentences on how far the marginal likelihood decides.
     """
 
     sizes: Mapping[str, Size]
@@ -99,13 +123,13 @@ class Learned(Brief):
 
     @property
     def families(self) -> tuple[str, ...]:
-        """The families of the chosen model."""
+        """The extensions of the selected model."""
         if not self.trials:
             return ()
         return self.trials[0].families
 
     def gain(self, family: str) -> float | None:
-        """Return by how much -2 ln L falls where a family is added to the best of the models without it."""
+        """Return by how much -2 ln L falls where an extension is added to the best of the models without it."""
         having = [t.value for t in self.trials if family in t.families]
         without = [t.value for t in self.trials if family not in t.families]
         if not having or not without:
@@ -120,79 +144,24 @@ class Learned(Brief):
 
 
 def sessions_spread(learned: Learned | None) -> float:
-    """Return the standard deviation of the logarithm of how far sessions lie apart; zero where no size was learned."""
+    """Return the standard deviation of the logarithm of how far sessions lie apart; zero where it was not estimated."""
     if learned is None:
         return 0.0
     return max((learned.sizes[name].spread for name in SESSIONS.values() if name in learned.sizes), default=0.0)
 
 
-NEARLY, APART = 6.0, 1.0
-"""By how much -2 ln L of another optimum may be worse to be named, and its logarithms of sizes must differ."""
-HARDLY = 1.0
-"""Standard deviation of a logarithm from which on a size of the geometry is hardly told."""
-
-
-def doubts(evidence: Evidence, point: Point, others: Sequence[Point], spread: Array) -> Iterator[str]:
-    """Yield sentences.
-
-    Parameters
-    ----------
-    evidence, point
-        And its optimum.
-    others
-        Optima that were come to from other sides.
-    spread
-        (s,) standard deviations of the logarithms of sizes.
-    """
-    for other in others:
-        if other.value - point.value < NEARLY and np.abs(other.logs - point.logs).max() > APART:
-            yield (
-                "The evidence has a second optimum that is nearly as good, with sizes "
-                f"{_times(other, point)} as large: more configurations would decide."
-            )
-            break
-    if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
-        yield "A size came to the edge of what is believed possible: look at units, scales and declared noise."
-    vague = [i for i in evidence.believed.geometry if spread[i] > HARDLY]
-    if vague:
-        names = joined([evidence.believed.names[i] for i in vague])
-        factor = np.exp(max(spread[vague]))
-        yield f"The data hardly tell how much {names} deviate (by a factor of {factor:.1f} either way)."
-    m, n = evidence.data.X.shape
-    if m < n:
-        yield f"{m} equations for {n} parameters: at least {n - m} directions are prior alone."
-
-
-def _times(other: Point, point: Point) -> str:
-    ratios = np.exp(other.logs - point.logs)
-    return ", ".join(f"{ratio:.1g}" for ratio in ratios) + " times"
-
-
-FEW = 60
-"""Configurations up to which the evidence may have several optima, and is climbed from several sides."""
-SAME_SIZE, SAME_PLACE = 0.02, 0.01
-"""Sizes are found when their logarithms change by no more, and deviations by no more of their scales (RMS)."""
-CLOSE = 0.1
-"""Scales (RMS) up to which the mean at one linearization stands for a fit."""
-STEPS = 6
-"""Iterations of the first fit in between, twice as many in every later one: the first sizes change soon."""
-Refit = Callable[[CalibrationProblem, Formulation, Array, int], Array]
-DISTINCT = 0.3
-"""Logarithms of sizes by which two optima differ."""
-
-
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A problem with sizes laid into it, and where it was linearized.
+    """A problem with hyperparameters laid into it, and where it was linearized.
 
     Parameters
     ----------
     problem
         With its stated scales.
     evidence, point, others
-        The last evidence, its optimum, and others that were come to from other sides.
+        The last marginal likelihood, its optimum, and others that were reached from other sides.
     laid
-        The problem with local scales and scatter: ordinary Tikhonov at weight 1.
+        The problem with local scales and noise: ordinary Tikhonov at weight 1.
     x
         (n,) its solution [SI].
     """
@@ -206,35 +175,38 @@ class Fit:
 
     @property
     def several(self) -> bool:
-        """Whether the evidence has other optima."""
+        """Whether the marginal likelihood has other optima."""
         return any(np.abs(other.logs - self.point.logs).max() > DISTINCT for other in self.others)
 
     @property
     def spare(self) -> float:
-        """Which part of the equations is left over for the noise."""
+        """Part of the equations that remains for the noise."""
         used = float(np.sum(1 - np.diag(self.point.C) / self.point.v))
         return 1 - used / len(self.evidence.data.y)
 
     @property
+    def unit(self) -> Array:
+        """(n,) what multiplies the deviations of the marginal likelihood [SI]."""
+        return self.laid.parameters.free.scale / np.sqrt(self.point.v)
+
+    @property
     def covariance(self) -> Array:
         """Covariance (n, n) of the deviations [SI]."""
-        unit = self.laid.parameters.free.scale / np.sqrt(self.point.v)
-        return self.point.C * np.outer(unit, unit)
+        return self.point.C * np.outer(self.unit, self.unit)
 
 
 @dataclass(frozen=True, eq=False)
-class Learning:
-    """What stays the same while sizes are learned.
+class Estimator:
+    """How the hyperparameters of problems are estimated.
 
     Parameters
     ----------
     prior
-        What is believed of the deviations.
+        Of the deviations.
     noise
-        Parts of the scatter that are looked for, where the data have such equations.
+        Parts of the noise that are estimated, where the data have such equations.
     refit
-        Deviations (n,) [SI] near a minimum of a formulation at weight 1, from a start, in so many iterations; without
-        it the posterior mean of one linearization stands for them.
+        How a Tikhonov fit at weight 1 goes on from one linearization; without it the posterior mean stands for one.
     """
 
     prior: Prior
@@ -242,18 +214,18 @@ class Learning:
     refit: Refit | None = None
 
     @cached_property
-    def _told(self) -> dict[int, tuple[Parameters, Stated]]:
+    def _tables(self) -> dict[int, tuple[Parameters, Stated]]:
         return {}
 
     def stated(self, problem: CalibrationProblem) -> Stated:
-        """Return what the prior says of a problem's parameters, in units of their stated scales; asked once a table."""
+        """Return the prior of a problem's parameters, in units of their stated scales; computed once a table."""
         table = problem.parameters
-        if id(table) not in self._told:
-            self._told[id(table)] = (table, self.prior.stated(table))  # the table is kept, so that its id is its own
-        return self._told[id(table)][1]
+        if id(table) not in self._tables:  # the table is kept, so that its id is its own
+            self._tables[id(table)] = (table, self.prior.stated(table))
+        return self._tables[id(table)][1]
 
     def evidence(self, problem: CalibrationProblem, x: Array) -> Evidence:
-        """Return the evidence of a linearization at x (n,) [SI]."""
+        """Return the marginal likelihood of a linearization at x (n,) [SI]."""
         free = problem.parameters.free
         stated = self.stated(problem)
         residual, jacobian = problem.slopes(x)
@@ -266,20 +238,20 @@ class Learning:
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
         heavy = np.isin(np.arange(len(stated.names)), stated.group[stated.heavy])
         base = np.array([name == BASE for name in stated.names], dtype=bool)
-        believed = Believed(
+        hierarchy = Hierarchy(
             group=stated.group,
             heavy=stated.heavy,
             names=stated.names,
-            covariance=alike(heavy, base),
+            covariance=scale_covariance(heavy, base),
             tails=self.prior.tails,
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,
             values=stated.values - stated.rows @ stated.centre,
         )
-        return Evidence(data, believed, self._kinds(data), problem.scatter or Scatter())
+        return Evidence(data, hierarchy, self._kinds(data), problem.scatter or Scatter())
 
     def _kinds(self, data: Linearized) -> tuple[str, ...]:
-        """Return the parts of the scatter that the equations have."""
+        """Return the parts of the noise that the equations have."""
         have = {"instrument"}
         if any(stack.positional for stack in data.stacks):
             have |= {"position", "joint"}
@@ -287,74 +259,88 @@ class Learning:
             have.add("orientation")
         return tuple(kind for kind in self.noise if kind in have)
 
-    def fitted(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
-        """Return sizes and deviations that agree with each other.
+    def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
+        """Return hyperparameters and deviations that agree with each other.
 
         Parameters
         ----------
         problem
-            Without what is to be learned.
+            Without what is to be estimated.
         x
             (n,) where to begin [SI].
         before
-            Logarithms of sizes to begin with, or None.
+            Logarithms of hyperparameters to begin with, or None.
         rounds
-            How often the evidence is asked.
+            Linearizations at most.
         """
-        fit = self._once(problem, x, before, before is None, STEPS)
+        fit = self._once(problem, x, before, before is None, ITERATIONS)
         for k in range(1, rounds):
-            again = self._once(problem, fit.x, fit.point.logs, k == 1 and fit.several, STEPS * 2**k)
-            moved = _moved(again.x, fit.x, again.laid)
-            resized = np.abs(again.point.logs - fit.point.logs).max()
+            again = self._once(problem, fit.x, fit.point.logs, k == 1 and fit.several, ITERATIONS * 2**k)
+            moved = _distance(again.x, fit.x, again.laid)
+            resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
             fit = replace(again, others=again.others or fit.others)
             if resized <= SAME_SIZE and moved <= SAME_PLACE:
                 break
         return fit
 
-    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, steps: int) -> Fit:
-        """Return sizes at one linearization, from known ones (s,) and from several sides, and what they lead to."""
+    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
+        """Return hyperparameters at one linearization, from known ones (s,) and from several sides, with a fit."""
         evidence = self.evidence(problem, x)
         starts = [] if known is None else [known]
         if several:
             starts += sides(problem, evidence)
         with phase("selection"):
-            point, *others = evidence.mode(starts)
-        laid = self.laid(problem, evidence, point, x)
+            point, *others = evidence.optima(starts)
+        laid = self._laid(problem, evidence, point, x)
         stated = self.stated(problem)
         mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
-        if self.refit is not None and _moved(mean, x, laid) > CLOSE:  # too far for one linearization
-            penalized = self.prior.penalized(tikhonov, self.inside(problem, point))
-            mean = self.refit(laid, penalized, x, steps)
+        if self.refit is not None and _distance(mean, x, laid) > CLOSE:  # too far for one linearization
+            mean = self.refit(laid, self.prior.penalized(tikhonov, self.inside(problem, point)), x, iterations)
         return Fit(problem, evidence, point, others, laid, mean)
 
-    def widths(self, problem: CalibrationProblem, point: Point) -> Array:
+    def _widths(self, problem: CalibrationProblem, point: Point) -> Array:
         """Return by what the scales of the identified parameters are multiplied, (n,)."""
         return self.stated(problem).scale * np.sqrt(point.v)
 
     def inside(self, problem: CalibrationProblem, point: Point) -> Stated:
-        """Return what the prior says of the parameters at the scales that were learned."""
-        return self.stated(problem).inside(self.widths(problem, point))
+        """Return the prior in units of the estimated scales."""
+        return self.stated(problem).inside(self._widths(problem, point))
 
-    def laid(self, problem: CalibrationProblem, evidence: Evidence, point: Point, x: Array) -> CalibrationProblem:
-        """Return the problem with what was learned in it: local scales, and the robot's scatter."""
+    def _laid(self, problem: CalibrationProblem, evidence: Evidence, point: Point, x: Array) -> CalibrationProblem:
+        """Return the problem with local scales and the robot's repeatability."""
         p = problem.parameters
         scale = p.scale.copy()
-        scale[p.identified] *= self.widths(problem, point)
+        scale[p.identified] *= self._widths(problem, point)
         scatter = replace(evidence.scatter(point.logs), at=_values(problem, x))
         return replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
 
 
-def _moved(x: Array, before: Array, laid: CalibrationProblem) -> float:
-    """Return by how many of their scales deviations (n,) moved, RMS."""
-    return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
-
-
 def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
-    """Return where its optimum is looked for: from several sides where configurations are few."""
+    """Return where the optimum is looked for: from several sides where configurations are few."""
     starts = evidence.starts()
     if len(np.unique(problem.data.configuration)) <= FEW:
         return starts
     return starts[:1]
+
+
+def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
+    """Return the problem with some of its configurations in memory: all, or so many at random, from every part."""
+    if isinstance(problem, CalibrationProblem):
+        return _drawn(problem, most).frozen()
+    count = sum(1 for _ in problem.rows())
+    parts = [_drawn(part, max(most // count, 1)).data for part in problem.rows()]
+    return problem.on(Dataset.together(parts, [str(i) for i in range(len(parts))])).frozen()
+
+
+def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
+    if len(np.unique(problem.data.configuration)) <= most:
+        return problem
+    return problem.on(problem.data.configurations(most, seed=0))
+
+
+def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
+    """Return by how many of their scales deviations (n,) moved, RMS."""
+    return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
 def _values(problem: CalibrationProblem, x: Array) -> Array:
@@ -363,3 +349,91 @@ def _values(problem: CalibrationProblem, x: Array) -> Array:
     values = p.nominal.copy()
     values[p.identified] = p.free.values(x)
     return values
+
+
+# --- how well they are known ------------------------------------------------------------------------------------
+
+
+def learned(
+    fit: Fit,
+    added: tuple[str, ...] = (),
+    trials: tuple[Trial, ...] = (),
+    left_out: tuple[LeftOut, ...] = (),
+    notes: tuple[str, ...] = (),
+) -> Learned:
+    """Return the hyperparameters of a fit with their uncertainty; the other arguments as of `Learned`.
+
+    Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L, and the variance V of a reading
+    has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three: of all of it, as what is not known of the
+    model counts with how little is known of the hyperparameters behind it.
+    """
+    evidence, point = fit.evidence, fit.point
+    curvature, U = np.linalg.eigh((point.curvature + point.curvature.T) / 2)
+    root = U * np.sqrt(2 / np.maximum(curvature, FLATTEST))
+    covariance = root @ root.T
+    spread = np.sqrt(np.diag(covariance))
+    growth = _growth(evidence, point)
+    names = evidence.prior.names
+    values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
+    size = np.append(np.exp(point.logs[: len(names)]), np.nan)[evidence.prior.group]
+    drift = fit.unit[:, None] * np.column_stack([point.slopes @ root, evidence.widening(point)])
+    return Learned(
+        sizes=dict(zip(names, values, strict=False)),
+        noise=dict(zip(evidence.noise, values[len(names) :], strict=True)),
+        local=np.where(np.isfinite(size), np.sqrt(point.v) / size, 1.0),
+        trials=trials,
+        value=point.value,
+        freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
+        left_out=left_out,
+        covariance=covariance,
+        stated=fit.problem.parameters.free.scale,
+        drift=drift,
+        added=added,
+        notes=(*notes, *_doubts(fit, spread)),
+    )
+
+
+def _growth(evidence: Evidence, point: Point) -> Array:
+    """Return the slopes (s,) of ln V by the logarithms of hyperparameters, V = tr(X C X' + R) of all lengths read."""
+    X = np.vstack([evidence.data.X[stack.index[_read(stack)]] for stack in evidence.data.stacks])
+    scatter = evidence.scatter(point.logs)
+    noise = _noise(evidence, scatter)
+    rises = point.falls(point.C @ (X.T @ X) @ point.C)
+    for i, kind in enumerate(evidence.noise, len(rises) - len(evidence.noise)):  # R is a sum of squares of the noises
+        rises[i] += 2 * (noise - _noise(evidence, replace(scatter, **{kind: 0.0})))
+    return np.asarray(rises / (float(np.sum((X @ point.C) * X)) + noise), dtype=float)
+
+
+def _read(stack: Stack) -> np.ndarray:
+    """Return which equations (N, k) are of lengths (else angles, else pixels)."""
+    kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
+    return next(kind for kind in kinds if kind.any())
+
+
+def _noise(evidence: Evidence, scatter: Scatter) -> float:
+    """Return the variance of what is read, summed over those equations."""
+    stacks = evidence.data.stacks
+    return sum(float(np.sum(np.einsum("nkk->nk", stack.covariance(scatter))[_read(stack)])) for stack in stacks)
+
+
+def _doubts(fit: Fit, spread: Array) -> Iterator[str]:
+    """Yield sentences on how far the marginal likelihood decides; ``spread`` (s,) of the logarithms."""
+    evidence, point = fit.evidence, fit.point
+    for other in fit.others:
+        if other.value - point.value < NEARLY and np.abs(other.logs - point.logs).max() > APART:
+            ratios = ", ".join(f"{ratio:.1g}" for ratio in np.exp(other.logs - point.logs))
+            yield (
+                f"The evidence has a second optimum that is nearly as good, with sizes {ratios} times as large: more "
+                "configurations would decide."
+            )
+            break
+    if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
+        yield "A size came to the edge of what is believed possible: look at units, scales and declared noise."
+    vague = [i for i in evidence.prior.geometry if spread[i] > VAGUE]
+    if vague:
+        names = joined([evidence.prior.names[i] for i in vague])
+        factor = np.exp(max(spread[vague]))
+        yield f"The data hardly tell how much {names} deviate (by a factor of {factor:.1f} either way)."
+    m, n = evidence.data.X.shape
+    if m < n:
+        yield f"{m} equations for {n} parameters: at least {n - m} directions are prior alone."

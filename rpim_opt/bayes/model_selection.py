@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from itertools import chain, combinations
-from operator import itemgetter
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.evidence import Evidence, Point
-from rpim_opt.bayes.hyperparameters import Fit, Learning, Trial
+from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, Trial, sampled, sides
+from rpim_opt.bayes.outliers import clustered
+from rpim_opt.bayes.prior import Prior, family_of
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.source import Source
 from rpim_opt.robot.family import families, family_scales
 from rpim_opt.robot.parameter_names import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 TURNED = 2.0
-"""Harmonics are looked for in joints that turned further [rad]: over less they are curve fitting."""
+"""Travel of a joint [rad] from which its harmonics are looked for: over less they are curve fitting."""
 MANY = 40
-"""Configurations from which on the last of the candidates is tried."""
+"""Configurations from which on the last of the candidates is compared."""
 TURNING = ("first harmonic", "second harmonic")
-"""Families of joints that turned far enough."""
+"""Extensions of joints that turned far enough."""
 CANDIDATES = (
     (),
     ("gravity",),
@@ -32,218 +35,340 @@ CANDIDATES = (
 )
 """The models of the arm that are compared."""
 SESSIONS = "sessions"
-"""The family of what the readings of a session have in common, which is none of the arm."""
+"""The extension by what the readings of a session have in common, which is none of the arm."""
 WARMTH = "temperature"
-"""The family of what grows with temperature."""
+"""The extension by what grows with temperature."""
 CONDITIONS = (SESSIONS, WARMTH)
-"""Families of how and when was measured; each is a question of its own."""
+"""Extensions by how and when was measured; each is a question of its own."""
+GAIN = 6.0
+"""By how much -2 ln L must fall for a model with extensions: of 306 simulated arms without them one gained more.
+
+For sessions and for temperature once more each: they are other questions."""
+LARGE = 3.0
+"""By how much larger, in its logarithm, the scale of an extension is in another start."""
+COMPARED = 1e-2
+"""Slopes of -2 ln L by the logarithms of hyperparameters at which models are compared."""
+ROUNDS = 3
+"""Linearizations at which the hyperparameters of the selected model are estimated."""
+SPEAK = 10.0
+"""By how much -2 ln L must fall for an extension to be spoken of: 4 is what a false pick gains, 10 none in many."""
+OWNED = {
+    "gravity": ("compliance", "bend"),
+    "first harmonic": ("ecc",),
+    "second harmonic": ("ecc2",),
+    SESSIONS: ("session",),
+    WARMTH: ("expansion",),
+}
+"""Extensions whose evidence is asked for at a result, and the terms that stand for them."""
+KNOWN = Prior(joint_offset=1.0, frames=1.0)
+"""The prior once scales were estimated: they are as the problem says."""
 
 
-def members(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
-    """Return the parameters of every family that these data may tell and that are not identified yet."""
+class Candidate(NamedTuple):
+    """A model that was compared: what decides, its extensions, and what was found."""
+
+    price: float
+    families: tuple[str, ...]
+    found: Any
+
+
+# --- which extensions there are ---------------------------------------------------------------------------------
+
+
+def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
+    """Return the parameters of every extension that these data may identify and that are not identified yet."""
     found: dict[str, tuple[str, ...]] = {}
+    known = set(problem.parameters.free.names)
     for robot in problem.arms:
         for family, names in _of_robot(problem, robot).items():
-            found[family] = tuple(dict.fromkeys((*found.get(family, ()), *names)))
-    shifts = _of_sessions(problem)
-    if shifts:
-        found[SESSIONS] = shifts
-    known = set(problem.parameters.free.names)
-    grows = tuple(name for name in problem.parameters.names if own_name(name) == EXPANSION and name not in known)
+            found[family] = tuple(dict.fromkeys((*found.get(family, ()), *(n for n in names if n not in known))))
+    prefixes = {session_prefix(name) for name in problem.data.sessions}
+    if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
+        found[SESSIONS] = tuple(n for n in problem.parameters.names if frame_of(n) in prefixes and n not in known)
+    grows = tuple(n for n in problem.parameters.names if own_name(n) == EXPANSION and n not in known)
     if grows and np.ptp(problem.data.temperatures) > 0:
         found[WARMTH] = grows
-    return found
-
-
-def _of_sessions(problem: CalibrationProblem) -> tuple[str, ...]:
-    """Return the shifts of sessions that are not identified yet, if sessions differ from single configurations."""
-    data = problem.data
-    known = set(problem.parameters.free.names)
-    prefixes = {session_prefix(name) for name in data.sessions}
-    if not 2 <= len(prefixes) <= len(np.unique(data.configuration)) / 2:
-        return ()
-    of_data = [name for name in problem.parameters.names if frame_of(name) in prefixes]
-    return tuple(name for name in of_data if name not in known)
+    return {family: names for family, names in found.items() if names}
 
 
 def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
-    """Return the same of one of several robots."""
-    p = problem.parameters
+    """Return the parameters of the extensions of one robot, of harmonics those of joints that turned far enough."""
     q = problem.alone(robot).joint_values
     turned = {str(i) for i, travel in enumerate(np.ptp(q, axis=0), start=1) if travel > TURNED}
-    known = set(p.free.names)
     found = {}
     for family, names in families(problem.arms[robot]).items():
         left = names
         if family in TURNING:
             left = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
-        called = [p.called(robot, name) for name in left]
-        found[family] = [name for name in called if name not in known]
-    return {family: names for family, names in found.items() if names}
+        found[family] = [problem.parameters.called(robot, name) for name in left]
+    return found
 
 
-def _is_of_arm(name: str) -> bool:
-    """Return whether the arm says how large a parameter is expected; others have their scale."""
-    return not of_session(name) and own_name(name) != EXPANSION
-
-
-def identifying(problem: CalibrationProblem, names: tuple[str, ...]) -> CalibrationProblem:
-    """Return the problem that identifies parameters of families, too, at the scales that their effects suggest."""
+def extended(problem: CalibrationProblem, x: Array, names: Sequence[str]) -> tuple[CalibrationProblem, Array]:
+    """Return the problem that identifies more parameters, at the scales that their effects suggest, with x (n,)."""
     p = problem.parameters
     index = [p.names.index(name) for name in names]
     identified = p.identified.copy()
     scale = p.scale.copy()
     identified[index] = True
     for name, robot in problem.arms.items():
-        mine = [i for i in p.places_of(name) if i in index and _is_of_arm(p.names[i])]
+        own = [i for i in p.places_of(name) if i in index]
+        mine = [i for i in own if not of_session(p.names[i]) and own_name(p.names[i]) != EXPANSION]
         scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
-    return problem.with_parameters(replace(p, identified=identified, scale=scale))
-
-
-GAIN = 6.0
-"""By how much -2 ln L must fall for a model with families: of 306 simulated arms without them one gained more.
-
-For sessions and for temperature once more each: they are other questions."""
-LARGE = 3.0
-"""By how much larger, in their logarithms, families are expected in another start."""
-COMPARED = 1e-6
-"""Of -2 ln L, to which models are compared: hundredths, of some thousands."""
-Priced = tuple[float, tuple[str, ...], Any]
-"""A model that was compared: what decides, its families, and what was found."""
-ROUNDS = 3
-"""Linearizations at which the sizes of the chosen model are looked for."""
-
-
-def modelled(learning: Learning, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
-    """Return the fit of the model that the evidence wants, and the models compared, the wanted one first.
-
-    Parameters
-    ----------
-    learning
-        How sizes are found.
-    fit
-        Of the parameters that were to be identified.
-    """
-    added, trials, point = chosen(learning, fit)
-    if not added:
-        return fit, trials
-    whole, x = extended(fit.problem, fit.x, added)
-    return learning.fitted(whole, x, point.logs, ROUNDS), trials
-
-
-def chosen(learning: Learning, fit: Fit) -> tuple[tuple[str, ...], tuple[Trial, ...], Point]:
-    """Return the parameters of the families that the evidence wants, the models compared, and the winner's sizes.
-
-    All models are compared at one linearization: families are small.
-    """
-    families = members(fit.problem)
-    whole, x = extended(fit.problem, fit.x, tuple(chain.from_iterable(families.values())))
-    columns = learning.evidence(whole, x)
-    names = whole.parameters.free.names
-    own = set(fit.problem.parameters.free.names)
-    before = _named(fit.evidence, fit.point)
-    sizes: dict[frozenset[str], dict[str, float]] = {}
-
-    def tried(candidate: tuple[str, ...]) -> tuple[float, tuple[str, ...], Point]:
-        used = own.union(*(families[family] for family in candidate))
-        evidence = restricted(columns, np.array([name in used for name in names]))
-        conditions = frozenset(candidate).intersection(CONDITIONS)
-        point = evidence.mode(_starts(evidence, sizes.get(conditions, before)), COMPARED)[0]
-        if conditions and conditions == set(candidate):  # what they explain stood among the noise
-            sizes[conditions] = _named(evidence, point)
-        return point.value + GAIN * _questions(candidate), candidate, point
-
-    trials = sorted(compared(fit.problem, families, tried), key=itemgetter(0))
-    _, best, point = trials[0]
-    added = tuple(name for family in best for name in families[family])
-    return added, tuple(Trial(candidate, each.value) for _, candidate, each in trials), point
-
-
-def compared(
-    problem: CalibrationProblem,
-    families: dict[str, tuple[str, ...]],
-    tried: Callable[[tuple[str, ...]], Priced],
-) -> list[Priced]:
-    """Return the models that were compared, what ``tried`` says of each: its price first, its families second.
-
-    Families of the arm are chosen with all conditions in the model, which would stand for them else; then of the best
-    one each condition is asked for.
-    """
-    conditions = tuple(condition for condition in CONDITIONS if condition in families)
-    found = [tried((*candidate, *conditions)) for candidate in _of_arm(problem, families)]
-    best = min(found, key=itemgetter(0))[1]
-    kept = tuple(family for family in best if family not in conditions)
-    for count in range(len(conditions)):
-        found += [tried((*kept, *some)) for some in combinations(conditions, count)]
-    return found
-
-
-def _of_arm(problem: CalibrationProblem, families: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return the models of the arm that these data may tell apart, each once."""
-    arm = CANDIDATES
-    if len(np.unique(problem.data.configuration)) < MANY:
-        arm = CANDIDATES[:-1]
-    possible = [tuple(family for family in candidate if family in families) for candidate in arm]
-    return list(dict.fromkeys(possible))
-
-
-def _questions(families: tuple[str, ...]) -> int:
-    """Return how many questions a model answers with yes: whether the arm has families, and each of the conditions."""
-    conditions = set(families) & set(CONDITIONS)
-    return len(conditions) + (len(families) > len(conditions))
-
-
-def extended(problem: CalibrationProblem, x: Array, names: tuple[str, ...]) -> tuple[CalibrationProblem, Array]:
-    """Return the problem that identifies more parameters, and its deviations, those zero."""
-    whole = identifying(problem, names)
-    known = dict(zip(problem.parameters.free.names, x, strict=True))
+    whole = problem.with_parameters(replace(p, identified=identified, scale=scale))
+    known = dict(zip(p.free.names, x, strict=True))
     return whole, np.array([known.get(name, 0.0) for name in whole.parameters.free.names])
 
 
-def size_names(evidence: Evidence) -> tuple[str, ...]:
-    """Return the names of all sizes: of deviations, then of noise."""
-    return (*evidence.believed.names, *evidence.noise)
+# --- which of them are selected ---------------------------------------------------------------------------------
+
+
+def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
+    """Return the fit of the model with the largest marginal likelihood, and the models compared, that one first.
+
+    All models are compared at one linearization: the effects of extensions are small.
+    """
+    extensions = identifiable(fit.problem)
+    every = [name for names in extensions.values() for name in names]
+    whole, x = extended(fit.problem, fit.x, every)
+    columns = estimator.evidence(whole, x)
+    names = whole.parameters.free.names
+    own = set(fit.problem.parameters.free.names)
+    before = _named(fit.evidence, fit.point)
+    known: dict[frozenset[str], dict[str, float]] = {}
+
+    def price(candidate: tuple[str, ...]) -> Candidate:
+        used = own.union(*(extensions[family] for family in candidate))
+        evidence = columns.restricted(np.array([name in used for name in names]))
+        conditions = frozenset(candidate).intersection(CONDITIONS)
+        point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
+        if conditions and conditions == set(candidate):  # what they explain stood among the noise
+            known[conditions] = _named(evidence, point)
+        questions = len(conditions) + (len(candidate) > len(conditions))
+        return Candidate(point.value + GAIN * questions, candidate, point)
+
+    found = sorted(compare_models(fit.problem, extensions, price), key=lambda each: each.price)
+    trials = tuple(Trial(each.families, each.found.value) for each in found)
+    added = [name for family in found[0].families for name in extensions[family]]
+    if not added:
+        return fit, trials
+    whole, x = extended(fit.problem, fit.x, added)
+    return estimator.fit(whole, x, found[0].found.logs, ROUNDS), trials
+
+
+def compare_models(
+    problem: CalibrationProblem,
+    extensions: Mapping[str, tuple[str, ...]],
+    price: Callable[[tuple[str, ...]], Candidate],
+) -> list[Candidate]:
+    """Return the models that were compared, by what ``price`` says of each.
+
+    Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of the
+    best one each condition is asked for.
+    """
+    conditions = tuple(condition for condition in CONDITIONS if condition in extensions)
+    arm = CANDIDATES
+    if len(np.unique(problem.data.configuration)) < MANY:
+        arm = CANDIDATES[:-1]
+    possible = [tuple(family for family in candidate if family in extensions) for candidate in arm]
+    found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+    best = min(found, key=lambda each: each.price).families
+    kept = tuple(family for family in best if family not in conditions)
+    for count in range(len(conditions)):
+        found += [price((*kept, *some)) for some in combinations(conditions, count)]
+    return found
 
 
 def _named(evidence: Evidence, point: Point) -> dict[str, float]:
-    return dict(zip(size_names(evidence), point.logs.tolist(), strict=True))
+    return dict(zip(evidence.names, point.logs.tolist(), strict=True))
 
 
-def _starts(evidence: Evidence, sizes: Mapping[str, float]) -> list[Array]:
-    """Return where the optimum of a model with families is looked for.
+def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
+    """Return where the optimum of a model is looked for, from logarithms of another's hyperparameters by name."""
+    logs = np.array([known.get(name, centre) for name, centre in zip(evidence.names, evidence.centre, strict=True)])
+    new = [i for i, name in enumerate(evidence.names) if name not in known]
+    if not new:
+        return [logs]
+    large = logs.copy()  # at small scales the likelihood is flat in an extension whose effect the noise has taken up
+    large[new] += LARGE
+    return [logs, large]
+
+
+# --- at a result ------------------------------------------------------------------------------------------------
+
+
+class Flagged(Protocol):
+    """A row that a fit distrusts."""
+
+    @property
+    def label(self) -> str:
+        """Of the row."""
+        ...
+
+
+class Outcome(Protocol):
+    """What is asked of a result: a `Calibration` has it."""
+
+    @property
+    def problem(self) -> Source:
+        """What was asked."""
+        ...
+
+    @property
+    def x(self) -> Array:
+        """(n,) deviations [SI]."""
+        ...
+
+    @property
+    def learned(self) -> Learned | None:
+        """The hyperparameters, where they were estimated."""
+        ...
+
+    @cached_property
+    def flagged(self) -> Sequence[Flagged]:
+        """Rows that the fit distrusts."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A model that was compared: extensions beside what the result identifies, its parameters, and its optimum."""
+
+    families: tuple[str, ...]
+    names: tuple[str, ...]
+    evidence: Evidence
+    point: Point
+
+    @cached_property
+    def residual(self) -> Array:
+        """Residuals (m,) [SI]."""
+        data = self.evidence.data
+        return data.y - data.X @ self.point.z
+
+
+class Comparison:
+    """Models with and without extensions, all at the linearization of one result, whatever its weight.
 
     Parameters
     ----------
-    evidence
-        Of the model.
-    sizes
-        Logarithms of sizes by name, of a model that was looked at before.
+    result
+        Any calibration; of large data `hyperparameters.MOST` configurations are looked at.
     """
-    names = size_names(evidence)
-    logs = np.array([sizes.get(name, centre) for name, centre in zip(names, evidence.centre, strict=True)])
-    starts = [logs]
-    new = [i for i, name in enumerate(names) if name not in sizes]
-    if new:  # at small sizes the likelihood is flat in a family whose effect the noise has taken up
-        large = logs.copy()
-        large[new] += LARGE
-        starts.append(large)
-    return starts
+
+    def __init__(self, result: Outcome) -> None:
+        self.result = result
+        self.problem = _trusted(result)
+        self.own = self.problem.parameters.free.names
+        self.extensions = identifiable(self.problem)
+        every = [name for names in self.extensions.values() for name in names]
+        whole, x = extended(self.problem, result.x, every)
+        self.names = whole.parameters.free.names
+        self.columns = _estimator(result.learned).evidence(whole, x)
+
+    @cached_property
+    def configurations(self) -> int:
+        """How many configurations are looked at."""
+        return len(np.unique(self.problem.data.configuration))
+
+    @cached_property
+    def dimension(self) -> str:
+        """``length``; ``angle`` where none was measured, ``pixel`` where a camera alone has seen."""
+        stacks = self.columns.data.stacks
+        return next(d for d in ("length", "angle", "pixel") if any(stack.of(d).any() for stack in stacks))
+
+    @cached_property
+    def equations(self) -> np.ndarray:
+        """The numbers of the equations of that dimension."""
+        stacks = self.columns.data.stacks
+        return np.sort(np.concatenate([stack.index[stack.of(self.dimension)] for stack in stacks]))
+
+    @cached_property
+    def row(self) -> np.ndarray:
+        """The row (m,) of every equation."""
+        return self.problem.owners
+
+    @cached_property
+    def rows(self) -> int:
+        """How many rows have such equations."""
+        return len(np.unique(self.row[self.equations]))
+
+    @cached_property
+    def spare(self) -> float:
+        """Degrees of freedom of the residuals, in the result's model."""
+        point = self.plain.point
+        return len(self.row) - float(np.sum(1 - np.diag(point.C) / point.v))
+
+    @cached_property
+    def plain(self) -> Judged:
+        """The model that the result has."""
+        evidence = self.columns.restricted(np.isin(self.names, self.own))
+        starts = sides(self.problem, evidence)
+        if self.result.learned is not None:
+            noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
+            starts = [np.array([noise.get(n, c) for n, c in zip(evidence.names, evidence.centre, strict=True)])]
+        return Judged((), self.own, evidence, evidence.optima(starts)[0])
+
+    @cached_property
+    def best(self) -> Judged:
+        """The model that the data select, at a price of `SPEAK` an extension."""
+        learned = self.result.learned
+        if learned is not None and learned.trials:  # the evidence has spoken
+            return self.plain
+        found = [self._price(()), *compare_models(self.problem, self.extensions, self._price)]
+        judged: Judged = min(found, key=lambda each: each.price).found
+        return judged
+
+    def _price(self, families: tuple[str, ...]) -> Candidate:
+        model = self.plain
+        if families:
+            used = set(self.own).union(*(self.extensions[family] for family in families))
+            model = self._fitted(families, np.isin(self.names, list(used)))
+        return Candidate(model.point.value + SPEAK * len(families), families, model)
+
+    @cached_property
+    def gain(self) -> float:
+        """By how much -2 ln L falls from the result's model to the best."""
+        return self.plain.point.value - self.best.point.value
+
+    def owned(self) -> dict[str, np.ndarray]:
+        """Return the extensions that the result identifies, with which parameters (n,) are theirs.
+
+        First moments of links are gravity's, too: either would stand for the other.
+        """
+        group = [family_of(name) for name in self.own]
+        found = {family: np.isin(group, patterns) for family, patterns in OWNED.items()}
+        return {family: members for family, members in found.items() if members.any()}
+
+    def rise_without(self, members: np.ndarray) -> float:
+        """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""
+        keep = np.isin(self.names, [name for name, out in zip(self.own, members, strict=True) if not out])
+        return self._fitted((), keep).point.value - self.plain.point.value
+
+    def _fitted(self, families: tuple[str, ...], keep: np.ndarray) -> Judged:
+        """Return a model at its hyperparameters, looked for from those of the result's."""
+        evidence = self.columns.restricted(keep)
+        start = _starts(evidence, _named(self.plain.evidence, self.plain.point))[:1]
+        return Judged(families, tuple(np.array(self.names)[keep].tolist()), evidence, evidence.optima(start)[0])
 
 
-def restricted(evidence: Evidence, keep: np.ndarray) -> Evidence:
-    """Return the evidence of a model with some of the columns (n,)."""
-    believed = evidence.believed
-    group = believed.group[keep]
-    used = np.unique(group[group >= 0])
-    number = np.full(len(believed.names) + 1, -1)
-    number[used] = np.arange(len(used))
-    fewer = replace(
-        believed,
-        group=number[group],
-        heavy=believed.heavy[keep],
-        names=tuple(believed.names[i] for i in used),
-        covariance=believed.covariance[np.ix_(used, used)],
-        replaced=believed.replaced[keep],
-        rows=believed.rows[:, keep],
-    )
-    return replace(evidence, data=replace(evidence.data, X=evidence.data.X[:, keep]), believed=fewer)
+def _trusted(result: Outcome) -> CalibrationProblem:
+    """Return the problem in memory without noise estimates, and without flagged rows unless their neighbours are."""
+    problem = sampled(result.problem.scattered(None))
+    labels = {label: i for i, label in enumerate(problem.labels)}
+    rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
+    if not len(rows) or len(rows) > len(labels) / 4:
+        return problem
+    alone = rows[~clustered(problem, result.x, rows)]
+    if not len(alone):
+        return problem
+    return problem.without({problem.labels[i] for i in alone})
+
+
+def _estimator(learned: Learned | None) -> Estimator:
+    """Return how the marginal likelihood is asked: scales that were estimated are taken at their word."""
+    kinds: tuple[str, ...] = ("position", "orientation", "joint")
+    if learned is None:
+        return Estimator(Prior(), kinds)
+    if "instrument" in learned.noise:
+        kinds += ("instrument",)
+    return Estimator(KNOWN, kinds)

@@ -6,11 +6,11 @@ from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
 from .expected import Improvement as Improvement
 from .expected import improvement as improvement
+from .held_out_rows import refit_all as refit_all
 from .leaving_out import Influence as Influence
 from .leaving_out import influence as influence
 from .outcome import Iteration as Iteration
 from .outcome import Prediction as Prediction
-from .refit import refit_all as refit_all
 from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo

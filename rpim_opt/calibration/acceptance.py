@@ -15,10 +15,9 @@ from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import refuse_misread
-from rpim_opt.calibration.checked import Checked, checked
+from rpim_opt.calibration.held_out_rows import Checked, checked
 from rpim_opt.calibration.lack_of_fit import judged
-from rpim_opt.calibration.reaching import Reaching, Share, reaching, share
-from rpim_opt.calibration.region import Region, region_of
+from rpim_opt.calibration.region import Reaching, Region, Share, reaching, region_of, share
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Requirement

@@ -10,7 +10,8 @@ from typing import Any
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.bayes.learning import learn, with_families
+from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
+from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration.loop import nearby, require_finite, require_start
 from rpim_opt.calibration.outcome import Iteration
@@ -148,13 +149,14 @@ def calibrate(
         weight = 0.0
     believed = prior or Prior()
     if weight is None:
-        found = learn(problem, believed, model, start, kinds, _refit)
+        found = estimate(problem, Estimator(believed, kinds, _refit), model, start)
         formulation = believed.penalized(formulation, found.stated)
         result = calibrated(found.problem, formulation, 1.0, start=found.x, **how)
         result = replace(result, learned=found.learned)
     else:
         if model == "auto":
-            problem = with_families(problem, learn(problem, believed, model, start, kinds, _refit))
+            found = estimate(problem, Estimator(believed, kinds, _refit), model, start)
+            problem = with_extensions(problem, found)
         if prior is not None:
             formulation = prior.penalized(formulation, prior.stated(problem.parameters, widened=False))
         result = calibrated(problem, formulation, weight, start=start, **how)

@@ -22,6 +22,7 @@ from rpim_opt.calibration.intervals import (
     UNLIKELY,
     Interval,
     NoiseTest,
+    Spread,
     checked,
     noise_test,
     position_noise,
@@ -30,7 +31,6 @@ from rpim_opt.calibration.intervals import (
 )
 from rpim_opt.calibration.prices import Price, prices
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
-from rpim_opt.calibration.spread import Spread
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program

@@ -64,11 +64,11 @@ class Calibration(Outcome):
         return words.selector(self)
 
     def noise_sentence(self) -> list[str]:
-        """Say how the noise that the data show compares with what was declared.
+        """Say how the residuals compare with the stated measurement noise.
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).noise_sentence()
-        ['The data scatter as declared (1.02 times).']
+        ['Residuals agree with the stated measurement noise (ratio 1.02).']
         """
         return words.noise_sentence(self)
 

@@ -19,11 +19,11 @@ from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.acceptance import Acceptance
 from rpim_opt.calibration.causes import likely_causes
-from rpim_opt.calibration.contact_words import HEADER, scatter, scatter_rows
+from rpim_opt.calibration.held_out_rows import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
+from rpim_opt.calibration.remarks import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.calibration.unseen import judged as predicted
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.program import Estimate, Program, pose

@@ -11,10 +11,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined, percent, table
-from rpim_opt.calibration.camera_words import camera_remarks
 from rpim_opt.calibration.causes import likely_causes
-from rpim_opt.calibration.contact_words import contact_remarks, known_points
 from rpim_opt.calibration.lack_of_fit import judged
+from rpim_opt.calibration.remarks import camera_remarks, contact_remarks, known_points
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
@@ -132,8 +131,7 @@ class Workspace(NamedTuple):
 
 def workspace(result: Calibration) -> Workspace | None:
     """Return the expanded uncertainty over the region; None for several robots, or a formulation without covariance."""
-    from rpim_opt.calibration.reaching import reaching
-    from rpim_opt.calibration.region import region_of
+    from rpim_opt.calibration.region import reaching, region_of
 
     requirement = result.record.requirement or ANYWHERE
     try:

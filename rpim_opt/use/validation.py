@@ -16,10 +16,10 @@ from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import table
 from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.calibration.causes import misread
-from rpim_opt.calibration.contact_words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
+from rpim_opt.calibration.held_out_rows import judged
 from rpim_opt.calibration.ranges import Outside
+from rpim_opt.calibration.remarks import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.unseen import judged
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN

@@ -9,8 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.hyperparameters import Learning
-from rpim_opt.bayes.learning import MOST, sampled
+from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
 from rpim_opt.bayes.outliers import clustered, ratios, resistant, suspected, unbelievable
 from rpim_opt.problem.scatter import joint_slopes
 
@@ -199,7 +198,7 @@ def test_an_assembly_error_leaves_its_group_and_is_named() -> None:
     x[free.names.index("theta3")] = np.radians(1.0)
     result = ro.calibrate(measured(POSITION, x, 3))
     assert result.x[free.names.index("theta3")] == pytest.approx(np.radians(1.0), abs=2e-4)
-    assert "theta3 moved by " in result.weight_sentence()
+    assert "theta3 deviates by " in result.weight_sentence()
     assert "error of assembly" in result.weight_sentence()
 
 
@@ -315,7 +314,7 @@ def test_blunders_are_left_out_and_named_and_no_good_row_with_them() -> None:
     wrong = {POSITION.data.label[i] for i in (4, 17)}
     assert {row.label for row in result.learned.left_out} == wrong
     assert wrong <= set(result.doubted)
-    assert "Left out as blunders: " in result.weight_sentence()
+    assert "Excluded outliers: " in result.weight_sentence()
     oracle = ro.calibrate(clean.without(wrong))
     assert np.abs(result.x - oracle.x).max() < 1e-6
     assert ro.calibrate(clean).learned.left_out == ()  # type: ignore[union-attr]
@@ -379,15 +378,13 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
     result = ro.calibrate(few)
     learned = result.learned
     assert learned is not None
-    learning = Learning(ro.bayes.Prior(), tuple(learned.noise))
-    fit = learning.fitted(
-        few, result.x, np.log([s.value for s in (*learned.sizes.values(), *learned.noise.values())]), 1
-    )
+    estimator = Estimator(ro.bayes.Prior(), tuple(learned.noise))
+    fit = estimator.fit(few, result.x, np.log([s.value for s in (*learned.sizes.values(), *learned.noise.values())]), 1)
     evidence, logs = fit.evidence, fit.point.logs
     step = 0.01
     ends = [[evidence.at(logs + side * e).z for side in (-1, 1)] for e in step * np.eye(len(logs))]
     J = np.array([(ahead - behind) / (2 * step) for behind, ahead in ends]).T
-    J = J * (POSITION.parameters.free.scale * learning.stated(few).scale)[:, None]
+    J = J * (POSITION.parameters.free.scale * estimator.stated(few).scale)[:, None]
     followed, tails = np.split(learned.drift, [len(logs)], axis=1)
     own = np.diag(J @ learned.covariance @ J.T)
     assert np.sum(followed**2, axis=1) == pytest.approx(own, rel=0.1, abs=0.02 * np.diag(result.covariance).min())
@@ -402,9 +399,9 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
 
 
 def test_sizes_agree_with_the_deviations_that_they_lead_to() -> None:
-    learning = Learning(ro.bayes.Prior(), ("position",))
-    fit = learning.fitted(POSITION, np.zeros(len(POSITION.parameters.free)), None, 8)
-    again = learning.fitted(POSITION, fit.x, fit.point.logs, 1)
+    estimator = Estimator(ro.bayes.Prior(), ("position",))
+    fit = estimator.fit(POSITION, np.zeros(len(POSITION.parameters.free)), None, 8)
+    again = estimator.fit(POSITION, fit.x, fit.point.logs, 1)
     assert np.abs(again.point.logs - fit.point.logs).max() < 0.02
     assert np.abs(again.x - fit.x).max() < 1e-5
     assert 0 < fit.spare < 1

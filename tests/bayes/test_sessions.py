@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.held_out_rows import judged
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.calibration.unseen import judged
 from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.several import unknown_sessions
 from rpim_opt.robot.model import model_parameters
@@ -99,7 +99,7 @@ def test_the_evidence_takes_sessions_and_says_how_they_differ(automatic: ro.Cali
         size = learned.sizes[f"sessions' {kind}"]
         assert abs(np.log(1e-4 * size.value / true)) < 2.5 * size.spread
         assert 0.15 < size.spread < 0.5  # of twelve numbers 1 / sqrt(24) = 0.2
-    assert "Sessions differ by 0." in str(automatic)
+    assert "Session offsets (1 sigma): 0." in str(automatic)
 
 
 def test_the_robot_is_found_as_if_the_instrument_had_not_been_moved(
@@ -129,7 +129,7 @@ def test_sessions_that_do_not_differ_are_not_taken_and_do_no_harm() -> None:
     seen = ro.study.simulated_arm(SEED, len(DAYS))
     explicit = ro.calibrate(with_sessions(same))
     assert off(explicit, seen) < 1.02 * off(ro.calibrate(same), seen)
-    assert "Sessions differ by at most" in str(explicit)
+    assert "Session offsets (1 sigma): at most" in str(explicit)
 
 
 @pytest.mark.slow

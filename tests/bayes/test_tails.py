@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.evidence import WIDEST, added
+from rpim_opt.bayes.evidence import MOST_WIDENED, tail_widening
 
 
 def field(H: Array, h: Array, size: Array, tails: float) -> tuple[Array, Array, Array]:
@@ -23,7 +23,7 @@ def field(H: Array, h: Array, size: Array, tails: float) -> tuple[Array, Array, 
 def widened(H: Array, h: Array, size: Array, tails: float) -> tuple[Array, Array]:
     """Return the covariance of the mean field, and that with what tails add."""
     z, C, v = field(H, h, size, tails)
-    D = added(z, C, v, np.arange(len(v)), size, tails)
+    D = tail_widening(z, C, v, np.arange(len(v)), size, tails)
     return C, C + D @ D.T
 
 
@@ -72,12 +72,12 @@ def test_only_the_precisions_of_deviations_with_tails_change() -> None:
     A = rng.normal(size=(3, 5))
     z, C, v = field(A.T @ A, A.T @ np.array([4.0, -1.0, 0.0]), np.ones(5), 3.0)
     heavy = np.array([0, 2, 3])
-    D = added(z, C, v, heavy, np.ones(3), 3.0)
+    D = tail_widening(z, C, v, heavy, np.ones(3), 3.0)
     change = np.linalg.inv(C) - np.linalg.inv(C + D @ D.T)
     less = np.diag(change)
     assert np.allclose(change, np.diag(less), atol=1e-10)
     assert (np.abs(less[[1, 4]]) < 1e-10).all()
-    assert ((less[heavy] > 0) & (less[heavy] <= (1 - 1 / WIDEST) / v[heavy] + 1e-10)).all()
+    assert ((less[heavy] > 0) & (less[heavy] <= (1 - 1 / MOST_WIDENED) / v[heavy] + 1e-10)).all()
 
 
 def test_units_do_not_matter() -> None:

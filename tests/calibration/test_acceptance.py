@@ -13,8 +13,7 @@ from scipy.stats import chi
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_json
-from rpim_opt.calibration.reaching import distance_quantile, reaching
-from rpim_opt.calibration.region import region_of
+from rpim_opt.calibration.region import distance_quantile, reaching, region_of
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.store.serialize import digest
 from tests.simulate import simulated

@@ -12,10 +12,9 @@ import pytest
 from scipy.spatial import KDTree
 
 import rpim_opt as ro
-from rpim_opt.calibration.alike import _nearest as nearest
-from rpim_opt.calibration.alike import alike
 from rpim_opt.calibration.lack_of_fit import LackOfFit, foreseen, judged, lack_of_fit
-from rpim_opt.calibration.left_over import FEWEST
+from rpim_opt.calibration.residuals import FEWEST, alike
+from rpim_opt.calibration.residuals import _nearest as nearest
 from rpim_opt.report.report import page
 from tests.simulate import ALL, ARM, simulated
 
@@ -59,8 +58,8 @@ def test_clean_arm_is_left_alone_and_its_noise_named():
     assert found.share == found.gain == found.repeatable == 0.0
     assert "would explain" not in str(found)
     fine = LackOfFit(60, 180, 150.0, "length", left=1e-4, instrument=1e-4, position=2e-5)
-    assert "only a better one" in str(fine)
-    assert "only a better one" not in str(replace(fine, position=4e-5))
+    assert "only a more accurate one" in str(fine)
+    assert "only a more accurate one" not in str(replace(fine, position=4e-5))
 
 
 @pytest.mark.parametrize("weight", [None, "reml", 1.0])
@@ -73,7 +72,7 @@ def test_gravity_is_found_whatever_the_weight(weight):
     assert found.gain > 10 * len(found.missing)
     assert not found.upward
     text = str(found)
-    assert f"explain {found.share:.0%} of the mean square" in text
+    assert f"explain {found.share:.0%} of the mean square residual" in text
     assert "add compliance?" in text
     # what it would explain is no longer the robot's scatter
     assert found.repeatable > 2 * found.robot
@@ -84,7 +83,7 @@ def test_division_adds_up_to_what_the_model_without_the_family_leaves():
     total = found.instrument**2 + found.robot**2 + found.repeatable**2
     assert found.repeatable**2 / total == pytest.approx(found.share, rel=1e-9)
     # of 75 equations 2 in 5 serve the parameters
-    assert found.left * found.room == pytest.approx(np.sqrt(total), rel=0.2)
+    assert found.left * np.sqrt(found.equations / found.spare) == pytest.approx(np.sqrt(total), rel=0.2)
 
 
 def test_model_that_has_gravity_says_how_far_it_bends_the_arm():
@@ -123,7 +122,7 @@ def test_wrong_mounting_bends_upwards():
     hanging = arm(4, compliance=BENT, mounting=1.0)
     found = lack_of_fit(ro.calibrate(hanging))
     assert 2 in found.upward
-    assert "bend upwards" in str(found)
+    assert "negative, which gravity cannot cause" in str(found)
     assert not lack_of_fit(learned(4, compliance=BENT)).upward
 
 
@@ -144,11 +143,11 @@ def test_repeated_readings_tell_scatter_from_what_comes_again():
     scattered = lack_of_fit(learned(7, n=30, repeats=2, scatter=2e-4))
     assert scattered.repeated == pytest.approx(ROOT3 * np.hypot(2e-4, NOISE), rel=0.2)
     assert scattered.excess == 0.0
-    assert "does not repeat better" in str(scattered)
+    assert "limits the result, by its repeatability, backlash or drift" in str(scattered)
     bent = lack_of_fit(learned(7, n=30, repeats=2, compliance=BENT))
     assert bent.repeated == pytest.approx(ROOT3 * NOISE, rel=0.2)
     assert bent.excess > bent.repeated
-    assert "comes again with the configuration" in str(bent)
+    assert "repeat with the configuration" in str(bent)
 
 
 def test_too_few_equations_are_not_judged():
@@ -163,7 +162,7 @@ def test_noise_declared_far_too_large_is_said():
     loud = problem.on(ro.Dataset.of(problem.data.q, problem.data.blocks[0].y, 10 * NOISE))
     found = lack_of_fit(ro.calibrate(loud))
     assert not found.alarming
-    assert "repeat one reading ten times" in str(found)
+    assert "Repeat one reading ten times" in str(found)
 
 
 def test_gross_errors_are_no_scatter():

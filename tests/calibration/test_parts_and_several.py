@@ -12,8 +12,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration import influence, likely_causes
 from rpim_opt.calibration.baselines import gradient_descent
+from rpim_opt.calibration.held_out_rows import refit_all
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.calibration.refit import refit_all
 from rpim_opt.data.record import Requirement
 from rpim_opt.problem.parts import PartitionedProblem
 from tests.simulate import simulated

@@ -62,4 +62,4 @@ def test_the_command_names_and_refits(monkeypatch, capsys) -> None:
     assert "Refitted without " in out
     assert all(label in out for label in BLUNDERS)
     assert run(monkeypatch, "calibrate", "paper_arm", "--variant", "misprints") == 0
-    assert "Distrusted rows: T8-6 (" in capsys.readouterr().out
+    assert "Outlying rows: T8-6 (" in capsys.readouterr().out

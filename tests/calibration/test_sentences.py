@@ -11,15 +11,14 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
-from rpim_opt.calibration import learned_words
+from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, _wide
-from rpim_opt.calibration.alike import Alike, alike
 from rpim_opt.calibration.certificate import Certificate, certified
-from rpim_opt.calibration.checked import Checked
+from rpim_opt.calibration.held_out_rows import Checked
 from rpim_opt.calibration.intervals import checked as interval
 from rpim_opt.calibration.lack_of_fit import LackOfFit
-from rpim_opt.calibration.left_over import Effect
-from rpim_opt.calibration.reaching import Share, share
+from rpim_opt.calibration.region import Share, share
+from rpim_opt.calibration.residuals import Alike, Effect, alike
 from rpim_opt.data.record import Requirement
 
 LIMIT = Requirement(1e-4)
@@ -87,33 +86,36 @@ def left(rms: float, **more: Any) -> LackOfFit:
 
 
 LEFT: dict[str, tuple[LackOfFit, str, str]] = {
-    "none spare": (LackOfFit(3, 9, 1.0, "length", 1e-4), "1 equation is left over", "would differ"),
-    "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 equations are left over", "would differ"),
+    "none spare": (LackOfFit(3, 9, 1.0, "length", 1e-4), "1 degree of freedom is too few", "measurement noise"),
+    "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 degrees of freedom are too few", "measurement noise"),
     "effects": (
         left(1e-4, instrument=1e-4, present={"gravity": Effect(30.0, None), "first harmonic": Effect(9.0, 2e-5)}),
         "gravity (-2 ln L falls by 30). Joints turn unevenly (eccentric encoders or gears): 0.02 mm",
         "imitate (-2 ln L falls by 30)",
     ),
-    "alike": (left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0)), "Similar configurations err alike", "More reach"),
+    "alike": (
+        left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0)),
+        "Residuals of neighbouring configurations are correlated", "moved too little",
+    ),
     "alike even then": (
         left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0), narrow=(2, 3), **LACKING),
-        "Even then similar configurations err alike (correlation 0.50, z = 9): the model lacks an effect, which more "
-        "readings will not average away. More reach would help to find it: of joints 2 and 3",
-        "Similar",
+        "Even then residuals of neighbouring configurations are correlated (0.50, z = 9): the model lacks an effect, "
+        "which more readings will not average away. Joints 2 and 3 moved too little to identify gear eccentricity.",
+        "Residuals of",
     ),
-    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "So much is no robot's scatter", "limit"),
+    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "No robot repeats so badly", "limits"),
     "does not repeat": (
         left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-3),
-        "this is repeatability, backlash or drift", "Repeat five",
+        "limits the result, by its repeatability, backlash or drift", "Repeat five",
     ),
     "repeats better": (
         left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-4, excess=9e-4),
-        "The robot, not the instrument, is the limit.", "this is repeatability",
+        "The robot, not the instrument, limits the result.", "backlash",
     ),
     "never repeated": (left(1e-3, instrument=1e-4, position=1e-3), "Repeat five configurations", "backlash"),
-    "below the noise": (left(1e-6, instrument=1e-4), "far below the declared noise", "only a better one"),
-    "up": (left(1e-4, instrument=1e-4, upward=(2,)), "Joint 2 seems to bend upwards", "Joints"),
-    "both up": (left(1e-4, instrument=1e-4, upward=(2, 3)), "Joints 2 and 3 seem to bend upwards", "Joint 2"),
+    "below the noise": (left(1e-6, instrument=1e-4, overstated=True), "Repeat one reading ten times", "only a more"),
+    "up": (left(1e-4, instrument=1e-4, upward=(2,)), "Compliance of joint 2 is negative", "joints 2"),
+    "both up": (left(1e-4, instrument=1e-4, upward=(2, 3)), "Compliances of joints 2 and 3 are negative", "joint 2 is"),
 }  # fmt: skip
 
 
@@ -160,7 +162,7 @@ def learned(sizes: Mapping[str, Size] | None = None, noise: Mapping[str, Size] |
 
 
 def said(found: Learned) -> list[str]:
-    return learned_words.sentences(found, ("theta2", "d3"), np.zeros(2))
+    return words.learned_lines(found, ("theta2", "d3"), np.zeros(2))
 
 
 def test_what_was_learned_is_said_and_nothing_else() -> None:
@@ -169,9 +171,8 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
     assert learned().gain("gravity") is None
     sized = learned({"lengths": Size(2.0, 0.1), "angles": Size(1.0, 0.1)}, {"position": Size(5e-5, 0.1)})
     assert said(sized) == [
-        "Learned from the data: "
-        "lengths deviate 2 times as much as expected (1.8 to 2.2) and angles 1 times (0.9 to 1.1).",
-        "Beside the instrument's noise the robot scatters by " + said(sized)[1].partition("scatters by ")[2],
+        "Estimated prior scale: lengths 2 x the stated one (95 % CI 1.6 to 2.4) and angles 1 x (95 % CI 0.82 to 1.2).",
+        "Robot repeatability (1 sigma): 0.05 mm (95 % CI 0.041 to 0.061) in position.",
     ]
 
 
@@ -182,7 +183,7 @@ def test_parts_of_the_scatter_that_are_not_worth_a_word() -> None:
     assert "joint" not in only[0]
     assert "mm" in only[0]
     vague = said(learned(noise={"position": Size(1e-3, 0.6)}))[0]
-    assert "at most 1.8 mm" in vague
+    assert "at most 2.7 mm (95 % confidence)" in vague
 
 
 def test_families_are_compared_with_the_best_model_without_them() -> None:
@@ -194,13 +195,13 @@ def test_families_are_compared_with_the_best_model_without_them() -> None:
     assert found.gain("compliance") is None
     assert said(found) == ["Model: geometry with gravity (-2 ln L falls by gravity 30)."]
     alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
-    assert said(alone) == ["Model: geometry alone; no family is worth its parameters."]
+    assert said(alone) == ["Model: geometry alone; the data support no model extension."]
 
 
 @pytest.mark.parametrize(("count", "more"), [(1, ""), (5, ""), (7, " and 2 more")])
 def test_blunders_are_named_and_the_others_counted(count: int, more: str) -> None:
     (text,) = said(learned(left_out=tuple(LeftOut(f"r{k}", 9.0) for k in range(count))))
-    assert text.startswith("Left out as blunders: r0 (9 times the median error)")
+    assert text.startswith("Excluded outliers: r0 (9 times the median error)")
     assert text.endswith(f"median error){more}.")
     assert text.count("times") == min(count, 5)
 

@@ -64,7 +64,11 @@ def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
 
 @pytest.mark.parametrize(
     ("variance", "said"),
-    [(1.0, "as declared"), (0.3, "stated too large"), (3.0, "times as much as declared: noise is larger")],
+    [
+        (1.0, "agree with the stated"),
+        (0.3, "stated too large"),
+        (3.0, "times the stated measurement noise: noise is larger"),
+    ],
 )
 def test_the_noise_is_judged_by_its_distribution(variance: float, said: str) -> None:
     test = stand_in(60, 20.0, variance).noise_test()
@@ -78,8 +82,8 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
     for tail in (0.005, 0.995):
         edge = chi2.ppf(tail, 40) / 40
         inner, outer = (edge * (1 + by * (0.5 - tail)) for by in (1e-6, -1e-6))
-        assert "as declared (" in stand_in(60, 20.0, inner).noise_test().verdict
-        assert "as declared (" not in stand_in(60, 20.0, outer).noise_test().verdict
+        assert "agree with the stated measurement noise (" in stand_in(60, 20.0, inner).noise_test().verdict
+        assert "agree with the stated measurement noise (" not in stand_in(60, 20.0, outer).noise_test().verdict
 
 
 @pytest.mark.parametrize(("left", "tells"), [(0.0, False), (0.9, False), (1.0, True), (1.5, True)])
@@ -87,7 +91,7 @@ def test_what_few_equations_tell(left: float, tells: bool) -> None:
     u = stand_in(20, 20.0 - left, 1.0)
     assert u.freedom == pytest.approx(left, abs=1e-12)
     test = u.noise_test()
-    assert ("No equation is left over" in test.verdict) != tells
+    assert ("No degree of freedom is left" in test.verdict) != tells
     if not tells:
         assert (test.ratio, test.probability) == (1.0, 1.0)
     assert u.coverage_factor == pytest.approx(student.ppf(0.975, max(left, 1.0)), rel=1e-12)

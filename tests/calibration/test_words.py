@@ -62,16 +62,16 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
 def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert flagged(0) == ["Done."]
     eight = flagged(8)[0]
-    assert eight.startswith("Distrusted rows: r0 (10 sigmas, 1.23 mm), ")
-    assert "r7 (17 sigmas" in eight
+    assert eight.startswith("Outlying rows: r0 (10 sigma, 1.23 mm), ")
+    assert "r7 (17 sigma" in eight
     assert "more" not in eight
     eleven = flagged(11)
     assert eleven[0].endswith("and 3 more.")
     assert "r8" not in eleven[0]
-    bounds = [line for line in eleven if "is held at" in line]
+    bounds = [line for line in eleven if line.startswith("Active bound")]
     assert len(bounds) == 5
     assert bounds[0] == (
-        "a2 is held at +0.5 mm: loosening its tolerance by 0.05 mm would lower the whitened RMS by 0.05."
+        "Active bound: a2 at +0.5 mm. Loosening its tolerance by 0.05 mm would lower the whitened RMS by 0.05."
     )
     assert not any("A squared loss lets" in line for line in eleven)
     assert any("A squared loss lets" in line for line in flagged(1, True))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.hyperparameters import Learning
+from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.outliers import clustered, ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
@@ -280,12 +280,12 @@ def test_evidence_does_not_see_the_points(name: str) -> None:
     """Slopes of -2 ln L by the logarithms of sizes are those of its differences."""
     problem = ro.load(name).problem
     x = near(problem)
-    evidence = Learning(Prior(), ("position", "joint")).evidence(problem, x)
+    evidence = Estimator(Prior(), ("position", "joint")).evidence(problem, x)
     logs = evidence.centre + 0.3
-    ahead = [evidence.at(logs + step, settled=1e-12).value for step in 1e-5 * np.eye(len(logs))]
-    behind = [evidence.at(logs - step, settled=1e-12).value for step in 1e-5 * np.eye(len(logs))]
+    ahead = [evidence.at(logs + step, accuracy=1e-12).value for step in 1e-5 * np.eye(len(logs))]
+    behind = [evidence.at(logs - step, accuracy=1e-12).value for step in 1e-5 * np.eye(len(logs))]
     numeric = (np.array(ahead) - behind) / 2e-5
-    assert evidence.at(logs, settled=1e-12).gradient == pytest.approx(numeric, rel=1e-4, abs=1e-3)
+    assert evidence.at(logs, accuracy=1e-12).gradient == pytest.approx(numeric, rel=1e-4, abs=1e-3)
 
 
 @pytest.mark.parametrize("formulation", [ro.tikhonov, ro.least_squares, ro.robust, ro.lasso])

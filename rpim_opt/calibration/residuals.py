@@ -1,4 +1,4 @@
-"""What a fit leaves over, part by part: noise, effects of families, neighbours, repeated readings."""
+"""Residuals of a calibration, part by part: noise, effects of model extensions, spatial autocorrelation, repetition."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.comparison import OWNED, SPEAK, Comparison, Judged
-from rpim_opt.bayes.model_selection import SESSIONS, TURNED, WARMTH
+from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
 from rpim_opt.bayes.prior import family_of
-from rpim_opt.calibration.alike import Alike, alike
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import measured_torques, repeatable
 
@@ -36,6 +35,14 @@ UNSEEN = 1e-10
 """Relative singular value of a direction of the geometry that the data do not see."""
 RARE = 1e-3
 """Probability that what is left exceeds the scatter of repeated readings by chance."""
+SHUFFLES = 300
+"""Permutations that an autocorrelation is compared with."""
+LEAST = 8
+"""Configurations below which there is no autocorrelation."""
+FEW = 500
+"""Up to so many points all distances are found sooner than SciPy's tree is loaded."""
+SURELY = 1 - 1e-9
+"""Of squared distances that differ by less rounding decides which is smaller: then the tree does, for all points."""
 
 
 class Effect(NamedTuple):
@@ -80,7 +87,7 @@ def present(compared: Comparison) -> Mapping[str, Effect]:
     """Return the families of the result's own model that are worth more than `SPEAK`, with what they do."""
     found = {}
     for family, members in compared.owned().items():
-        gain = compared.worth(members)
+        gain = compared.rise_without(members)
         if gain > SPEAK:
             found[family] = Effect(gain, _beyond_geometry(compared, members))
     return found
@@ -187,3 +194,73 @@ def excess(again: Repeated, total: float, spare: float) -> float:
     if total / within < fdtri(spare, again.freedom, 1 - RARE):
         return 0.0
     return float(np.sqrt(total - within))
+
+
+# --- spatial autocorrelation ------------------------------------------------------------------------------------------
+
+
+class Alike(NamedTuple):
+    """Correlation of the residuals of nearest configurations, and its z-score among permutations."""
+
+    correlation: float
+    z: float
+
+
+def alike(q: Array, errors: Array, kinds: np.ndarray) -> Alike | None:
+    """Return the autocorrelation of residuals with those of nearest neighbours in joint space (Moran).
+
+    ::
+
+        rho = sum_i e_i . e_nearest(i) / sum_i e_i . e_i
+
+    and z = (rho - mean) / std over permutations of the residuals. The neighbours stay: two that are each other's
+    nearest count twice in both.
+
+    Parameters
+    ----------
+    q
+        (N, dof) joint values.
+    errors
+        (N, k) residuals in units of their noise; zero beyond what was measured there.
+    kinds
+        (N,) which configurations have residuals of the same kind: neighbours are among those.
+
+    Returns
+    -------
+    None for fewer than `LEAST` configurations of the same kind.
+    """
+    unit = (q - q.mean(axis=0)) / (q.std(axis=0) + 1e-9)
+    groups = [rows for kind in np.unique(kinds) if len(rows := np.flatnonzero(kinds == kind)) >= LEAST]
+    squares = sum(float(np.sum(errors[rows] ** 2)) for rows in groups)
+    if not squares > 0:
+        return None
+    rng = np.random.default_rng(0)
+    found = 0.0
+    dealt = np.zeros(SHUFFLES)
+    for rows in groups:
+        e = errors[rows]
+        nearest = _nearest(unit[rows])
+        found += float(np.sum(e * e[nearest]))
+        # a table of all products: shuffles only look up
+        products = e @ e.T
+        for k in range(SHUFFLES):
+            order = rng.permutation(len(rows))
+            dealt[k] += float(np.sum(products[order, order[nearest]]))
+    spread = float(dealt.std())
+    if not spread > 0:
+        return None
+    return Alike(found / squares, (found - float(dealt.mean())) / spread)
+
+
+def _nearest(points: Array) -> np.ndarray:
+    """Return the number (N,) of every point's nearest other one."""
+    number = np.arange(len(points))
+    if len(points) <= FEW:
+        squares = np.sum((points[:, None] - points) ** 2, axis=2)
+        np.fill_diagonal(squares, np.inf)
+        nearest, next_one = np.partition(squares, 1)[:, :2].T
+        if np.all(nearest < SURELY * next_one):
+            return np.argmin(squares, axis=1)
+    near = np.asarray(scipy.spatial.KDTree(points).query(points, k=2)[1])
+    # of points at the same place either may come first
+    return np.where(near[:, 0] == number, near[:, 1], near[:, 0])

@@ -1,4 +1,4 @@
-"""What errors mean where points or planes were touched, in words and point by point."""
+"""Remarks on errors of cameras and of contacts: what they mean, and how they divide by point."""
 
 from __future__ import annotations
 
@@ -9,12 +9,73 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import listed
+from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.camera import camera_blocks
 
 MOST = 20
 """Points of a table; of others one row says how many there are."""
 HEADER = ["touches by point [mm]", "touches", "RMS before", "RMS after", "largest after"]
+
+
+# --- cameras ----------------------------------------------------------------------------------------------------------
+
+
+def camera_remarks(result: Calibration) -> list[str]:
+    """Return remarks on a camera's views; nothing where there are none.
+
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.calibration.remarks import camera_remarks
+    >>> camera_remarks(ro.load("paper_arm").calibrate())
+    []
+    >>> said = camera_remarks(ro.load("camera").calibrate(weight=1.0))
+    >>> said[1].split(",")[0]
+    'Expected position error of the flange over its joint ranges'
+    """
+    blocks = camera_blocks(result.problem.sample().data)
+    if not blocks:
+        return []
+    before = _rms(result.nominal_errors(dimension="pixel"))
+    after = _rms(result.errors(dimension="pixel"))
+    remarks = [
+        f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; in millimetres, the distance of the "
+        "line of sight from the point. It measures how well views agree, not how well the robot is identified."
+    ]
+    remarks += _positions(result)
+    if not any("stretch" in name for name in result.problem.parameters.free.names):
+        remarks.append(
+            "Views do not identify the size of the board: an error of it scales the robot by the same factor "
+            "(identify board_stretch_x and board_stretch_y where it was printed)."
+        )
+    return remarks
+
+
+def _positions(result: Calibration) -> list[str]:
+    from rpim_opt.calibration.expected import improvement  # which no other measurement asks for
+
+    found = improvement(result)
+    if found is None:
+        return ["This result does not determine the expected position error of the flange."]
+    figures = (
+        "Expected position error of the flange over its joint ranges, base and tool fitted: "
+        f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % of it within "
+        f"{1e3 * found.within:.3g} mm along any axis)."
+    )
+    if found.improves:
+        return [figures]
+    return [
+        figures,
+        "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the board "
+        "nearer or larger, or an instrument that measures positions would.",
+    ]
+
+
+def _rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
 
 
 class Scatter(NamedTuple):
@@ -46,7 +107,7 @@ def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
     --------
     >>> import numpy as np
     >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.contact_words import scatter
+    >>> from rpim_opt.calibration.remarks import scatter
     >>> data = ro.data.touches(np.zeros((4, 6)), ["A", "B", "A", "B"], sigma=1e-4)
     >>> [each.name for each in scatter(data, np.zeros(4), np.array([1e-4, 3e-4, 2e-4, 3e-4]))]
     ['B', 'A']
@@ -89,7 +150,7 @@ def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
     """Say of which points that rows touched the calibration has touches of its own: those are not held back.
 
     >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.contact_words import known_points
+    >>> from rpim_opt.calibration.remarks import known_points
     >>> instance = ro.load("contact")
     >>> known_points(instance.problem, instance.validation)  # four sockets elsewhere
     []
@@ -98,14 +159,14 @@ def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
     both = [name for name, _ in _touched(data) if name in known]
     if not both:
         return []
-    return [f"Not held back: the calibration has touches of {listed(both)}, too."]
+    return [f"Not held out: the calibration has touches of {listed(both)}, too."]
 
 
 def contact_remarks(problem: CalibrationProblem) -> list[str]:
-    """Return what a reader of errors has to know of touches; nothing where there are none.
+    """Return remarks on errors of touches; nothing where there are none.
 
     >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.contact_words import contact_remarks
+    >>> from rpim_opt.calibration.remarks import contact_remarks
     >>> contact_remarks(ro.load("paper_arm").problem)
     []
     >>> contact_remarks(ro.load("contact").problem)[0][:58]
@@ -119,10 +180,10 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     if any(problem.touches.planar):
         nearest.append("the plane that fits all touches of it best")
     said = f"Error of a touch: the distance of the tool from {', or '.join(nearest)}, as the model has them"
-    tells = "the robot repeats itself"
+    tells = "how well the robot returns there"
     if len(problem.arms) > 1:
-        tells = "the robots meet there, and repeat themselves,"
-    remarks = [f"{said}. Where these are nobody measured: it is how well {tells} from all sides."]
+        tells = "how well the robots meet and return there"
+    remarks = [f"{said}. Their positions were not measured: the error is {tells} from all sides."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
-        remarks.append("No distance is known: how large the robot is rests on its drawing alone.")
+        remarks.append("No distance is known: the size of the robot rests on its nominal lengths alone.")
     return remarks

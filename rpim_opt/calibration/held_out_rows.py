@@ -1,24 +1,89 @@
-"""Rows that a calibration did not see, held against a limit and against the intervals that predicted them."""
+"""Held-out rows: against the intervals that predicted them and a limit, and used for a last fit."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import bdtr
+from scipy.special import bdtr, fdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import listed
-from rpim_opt.calibration.intervals import UNLIKELY
+from rpim_opt.bayes.hyperparameters import sessions_spread
+from rpim_opt.calibration.intervals import UNLIKELY, coverage_factors, row_freedom, scattered
 from rpim_opt.calibration.ranges import SLACK
-from rpim_opt.calibration.reaching import distance_quantile
-from rpim_opt.calibration.region import Region
+from rpim_opt.calibration.region import Region, distance_quantile
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.unseen import CONFIDENCE
-from rpim_opt.calibration.unseen import judged as unseen
+from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Requirement
+from rpim_opt.data.record import HeldOut, Requirement
+
+RARE = 0.01
+"""Probability that data like those of the calibration have any row that is named."""
+CONFIDENCE = 0.95
+"""Of the intervals whose coverage is counted."""
+
+
+class Judged(NamedTuple):
+    """Residuals (N,) in standard deviations of a reading, what of it is allowed, and the coverage of the intervals."""
+
+    sigmas: Array
+    allowed: Array
+    coverage: float | None
+
+
+def judged(result: Calibration, data: Dataset) -> Judged:
+    """Return how the rows lie beside what the calibration's uncertainty predicts; NaN where it predicts nothing.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    data
+        N measurements in the same instrument's frame, by reflectors of the calibration.
+    """
+    N = len(data)
+    sigmas = np.full(N, np.nan)
+    allowed = np.full(N, np.nan)
+    inside: list[np.ndarray] = []
+    C = known_covariance(result)
+    if C is None:
+        return Judged(sigmas, allowed, None)
+    problem = result.problem.on(data)
+    residual = problem.residual(result.x)
+    J = problem.jacobian(result.x)
+    known = np.isfinite(np.diag(C))
+    C = np.where(np.outer(known, known), C, 0.0)
+    start = 0
+    added = scattered(problem, result.noise_level)
+    for block, reading, session in zip(data.blocks, added.reading, added.session, strict=True):
+        k = len(block.measurement.components)
+        end = start + k * len(block.row)
+        r = residual[start:end].reshape(-1, k)
+        A = J[start:end].reshape(-1, k, len(C))
+        start = end
+        S = A @ C @ A.transpose(0, 2, 1) + reading
+        freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
+        squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
+        seen = (A[:, :, ~known] == 0).all(axis=(1, 2))
+        sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
+        allowed[block.row] = np.where(seen, _limit(k, freedom, N), np.nan)
+        lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
+        factor = coverage_factors(freedom, CONFIDENCE)[:, None]
+        within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
+        inside.append(within[seen][:, lengths].ravel())
+    covered = np.concatenate(inside)
+    if not len(covered):
+        return Judged(sigmas, allowed, None)
+    return Judged(sigmas, allowed, float(covered.mean()))
+
+
+def _limit(k: int, freedom: Array, rows: int) -> Array:
+    """Return above which norm one of so many rows with k components lies with probability `RARE`."""
+    return np.asarray(np.sqrt(k * fdtri(k, freedom, 1 - RARE / rows)))
+
 
 SURE = 1e9
 """Degrees of freedom of an uncertainty that is stated."""
@@ -109,7 +174,7 @@ def checked(result: Calibration, region: Region, requirement: Requirement, data:
     if apart is None:
         apart = result.record.validation
     if apart is not None:
-        found = unseen(result, apart)
+        found = judged(result, apart)
         return _checked(apart, result.errors(apart), *found, region, requirement)
     held = result.record.held_out
     if held is None:
@@ -162,3 +227,50 @@ def _instrument(data: Dataset, confidence: float) -> Array:
         if lengths:
             found[block.row] = distance_quantile(stated[:, lengths][:, :, lengths], SURE, confidence)
     return found
+
+
+def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:
+    """Return the calibration from identification and validation rows together, asked as this one was.
+
+    Errors on the rows that were kept apart, which validate the procedure, stay in its record (``held_out``); the
+    parameters that are delivered come from all rows. No row is left that checks these alone.
+
+    Parameters
+    ----------
+    result
+        The calibration that was validated.
+    validation
+        The rows that were kept apart; those of its record by default.
+
+    Raises
+    ------
+    InputError
+        Where no rows were kept apart, or measurements are not in memory.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> instance = ro.load("position")
+    >>> result = instance.calibrate()
+    >>> everything = ro.calibration.refit_all(result)
+    >>> f"{1e3 * everything.record.held_out.error.mean():.3f} mm, then {len(everything.problem.data)} rows"
+    '0.024 mm, then 80 rows'
+    """
+    apart = validation
+    if apart is None:
+        apart = result.record.validation
+    if apart is None:
+        raise InputError("validation", "no rows that were kept apart", "a calibration with validation data")
+    if not result.stated.keeps_rows:
+        raise InputError("refit_all", "measurements in parts", "measurements in memory")
+    stated = result.stated
+    whole = Dataset.together([stated.data, apart], ["identification", "validation"])
+    held_out = HeldOut(
+        whole.label[len(stated.data) :],
+        len(stated.data),
+        result.nominal_errors(apart),
+        result.errors(apart),
+        *judged(result, apart),
+    )
+    record = replace(result.record, validation=None, held_out=held_out)
+    return replace(result.asked(stated.on(whole)), record=record)

@@ -1,0 +1,150 @@
+"""Empirical Bayes: hyperparameters, model extensions and outliers of one problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
+from rpim_opt.bayes.model_selection import select_model
+from rpim_opt.bayes.outliers import beyond, suspected, unbelievable
+from rpim_opt.bayes.prior_terms import Stated
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import settled
+from rpim_opt.problem.source import Source
+
+ROUNDS = 6
+"""Linearizations at which hyperparameters are estimated."""
+ASKED = 6.0
+"""By how much -2 ln L must fall for a doubted prior: a likelihood ratio of twenty, which by Markov's inequality an arm
+of another kind shows once in twenty times at most."""
+LOOKS = 4
+"""How often outliers are looked for again without those that were found: they mask each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was estimated, ready for a fit at weight 1.
+
+    Parameters
+    ----------
+    problem
+        With local scales, noise and model extensions, without outliers.
+    learned
+        The hyperparameters.
+    stated
+        The prior, in units of those scales.
+    x
+        (n,) where to begin [SI].
+    """
+
+    problem: Source
+    learned: Learned
+    stated: Stated
+    x: Array
+
+
+def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
+    """Return hyperparameters, model extensions and outliers of a problem, laid into it.
+
+    Parameters
+    ----------
+    problem
+        With stated scales.
+    estimator
+        With the prior, and the parts of the noise to estimate.
+    model
+        ``"geometry"``, or ``"auto"`` for the model extensions that the marginal likelihood selects.
+    start
+        (n,) where to begin [SI], or None.
+    """
+    try:
+        return _found(problem, estimator, model, start)
+    except np.linalg.LinAlgError:
+        found = "equations, scales and noise too far apart for sizes to be learned"
+        raise InputError("data", found, "their units looked at, or a weight") from None
+
+
+def _found(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
+    every = sampled(problem)
+    estimator, whole, notes = _first(every, estimator, _begin(every, start))
+    fit, trials, outliers = _without_outliers(every, estimator, whole, model)
+    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
+    if not problem.keeps_rows or len(every.data) < len(problem.labels):
+        outliers = beyond(laid, fit.x)
+    if outliers:
+        laid = laid.without(outliers)
+    worst = tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1]))
+    stated = set(every.parameters.free.names)
+    added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
+    result = learned(fit, added, trials, worst, notes)
+    return Found(laid, result, estimator.inside(fit.problem, fit.point), fit.x)
+
+
+def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
+    """Return where to linearize first: frames registered to the data, the robot nominal."""
+    if start is not None:
+        return start
+    p = problem.parameters
+    x = np.zeros(len(p.free))
+    frames = p.placed & p.identified
+    if frames.any():
+        x[p.placed[p.identified]] = settled(problem.identifying(frames))
+    return x
+
+
+def _first(every: CalibrationProblem, estimator: Estimator, x: Array) -> tuple[Estimator, Fit, tuple[str, ...]]:
+    """Return the first fit; a doubted prior is left out where the marginal likelihood is against it."""
+    whole = estimator.fit(every, x, None, ROUNDS)
+    if not estimator.prior.doubted:
+        return estimator, whole, ()
+    plain = replace(estimator, prior=estimator.prior.without_centre())
+    without = plain.fit(every, x, None, ROUNDS)
+    fall = without.point.value - whole.point.value
+    if fall >= ASKED:
+        return estimator, whole, ()
+    note = f"What other arms say was left out: -2 ln L falls by {fall:.1f} with it, where {ASKED:g} are asked."
+    return plain, without, (note,)
+
+
+def _without_outliers(
+    every: CalibrationProblem, estimator: Estimator, whole: Fit, model: str
+) -> tuple[Fit, tuple[Trial, ...], dict[str, float]]:
+    """Return the fit without the rows that no model explains, the models compared, and those rows."""
+
+    def explain(outliers: Mapping[str, float]) -> tuple[Fit, tuple[Trial, ...]]:
+        fit = whole
+        if outliers:
+            fit = estimator.fit(whole.problem.without(outliers), whole.x, None, ROUNDS)
+        if model == "geometry":
+            return fit, ()
+        return select_model(estimator, fit)
+
+    outliers = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
+    fit, trials = explain(outliers)
+    for _ in range(LOOKS):  # what extensions explain, and the worst outliers, stood before the smaller ones
+        if not outliers and not (trials and trials[0].families):
+            break
+        more = suspected(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
+        if not more.keys() - outliers.keys():
+            break
+        outliers = {**more, **outliers}
+        fit, trials = explain(outliers)
+    if outliers:
+        left = unbelievable(fit.laid.on(every.data), fit.x, fit.covariance, outliers)
+        if left.keys() != outliers.keys():
+            outliers = left
+            fit, trials = explain(outliers)
+    return fit, trials, outliers
+
+
+def with_extensions(problem: Source, found: Found) -> Source:
+    """Return a problem with the model extensions that were selected, and all else as it was stated."""
+    p = problem.parameters
+    added = np.isin(p.names, found.learned.added)
+    scale = np.where(added, found.problem.parameters.scale, p.scale)
+    return problem.with_parameters(replace(p, scale=scale, identified=p.identified | added))
