@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
-from rpim_opt.bayes.outliers import beyond, suspected, unbelievable
+from rpim_opt.bayes.outliers import beyond_noise, suspects, unexplained
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
@@ -75,7 +75,7 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
     laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
-        outliers = beyond(laid, fit.x)
+        outliers = beyond_noise(laid, fit.x)
     if outliers:
         laid = laid.without(outliers)
     worst = tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1]))
@@ -124,18 +124,18 @@ def _without_outliers(
             return fit, ()
         return select_model(estimator, fit)
 
-    outliers = suspected(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
+    outliers = suspects(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = explain(outliers)
     for _ in range(LOOKS):  # what extensions explain, and the worst outliers, stood before the smaller ones
         if not outliers and not (trials and trials[0].families):
             break
-        more = suspected(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
+        more = suspects(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
         if not more.keys() - outliers.keys():
             break
         outliers = {**more, **outliers}
         fit, trials = explain(outliers)
     if outliers:
-        left = unbelievable(fit.laid.on(every.data), fit.x, fit.covariance, outliers)
+        left = unexplained(fit.laid.on(every.data), fit.x, fit.covariance, outliers)
         if left.keys() != outliers.keys():
             outliers = left
             fit, trials = explain(outliers)

@@ -8,11 +8,11 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from scipy.linalg import solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.late import optimize
 from rpim_opt.basics.patterns import fits
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.program import pose
@@ -336,16 +336,15 @@ def reml_groups(grouped: Grouped) -> Selection:
     """
     if grouped.model.constrained:
         note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
-        return _answer(grouped, "reml", np.zeros(len(grouped.names)), np.zeros(len(FACTORS)), False, note)
+        weights = {**dict.fromkeys(grouped.names, 1.0), **grouped.told}
+        return Selection(1.0, "reml by group", FACTORS, np.zeros(len(FACTORS)), False, note, weights)
     objective = restricted_likelihood(grouped)
     bounds = _bounds(grouped)
-    t, inside = _least(objective, bounds, len(grouped.names), EXACT)
-    if (t >= bounds[1] - EDGE).all():
-        note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
-        t = np.zeros_like(t)
-    else:
-        note = _noted("largest restricted likelihood", grouped, t, bounds)
-    return _answer(grouped, "reml", t, _profile(objective, t), inside, note)
+    t = _least(objective, bounds, len(grouped.names), EXACT)
+    if (t < bounds[1] - EDGE).any():
+        return _selection(grouped, "reml", objective, t, bounds, "largest restricted likelihood")
+    note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
+    return replace(_selection(grouped, "reml", objective, np.zeros_like(t), bounds, note), interior=False)
 
 
 def restricted_likelihood(grouped: Grouped) -> Objective:
@@ -400,9 +399,8 @@ def k_fold_groups(grouped: Grouped, folds: int = 10, seed: int = 0) -> Selection
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
     objective = held_out(grouped, [np.isin(model.group, part) for part in parts])
     bounds = _bounds(grouped)
-    t, inside = _least(objective, bounds, len(grouped.names))
-    note = _noted("smallest error of configurations held out", grouped, t, bounds)
-    return _answer(grouped, "k_fold", t, _profile(objective, t), inside, note)
+    t = _least(objective, bounds, len(grouped.names))
+    return _selection(grouped, "k_fold", objective, t, bounds, "smallest error of configurations held out")
 
 
 def held_out(grouped: Grouped, out: list[np.ndarray]) -> Objective:
@@ -445,15 +443,10 @@ def minimum_distance(grouped: Grouped) -> Selection:
     least = grouped.at(np.full(count, low))
     most = grouped.at(np.full(count, high))
     objective = distance(grouped, np.log(least.misfit), np.log(most.sizes))
-    t, inside = _least(objective, (low, high), count)
-    note = _noted(
-        "nearest to the origin of the L-hypersurface",
-        grouped,
-        t,
-        (low, high),
-        ("at the least weight", "at the largest weight"),
-    )
-    return _answer(grouped, "l_curve", t, _profile(objective, t), inside, note)
+    t = _least(objective, (low, high), count)
+    sides = ("at the least weight", "at the largest weight")
+    note = "nearest to the origin of the L-hypersurface"
+    return _selection(grouped, "l_curve", objective, t, (low, high), note, sides)
 
 
 def distance(grouped: Grouped, misfit: float, sizes: Array) -> Objective:
@@ -512,7 +505,7 @@ def rule_of(weights: Mapping[str, Any]) -> GroupSelector | None:
     return partial(RULES[name], **options)
 
 
-# --- minimization ----------------------------------------------------------------------------------------------
+# --- minimization -----------------------------------------------------------------------------------------------
 
 
 def _bounds(grouped: Grouped) -> tuple[float, float]:
@@ -521,13 +514,10 @@ def _bounds(grouped: Grouped) -> tuple[float, float]:
     return float(np.log(grid[0] / BEYOND)), float(np.log(grid[-1] * BEYOND))
 
 
-def _least(
-    objective: Objective, bounds: tuple[float, float], count: int, accuracy: float = 1e-10
-) -> tuple[Array, bool]:
-    """Return the best minimum (G,) from several starts, and whether it lies inside the bounds.
+def _least(objective: Objective, bounds: tuple[float, float], count: int, accuracy: float = 1e-10) -> Array:
+    """Return the best minimum (G,) from several starts; the accuracy is relative, of the score.
 
-    ``accuracy`` is relative, of the score. A minimum at a bound in every group (no penalty at all, or no deviation)
-    counts only if there is no other.
+    A minimum at a bound in every group (no penalty at all, or no deviation) counts only if there is no other.
     """
     low, high = bounds
     common = np.linspace(low, high, COMMON)
@@ -539,18 +529,15 @@ def _least(
     if count > 1:
         sides = [common[best] + sign * APART * one for one in np.eye(count) for sign in (-1, 1)]
         starts += [np.clip(side, low, high) for side in sides]
-    found = [_polished(objective, start, bounds, accuracy) for start in starts]
-    t = min(found, key=lambda each: (_at_edges(each[1], bounds).all(), each[0]))[1]
-    return t, not bool(_at_edges(t, bounds).any())
-
-
-def _polished(objective: Objective, start: Array, bounds: tuple[float, float], accuracy: float) -> tuple[float, Array]:
-    """Return the minimum next to a start, its value before it."""
-    options = {"ftol": accuracy, "gtol": 1e-9, "maxiter": 500}
-    found: Any = optimize.minimize(
-        objective, start, jac=True, method="L-BFGS-B", bounds=[bounds] * len(start), options=options
-    )
-    return float(found.fun), np.asarray(found.x)
+    how: dict[str, Any] = {
+        "jac": True,
+        "method": "L-BFGS-B",
+        "bounds": [bounds] * count,
+        "options": {"ftol": accuracy, "gtol": 1e-9, "maxiter": 500},
+    }
+    found = [scipy.optimize.minimize(objective, start, **how) for start in starts]
+    least = min(found, key=lambda each: (bool(_at_edges(each.x, bounds).all()), float(each.fun)))
+    return np.asarray(least.x, dtype=float)
 
 
 def _at_edges(t: Array, bounds: tuple[float, float]) -> np.ndarray:
@@ -558,23 +545,22 @@ def _at_edges(t: Array, bounds: tuple[float, float]) -> np.ndarray:
     return (t <= low + EDGE) | (t >= high - EDGE)
 
 
-def _profile(objective: Objective, t: Array) -> Array:
-    """Return the score with all weights multiplied by the same factors."""
-    return np.array([objective(t + np.log(factor))[0] for factor in FACTORS])
-
-
-def _noted(note: str, grouped: Grouped, t: Array, bounds: tuple[float, float], sides: Sequence[str] = SIDES) -> str:
-    """Return what a choice rests on, with the groups that are at a bound."""
+def _selection(
+    grouped: Grouped,
+    name: str,
+    objective: Objective,
+    t: Array,
+    bounds: tuple[float, float],
+    note: str,
+    sides: Sequence[str] = SIDES,
+) -> Selection:
+    """Return the choice: the program has weight 1, with the groups' weights in its scales."""
     low, high = bounds
     for which, at in zip(sides, (t <= low + EDGE, t >= high - EDGE), strict=True):
-        names = [name for name, is_there in zip(grouped.names, at, strict=True) if is_there]
+        names = [group for group, is_there in zip(grouped.names, at, strict=True) if is_there]
         if names:
             note += f"; {which} of {', '.join(names)}"
-    return note
-
-
-def _answer(grouped: Grouped, name: str, t: Array, score: Array, inside: bool, note: str) -> Selection:
-    """Return the choice: the program has weight 1, with the groups' weights in its scales."""
-    chosen = dict(zip(grouped.names, np.exp(t).tolist(), strict=True))
-    groups = {**chosen, **grouped.told}
-    return Selection(1.0, f"{name} by group", FACTORS, score, inside, note, groups)
+    score = np.array([objective(t + np.log(factor))[0] for factor in FACTORS])
+    weights = dict(zip(grouped.names, np.exp(t).tolist(), strict=True))
+    inside = not bool(_at_edges(t, bounds).any())
+    return Selection(1.0, f"{name} by group", FACTORS, score, inside, note, {**weights, **grouped.told})

@@ -50,7 +50,7 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
     return vectors
 
 
-def ratios(problem: CalibrationProblem, x: Array) -> Array:
+def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
     """Return every row's error over the median of its kind (N,), in multiples that are as rare as those of positions.
 
     The larger of those of lengths and of angles, at the deviations x (n,) [SI].
@@ -81,7 +81,7 @@ def _multiple(k: int) -> float:
     return float(np.sqrt(chdtri(k, _rare()) / chdtri(k, 0.5)) / BEYOND)
 
 
-def resistant(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
+def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     """Return deviations (n,) [SI] that no few rows pull to themselves.
 
     Huber's loss of the rows' errors over their own median, by reweighted squares of the linearization at x::
@@ -135,7 +135,7 @@ def _medians(e: Array, rows: np.ndarray, kinds: np.ndarray) -> Array:
     return found
 
 
-def suspected(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
+def suspects(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
     """Return the rows that may be blunders, label to error over the median.
 
     Parameters
@@ -147,11 +147,11 @@ def suspected(problem: CalibrationProblem, x: Array, scale: Array, spare: float)
     spare
         Part of the equations that this fit left over.
     """
-    ratio = ratios(problem, x)
+    ratio = error_ratios(problem, x)
     if spare < SPARE or ratio.max() < LOOK:
         return {}
     if len(problem.groups) < WELL_DETERMINED * len(x):
-        ratio = ratios(problem, resistant(problem, x, scale))
+        ratio = error_ratios(problem, resistant_fit(problem, x, scale))
     rows = np.flatnonzero(ratio > BEYOND)
     alone = rows[~clustered(problem, x, rows)]
     return {problem.labels[i]: float(ratio[i]) for i in alone}
@@ -221,7 +221,7 @@ def _visits(problem: CalibrationProblem) -> np.ndarray:
     return np.cumsum(moved)
 
 
-def beyond(problem: Source, x: Array) -> dict[str, float]:
+def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
     """Return the rows that the noise of a fit to some of them cannot explain, by the same false rate.
 
     For so many measurements that no single one pulls the fit, and that are not fitted all before sizes are known.
@@ -240,9 +240,7 @@ def beyond(problem: Source, x: Array) -> dict[str, float]:
     return {labels[i]: float(typical[i]) for i in np.flatnonzero(rare)}
 
 
-def unbelievable(
-    problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]
-) -> dict[str, float]:
+def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]) -> dict[str, float]:
     """Return those of some left-out rows that a fit without them cannot explain, by the same false rate.
 
     Parameters
@@ -298,7 +296,7 @@ def contradicted(
     width
         (n,) how large deviations are believed to be, in units of their scales.
     groups
-        (g,) numbers of the configurations that are suspected.
+        (g,) numbers of the configurations under suspicion.
     """
     rest = ~np.isin(model.group, groups)
     A, b = model.A[rest], model.b[rest]

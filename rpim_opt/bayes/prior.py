@@ -64,7 +64,7 @@ class Prior:
     statements
         What is known of linear combinations: `known`, `gaussian`, `from_result`.
     doubted
-        Whether centre and scale are left out where the evidence of the data is against them: `from_fleet`.
+        Whether centre and scale are left out where the evidence of the data is against them: `from_population`.
 
     Raises
     ------
@@ -210,12 +210,12 @@ class Prior:
         return cls(statements=(posterior(result, inflate, without, noise),))
 
     @classmethod
-    def from_fleet(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
+    def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
         """Return the prior of another arm of the type of several that were calibrated: their centre and spread.
 
-        Both are learned by empirical Bayes, and are shrunken towards the generic widths where arms or data are few
-        (`Fleet` has the evidence). Tails stay heavy, and where the evidence of another arm's data is against it, this
-        prior is left out (``doubted``).
+        Both are estimated by empirical Bayes, and are shrunken towards the generic widths where arms or data are few
+        (`PopulationPrior` has the evidence). Tails stay heavy, and where the marginal likelihood of another arm's data
+        is against it, this prior is left out (``doubted``).
 
         Parameters
         ----------
@@ -231,14 +231,14 @@ class Prior:
         --------
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> prior = ro.bayes.Prior.from_fleet([result, result, result])
+        >>> prior = ro.bayes.Prior.from_population([result, result, result])
         >>> stated = prior.stated(result.problem.parameters)
         >>> bool(stated.centre.any()), bool(stated.heavy.any()), len(stated.rows)
         (True, True, 0)
         """
-        from rpim_opt.bayes.population import Fleet
+        from rpim_opt.bayes.population import PopulationPrior
 
-        centre, width = Fleet.of(results).tables()
+        centre, width = PopulationPrior.of(results).tables()
         return cls(centre=centre, scale=width, doubted=True)
 
     def __and__(self, other: Prior) -> Prior:

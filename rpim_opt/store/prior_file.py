@@ -251,4 +251,4 @@ def _earlier(table: PriorTable, file: Path, measurements: Sequence[Measurement])
 def _population(names: Sequence[str], files: Mapping[str, Path], measurements: Sequence[Measurement]) -> Prior:
     from rpim_opt.store.result_file import load_result
 
-    return Prior.from_fleet({name: load_result(files[name], measurements) for name in names})
+    return Prior.from_population({name: load_result(files[name], measurements) for name in names})

@@ -10,7 +10,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
-from rpim_opt.bayes.outliers import clustered, ratios, resistant, suspected, unbelievable
+from rpim_opt.bayes.outliers import clustered, error_ratios, resistant_fit, suspects, unexplained
 from rpim_opt.problem.scatter import joint_slopes
 
 POSITION = ro.load("position").problem
@@ -322,7 +322,7 @@ def test_blunders_are_left_out_and_named_and_no_good_row_with_them() -> None:
 
 def test_a_rows_ratio_is_as_rare_for_every_kind() -> None:
     mixed = ro.load("pose").problem
-    ratio = ratios(mixed, ro.calibrate(mixed, weight=1.0).x)
+    ratio = error_ratios(mixed, ro.calibrate(mixed, weight=1.0).x)
     assert ratio.max() < 6
     assert 0.5 < np.median(ratio) < 1.6
 
@@ -331,7 +331,7 @@ def test_a_fit_that_swallows_its_data_suspects_nobody() -> None:
     few = spoiled(POSITION.on(POSITION.data.take(range(8))), [2], 3e-3)
     x = ro.calibrate(few, weight=1e-6).x
     scale = few.parameters.free.scale
-    assert suspected(few, x, scale, spare=0.1) == {}
+    assert suspects(few, x, scale, spare=0.1) == {}
 
 
 def test_a_resistant_fit_is_not_pulled() -> None:
@@ -339,7 +339,7 @@ def test_a_resistant_fit_is_not_pulled() -> None:
     wrong = spoiled(clean, [3, 9, 21], 5e-3)
     scale = 3 * POSITION.parameters.free.scale
     pulled = ro.calibrate(wrong, weight=1.0)
-    fit = resistant(wrong, pulled.x, scale)
+    fit = resistant_fit(wrong, pulled.x, scale)
     good = np.delete(np.arange(len(POSITION.data)), [3, 9, 21])
     assert np.median(clean.errors(fit)[good]) < 2 * np.median(clean.errors(ro.calibrate(clean, weight=1.0).x))
     assert set(np.argsort(-wrong.errors(fit))[:3]) == {3, 9, 21}
@@ -365,7 +365,7 @@ def test_a_suspect_that_the_model_explains_comes_back() -> None:
     result = ro.calibrate(POSITION)
     labels = {POSITION.data.label[0]: 7.0, POSITION.data.label[1]: 8.0}
     wrong = spoiled(POSITION, [1], 3e-3)
-    kept = unbelievable(wrong.scattered(result.problem.scatter), result.x, result.covariance, labels)
+    kept = unexplained(wrong.scattered(result.problem.scatter), result.x, result.covariance, labels)
     assert kept == {POSITION.data.label[1]: 8.0}
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import rpim_opt as ro
-from rpim_opt.bayes import Fleet, Prior
-from rpim_opt.bayes.population import EVEN, SIZES, Arm, _expected, learned
+from rpim_opt.bayes import PopulationPrior, Prior
+from rpim_opt.bayes.population import PRIOR_RATIO, SIZES, Arm, expectation, random_effects
 
 n = 12
 
@@ -32,7 +32,7 @@ def test_expectations_are_those_of_the_joint_normal_distribution() -> None:
     s2, ratio = np.array([0.2, 1.0, 3.0, 0.5]), 0.7
     P = np.einsum("kij,kil->kjl", rows, rows)
     q = np.einsum("kij,ki->kj", rows, values)
-    m, C_m, d2 = _expected(P, q, s2, ratio)
+    m, C_m, d2 = expectation(P, q, s2, ratio)
     # unknowns (m, d_1, ..., d_K), all at once
     size = few * (K + 1)
     precision = np.diag(np.concatenate([1 / (ratio * s2), *[1 / s2] * K]))
@@ -55,7 +55,7 @@ def test_many_arms_that_are_seen_well_tell_everything() -> None:
     own = np.geomspace(0.1, 3.0, n)
     common = 2 * own * rng.standard_normal(n)
     made, truth = arms(400, common, own, sd=0.01)
-    found = learned(made)
+    found = random_effects(made)
     error = own / np.sqrt(400)
     assert np.abs(found.centre - common).max() < 4 * error.max()
     assert found.width == pytest.approx(truth.std(axis=0), rel=0.03)
@@ -65,10 +65,10 @@ def test_many_arms_that_are_seen_well_tell_everything() -> None:
 
 def test_arms_that_say_nothing_leave_the_generic_widths() -> None:
     made = [Arm(f"{k}", 1e-6 * np.eye(n), np.zeros(n)) for k in range(3)]
-    found = learned(made)
+    found = random_effects(made)
     assert found.centre == pytest.approx(np.zeros(n), abs=1e-9)
     assert found.width == pytest.approx(np.ones(n), rel=1e-3)
-    assert found.share == pytest.approx(EVEN / (1 + EVEN), abs=1e-3)
+    assert found.share == pytest.approx(PRIOR_RATIO / (1 + PRIOR_RATIO), abs=1e-3)
 
 
 def test_few_arms_are_shrunken_towards_the_spread_that_all_have() -> None:
@@ -76,7 +76,7 @@ def test_few_arms_are_shrunken_towards_the_spread_that_all_have() -> None:
     ratio = []
     for count in (2, 5, 40):
         made, truth = arms(count, common, own, sd=0.01, seed=3)
-        width = learned(made).width
+        width = random_effects(made).width
         sample = truth.std(axis=0)
         ratio.append(np.ptp(np.log(width)) / np.ptp(np.log(sample)))
     assert ratio[0] < ratio[1] < ratio[2]
@@ -115,7 +115,7 @@ def test_another_arm_gains_by_what_the_others_share() -> None:
     for seed in range(30):
         common = 0.9 * rng.standard_normal(n)
         made, _ = arms(6, common, np.full(n, 0.4), sd=0.05, seed=seed)
-        found = learned(made[:5])
+        found = random_effects(made[:5])
         x = common + 0.4 * rng.standard_normal(n)
         rows, values = few_data(x, 0.05, seed)
         errors = [
@@ -130,7 +130,7 @@ def test_an_arm_that_differs_is_seen() -> None:
     common = np.random.default_rng(6).standard_normal(n)
     made, _ = arms(6, common, np.full(n, 0.1), sd=0.05)
     odd, _ = arms(1, -common, np.full(n, 0.1), sd=0.05, seed=7)
-    everyone = Fleet(
+    everyone = PopulationPrior(
         tuple(f"a{i}" for i in range(n)),
         ("length",) * n,
         np.zeros(n),
@@ -139,8 +139,8 @@ def test_an_arm_that_differs_is_seen() -> None:
     )
     assert np.argmin(everyone.gain) == 6
     assert everyone.gain[6] < 0
-    assert "odd: unlike the others" in str(everyone)
-    alike = Fleet(everyone.names, everyone.dimensions, np.zeros(n), np.ones(n), tuple(made))
+    assert "odd: differs from the others" in str(everyone)
+    alike = PopulationPrior(everyone.names, everyone.dimensions, np.zeros(n), np.ones(n), tuple(made))
     assert (alike.gain > 0).all()
 
 
@@ -151,8 +151,8 @@ def test_the_prior_of_a_fleet_centres_on_what_calibrations_share() -> None:
     problem = ro.load("position").problem
     rows = np.arange(len(problem.data))
     results = {f"arm {k}": ro.calibrate(problem.on(problem.data.take(rows[k::3])), ro.tikhonov, 1.0) for k in range(3)}
-    found = Fleet.of(results)
-    prior = Prior.from_fleet(results)
+    found = PopulationPrior.of(results)
+    prior = Prior.from_population(results)
     stated = prior.stated(problem.parameters)
     free = problem.parameters.free
     robot = ~free.of_frames
@@ -170,10 +170,10 @@ def test_the_prior_of_a_fleet_centres_on_what_calibrations_share() -> None:
 def test_one_arm_is_no_fleet(count: int) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
     with pytest.raises(ro.InputError, match="two arms"):
-        Prior.from_fleet([result] * count)
+        Prior.from_population([result] * count)
 
 
 def test_arms_of_another_type_are_refused() -> None:
     results = [ro.calibrate(ro.load(name).problem, ro.tikhonov, 1.0) for name in ("position", "paper_arm")]
     with pytest.raises(ro.InputError, match="arms of one type"):
-        Prior.from_fleet(results)
+        Prior.from_population(results)

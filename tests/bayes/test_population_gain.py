@@ -57,7 +57,9 @@ def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
             own = np.where(STATED.heavy, common + np.sqrt(1 - SHARED) * own, own)
         return own * unit
 
-    fleet = ro.bayes.Prior.from_fleet([ro.calibrate(measured(arm(True), 25, SCATTER, (seed, k))) for k in range(ARMS)])
+    fleet = ro.bayes.Prior.from_population(
+        [ro.calibrate(measured(arm(True), 25, SCATTER, (seed, k))) for k in range(ARMS)]
+    )
     for kind, alike in OTHERS.items():
         for k in range(NEXT):
             truth = arm(alike)

@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Estimator
-from rpim_opt.bayes.outliers import clustered, ratios
+from rpim_opt.bayes.outliers import clustered, error_ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
 from rpim_opt.problem.scatter import Scatter, stacked
@@ -321,7 +321,7 @@ def test_touches_of_a_point_are_neighbours_of_each_other() -> None:
     q[2] += 0.02
     alone = problem.on(replace(problem.data, blocks=(replace(problem.data.blocks[0], q=q), *problem.data.blocks[1:])))
     x = np.zeros(len(problem.parameters.free))
-    assert ratios(alone, x)[2] > 2 * ratios(problem, x)[2]
+    assert error_ratios(alone, x)[2] > 2 * error_ratios(problem, x)[2]
     assert not clustered(alone, x, np.array([2])).any()
     assert len(labels) == 22
 

@@ -151,7 +151,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     result = ro.calibrate(blunders.problem, ro.robust, ro.reml)
     text = page(replace(result, record=blunders.record))
     assert "The measurements are simulated." in text
-    assert "Distrusted rows: c" in text
+    assert "Outlying rows: c" in text
     assert "huber(2.0) of each configuration" in text
 
 

@@ -189,7 +189,7 @@ def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
         (folder / f"arm{k}").mkdir()
         ro.store.save_result(results[f"arm{k}"], folder / f"arm{k}")
     found = with_prior(folder, '[prior]\nfleet = ["arm0", "arm1"]').prior
-    wanted = Prior.from_fleet(results)
+    wanted = Prior.from_population(results)
     assert found.centre == pytest.approx(wanted.centre, rel=1e-6, abs=1e-12)
     assert found.scale == pytest.approx(wanted.scale, rel=1e-6)
 
