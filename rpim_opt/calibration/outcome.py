@@ -550,7 +550,7 @@ class Outcome:
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
-        'The data scatter as declared (1.02 times).'
+        'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
         spare = self.equations - self.degrees_of_freedom
         return noise_test(self.declared_squares, spare, self.problem.scatter is not None)

@@ -149,7 +149,7 @@ class Uncertainty(Tabled):
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
         >>> print(ro.calibration.Uncertainty(result).noise_test().verdict)
-        The data scatter as declared (1.02 times).
+        Residuals agree with the stated measurement noise (ratio 1.02).
         """
         return self.result.noise_test()
 
