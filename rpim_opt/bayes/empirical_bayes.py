@@ -65,7 +65,7 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
     try:
         return _found(problem, estimator, model, start)
     except np.linalg.LinAlgError:
-        found = "equations, scales and noise too far apart for sizes to be learned"
+        found = "equations, scales and noise too far apart to estimate hyperparameters"
         raise InputError("data", found, "their units looked at, or a weight") from None
 
 
@@ -107,7 +107,7 @@ def _first(every: CalibrationProblem, estimator: Estimator, x: Array) -> tuple[E
     fall = without.point.value - whole.point.value
     if fall >= ASKED:
         return estimator, whole, ()
-    note = f"What other arms say was left out: -2 ln L falls by {fall:.1f} with it, where {ASKED:g} are asked."
+    note = f"The population prior was left out: -2 ln L falls by {fall:.1f} with it, where {ASKED:g} are required."
     return plain, without, (note,)
 
 

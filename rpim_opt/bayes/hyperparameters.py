@@ -423,17 +423,17 @@ def _doubts(fit: Fit, spread: Array) -> Iterator[str]:
         if other.value - point.value < NEARLY and np.abs(other.logs - point.logs).max() > APART:
             ratios = ", ".join(f"{ratio:.1g}" for ratio in np.exp(other.logs - point.logs))
             yield (
-                f"The evidence has a second optimum that is nearly as good, with sizes {ratios} times as large: more "
-                "configurations would decide."
+                "The marginal likelihood has a second optimum that is nearly as good, with hyperparameters "
+                f"{ratios} times as large: more configurations would decide."
             )
             break
     if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
-        yield "A size came to the edge of what is believed possible: look at units, scales and declared noise."
+        yield "A hyperparameter is implausibly far from its prior median: check units, scales and stated noise."
     vague = [i for i in evidence.prior.geometry if spread[i] > VAGUE]
     if vague:
         names = joined([evidence.prior.names[i] for i in vague])
         factor = np.exp(max(spread[vague]))
-        yield f"The data hardly tell how much {names} deviate (by a factor of {factor:.1f} either way)."
+        yield f"The data hardly identify the prior scale of {names} (a factor of {factor:.1f} either way, 1 sigma)."
     m, n = evidence.data.X.shape
     if m < n:
-        yield f"{m} equations for {n} parameters: at least {n - m} directions are prior alone."
+        yield f"{m} equations for {n} parameters: at least {n - m} parameter combinations rest on the prior alone."

@@ -271,7 +271,7 @@ def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels
 
 
 WIDE = 30.0
-"""Times what deviations are believed to be, so that no prior alone accuses. Chosen on 300 simulated arms with ten good
+"""Times their prior scales, so that no prior alone accuses. Chosen on 300 simulated arms with ten good
 configurations, of which 7 have a row accused then, and 40 without this test; on 300 others 7 and 41. Meant are 3."""
 LOOSE = 1e-9
 """Part of what equations say of all deviations, below which a direction is one that the others do not decide."""
@@ -294,7 +294,7 @@ def contradicted(
     penalty, weight
         |L z - c|^2 and its weight against them; None where there is none.
     width
-        (n,) how large deviations are believed to be, in units of their scales.
+        (n,) prior scales of deviations, in units of the stated ones.
     groups
         (g,) numbers of the configurations under suspicion.
     """

@@ -35,12 +35,12 @@ _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed of the deviations before the data are seen.
+    """The prior of the deviations, before the data are seen.
 
     By default deviations are about as large as the scales of the parameters say, some of them much larger (Student's
     t), joint offsets three times as large, because they are set at assembly, and frames may be anywhere within ten of
     their scales. How large a group of them is altogether, the data may tell: lengths, angles and joint offsets have a
-    size each, which are believed alike, and the base has one. `stated` says it of a problem in numbers.
+    size each, which are alike a priori, and the base has one. `stated` says it of a problem in numbers.
 
     Parameters
     ----------
@@ -349,7 +349,7 @@ class Prior:
         """
         return penalized(formulation, stated)
 
-    # --- what is believed where nothing is said ----------------------------------------------------------------
+    # --- groups and tails where nothing is stated ----------------------------------------------------------------
 
     def _heavy(self, free: Parameters) -> np.ndarray:
         geometry = np.array([_GEOMETRY.fullmatch(own_name(name)) is not None for name in free.names])

@@ -36,7 +36,7 @@ class Statement:
     reference
         (p,) [SI] from which the parameters' values count; None: from nominal, whatever that is.
     whole
-        Whether it is all that is believed of these parameters: it stands in the place of their own scales, and says
+        Whether it is the whole prior of these parameters: it stands in the place of their own scales, and says
         what it says of some of them where others are not identified. Otherwise those that are not identified are
         nominal.
     text

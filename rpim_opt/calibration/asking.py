@@ -81,7 +81,7 @@ def calibrate(
         that takes turns between weights is answered, with a sentence. Several weights by patterns, kinds or links of
         parameters: ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
     prior
-        What is believed of the deviations before the data, beyond the scales of the parameters.
+        Of the deviations, beyond the scales of the parameters.
     model
         ``"geometry"``, or ``"auto"``: families of parameters that geometry lacks (compliance under gravity,
         eccentric joints, ...) are added where the evidence wants them.

@@ -116,7 +116,7 @@ def grouped(
         From patterns, names or kinds of parameters to a number, or to ``ro.reml``, ``ro.k_fold``, ``ro.l_curve`` (here
         the distance to the origin of the L-hypersurface) or its name. What no key names has weight 1.
     prior
-        What is believed besides: its centre, widths and statements.
+        The prior besides: its centre, widths and statements.
     start, how
         As for `calibrate`.
 

@@ -205,7 +205,10 @@ def test_an_assembly_error_leaves_its_group_and_is_named() -> None:
 def test_fewer_equations_than_parameters_are_said() -> None:
     few = POSITION.on(POSITION.data.configurations(5, 0))
     result = ro.calibrate(few)
-    assert "15 equations for 34 parameters: at least 19 directions are prior alone." in result.weight_sentence()
+    assert (
+        "15 equations for 34 parameters: at least 19 parameter combinations rest on the prior alone."
+        in result.weight_sentence()
+    )
 
 
 def test_a_known_combination_holds() -> None:
@@ -235,8 +238,8 @@ def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> N
     plain = ro.calibrate(few)
     assert right.learned is not None
     assert wrong.learned is not None
-    assert "What other arms say" not in right.weight_sentence()
-    assert "What other arms say was left out" in wrong.weight_sentence()
+    assert "The population prior" not in right.weight_sentence()
+    assert "The population prior was left out" in wrong.weight_sentence()
     assert np.abs(wrong.x - plain.x).max() < 1e-7
     errors = [
         np.sqrt(np.mean((POSITION.on(POSITION.data).errors(r.x) - POSITION.errors(x)) ** 2)) for r in (right, plain)
