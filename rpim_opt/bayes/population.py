@@ -151,8 +151,9 @@ class PopulationPrior:
         >>> print(str(ro.bayes.PopulationPrior.of({"left": result, "right": result})).splitlines()[0])
         2 arms share 100 % of their mean square deviation.
         """
-        named = results
-        if not isinstance(named, Mapping):
+        if isinstance(results, Mapping):
+            named = dict(results)
+        else:
             named = {f"arm {i}": result for i, result in enumerate(results, start=1)}
         if len(named) < 2:
             raise InputError("Prior.from_population", f"{len(named)} results", "those of two arms or more")
