@@ -33,27 +33,10 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.observability import combination, observe
 from rpim_opt.problem.workspace import in_base
-from rpim_opt.report import charts
+from rpim_opt.report import charts, summary
 from rpim_opt.report.chart import Picture, tag
 from rpim_opt.report.charts import mm
 from rpim_opt.report.page import Figure, Table, figure, render
-from rpim_opt.report.summary import (
-    ANGLE_HEADER,
-    ERROR_HEADER,
-    Workspace,
-    acceptance,
-    angle_cells,
-    error_cells,
-    error_rows,
-    headline,
-    headline_errors,
-    identifiability,
-    nominal_note,
-    orientation_rows,
-    sets,
-    warnings,
-    workspace,
-)
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
@@ -103,8 +86,8 @@ def page(result: Calibration) -> str:
     data: dict[str, Any] = {}
     record = result.record
     heading = record.title or " and ".join(robot.name for robot in result.problem.arms.values())
-    accepted = acceptance(result)
-    map_ = workspace(result)
+    accepted = summary.acceptance(result)
+    map_ = summary.workspace(result)
     causes = likely_causes(result)
     lacking = judged(result)
     # an effect that the model lacks is said at the top; otherwise what the residuals consist of is a diagnosis
@@ -118,11 +101,11 @@ def page(result: Calibration) -> str:
         heading=heading,
         details=[(FIELDS.get(key, key), text) for key, text in record.details.items()],
         verdict=_verdict(accepted),
-        headline=headline(result),
+        headline=summary.headline(result),
         alarm=bool(causes) or not result.converged,
         causes=causes,
         cards=_cards(result, map_, accepted),
-        warnings=[*([" ".join(composition)] if alarming else []), *warnings(result)],
+        warnings=[*([" ".join(composition)] if alarming else []), *summary.warnings(result)],
         acceptance=_acceptance(result, accepted),
         accuracy=_accuracy(result),
         uncertainty=_uncertainty(map_, result),
@@ -153,9 +136,11 @@ def _verdict(found: Acceptance | None) -> Section | None:
     return {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
 
 
-def _cards(result: Calibration, map_: Workspace | None, accepted: Acceptance | None) -> list[tuple[str, str, str]]:
+def _cards(
+    result: Calibration, map_: summary.Workspace | None, accepted: Acceptance | None
+) -> list[tuple[str, str, str]]:
     """Return name, role and value [mm] of the headline's figures."""
-    name, nominal, identified = headline_errors(result)
+    name, nominal, identified = summary.headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
         raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
@@ -203,7 +188,7 @@ def _acceptance(result: Calibration, found: Acceptance | None) -> Section | None
 
 def _accuracy(result: Calibration) -> Section:
     record = result.record
-    notes = [nominal_note(result)]
+    notes = [summary.nominal_note(result)]
     used = "Identification rows were used to identify the parameters"
     if record.validation is not None:
         used += "; validation rows were not used for anything"
@@ -219,18 +204,18 @@ def _accuracy(result: Calibration) -> Section:
         notes.append(
             f"{percent(round(covered, 2))} of the held-out coordinates lie in their 95 % prediction intervals."
         )
-    rows = error_rows(result)
-    rows = [row for row in rows if row["count"]]
-    tables = [Table("Error [mm]", ["data, model", *ERROR_HEADER[1:]], error_cells(rows))]
-    angles = orientation_rows(result)
+    head = ["data, model", *summary.COLUMNS]
+    rows = [row for row in summary.error_rows(result) if row["count"]]
+    tables = [Table("Error [mm]", head, summary.cells(rows))]
+    angles = summary.orientation_rows(result)
     if angles:
-        tables.append(Table("Orientation error [mrad]", ["data, model", *ANGLE_HEADER[1:]], angle_cells(angles)))
-    for name, data in sets(result).items():
+        tables.append(Table("Orientation error [mrad]", head, summary.cells(angles, "mrad")))
+    for name, data in summary.sets(result).items():
         touched = scatter(data, result.nominal_errors(data), result.errors(data))
         if touched:
             caption = f"{name.capitalize()}, distance of touches from their point [mm]"
             tables.append(Table(caption, HEADER, scatter_rows(touched)))
-    name, data = next(iter(sets(result).items()))
+    name, data = next(iter(summary.sets(result).items()))
     return {"notes": notes, "tables": tables, "figures": _error_figures(result, name, data)}
 
 
@@ -242,7 +227,7 @@ def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure
     ]
 
 
-def _uncertainty(map_: Workspace | None, result: Calibration) -> Section | None:
+def _uncertainty(map_: summary.Workspace | None, result: Calibration) -> Section | None:
     """Return the map of the expanded uncertainty over the workspace."""
     if map_ is None:
         return None
@@ -320,9 +305,10 @@ def _residuals(result: Calibration, composition: list[str]) -> Section:
     """Return residuals against noise, what they consist of, and errors along the axes."""
     figures = []
     rows = []
-    if len(sets(result)) > 1:
+    what = ""
+    if len(summary.sets(result)) > 1:
         figures += _error_figures(result, "identification", result.problem.data)
-    for name, data in sets(result).items():
+    for name, data in summary.sets(result).items():
         frame, what, vectors = charts.signed_errors(result, data)
         if not len(vectors["after"]):
             continue
@@ -330,8 +316,9 @@ def _residuals(result: Calibration, composition: list[str]) -> Section:
         figures.append(figure(charts.axes_chart(result, data), caption))
         for i, axis in enumerate("xyz"):
             means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
-            rows.append([f"{name}, {what}, {axis}", *means])
-    table = Table("Mean ± standard deviation along the axes [mm]", ["data", "nominal", "identified"], rows)
+            rows.append([f"{name}, {axis}", *means])
+    caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
+    table = Table(caption, ["data, axis", "nominal", "identified"], rows)
     return {"notes": [*result.noise_sentence(), *composition], "figures": figures, "table": table if rows else None}
 
 
@@ -339,7 +326,7 @@ def _space(result: Calibration, embedded: dict[str, Any]) -> Section | None:
     """Return the view of measured positions with their errors; what the page's script draws goes into ``embedded``."""
     points, before, after = [], [], []
     labels: list[str] = []
-    for name, data in sets(result).items():
+    for name, data in summary.sets(result).items():
         vectors = result.error_vectors(data, nominal=True)
         finite = np.isfinite(vectors).all(axis=1)
         points.append(result.measured_positions(data)[finite])
@@ -383,7 +370,7 @@ def _lines(points: Array, vectors: Array) -> Section:
 
 def _identifiability(result: Calibration) -> Section:
     found = observe(result.problem)
-    text = f"{found.configurations} configurations. {identifiability(result)}"
+    text = f"{found.configurations} configurations. {summary.identifiability(result)}"
     redundant = [f"{combination(each)}" for each in found.redundant]
     if result.record.earlier:
         text += " The others are known from the calibrations that are this one's prior."
@@ -443,7 +430,7 @@ def _provenance(result: Calibration) -> Section:
         ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
     ]
     count: Counter[tuple[str, str]] = Counter()
-    for name, data in sets(result).items():
+    for name, data in summary.sets(result).items():
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
             count[f"{name}, {what}", _noise(block)] += len(block.row)
@@ -515,7 +502,7 @@ PICARD = "Picard's condition at the solution: the penalty damps directions below
 def _weight(result: Calibration, embedded: dict[str, Any]) -> Section:
     """Return the L-curve with every selector's choice; what the page's slider needs goes into ``embedded``."""
     picard = figure(charts.picard_chart(result.program, result.penalty_weight), PICARD)
-    section: Section = {"notes": weight_lines(result), "figure": None, "picard": picard}
+    section: Section = {"figure": None, "picard": picard}
     formulation = result.formulation
     # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
     if result.record.earlier or formulation.penalty is None or not formulation.solvable or result.weight <= 0:
@@ -588,7 +575,7 @@ def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]
     for weight in np.unique([*weight_grid(program, count), *positive]):
         with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
             estimates += program.path([weight])
-    name, data = next(iter(sets(result).items()))
+    name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
     scale = result.problem.parameters.free.scale
     return name, {

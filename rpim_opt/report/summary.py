@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from rpim_opt.calibration.region import Region
 
 KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
-ERROR_HEADER = ("error [mm]", "rows", "mean", "RMS", "95 % below", "max")
-ANGLE_HEADER = ("orientation error [mrad]", "rows", "mean", "RMS", "max")
+COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
+Unit = Literal["mm", "mrad"]
 ANYWHERE = Requirement(limit=1.0)
 """The region of a result without requirement: joints within the measured ranges."""
 
@@ -51,12 +51,10 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
     several = len(_kinds(result.problem.data)) > 1
     for name, data in sets(result).items():
         for kind, at in _kinds(data).items():
-            which = f"{name}, {kind.replace('_', ' ')}" if several else name
-            if kind in (known_square.name, known_parallel.name):
-                continue
-            dimension = "stated length" if kind == known_distance.name else "length"
-            for model, errors in (("nominal", result.nominal_errors), ("identified", result.errors)):
-                rows.append(_figures(f"{which}, {model}", errors(data, dimension)[at]))
+            if kind not in (known_square.name, known_parallel.name):
+                what = f"{name}, {kind.replace('_', ' ')}" if several else name
+                dimension = "stated length" if kind == known_distance.name else "length"
+                rows += _both_models(result, what, data, dimension, np.array(at))
         if name == "identification" and result.flagged:
             flagged = {flag.label for flag in result.flagged}
             trusted = result.errors(data)[[label not in flagged for label in data.label]]
@@ -68,10 +66,27 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
     return rows
 
 
-def _figures(what: str, errors: Array) -> dict[str, Any]:
+def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
+    """Return the same of orientations and of known angles [mrad]; empty where none were measured."""
+    rows: list[dict[str, Any]] = []
+    for name, data in sets(result).items():
+        every = np.arange(len(data))
+        rows += _both_models(result, name, data, "angle", every, "mrad")
+        rows += _both_models(result, f"{name}, known angle", data, "stated angle", every, "mrad")
+    return [row for row in rows if row["count"]]
+
+
+def _both_models(
+    result: Calibration, what: str, data: Dataset, dimension: str, rows: np.ndarray, unit: Unit = "mm"
+) -> list[dict[str, Any]]:
+    models = {"nominal": result.nominal_errors, "identified": result.errors}
+    return [_figures(f"{what}, {model}", errors(data, dimension)[rows], unit) for model, errors in models.items()]
+
+
+def _figures(what: str, errors: Array, unit: Unit = "mm") -> dict[str, Any]:
     finite = 1e3 * errors[np.isfinite(errors)]
     high = float(np.percentile(finite, 95)) if len(finite) else None
-    return {"what": what, **statistics(errors), "p95_mm": high}
+    return {"what": what, **statistics(errors, unit), f"p95_{unit}": high}
 
 
 def _kinds(data: Dataset) -> dict[str, list[int]]:
@@ -82,34 +97,13 @@ def _kinds(data: Dataset) -> dict[str, list[int]]:
     return kinds
 
 
-def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
-    """Return the same of orientations and of known angles [mrad]; empty where none were measured."""
-    rows: list[dict[str, Any]] = []
-    for name, data in sets(result).items():
-        for dimension, what in (("angle", name), ("stated angle", f"{name}, known angle")):
-            for model, errors in (("nominal", result.nominal_errors), ("identified", result.errors)):
-                angles = errors(data, dimension)
-                if np.isfinite(angles).any():
-                    rows.append({"what": f"{what}, {model}", **statistics(angles, "mrad")})
-    return rows
-
-
-def cells(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[list[str]]:
-    """Return rows of figures as text, an empty cell where one is missing."""
+def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str]]:
+    """Return rows of figures as text under `COLUMNS`, an empty cell where one is missing."""
+    keys = [f"{key}_{unit}" for key in ("mean", "rms", "p95", "max")]
     return [
         [row["what"], str(row.get("count", "")), *("" if row.get(key) is None else f"{row[key]:.4f}" for key in keys)]
         for row in rows
     ]
-
-
-def error_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows under `ERROR_HEADER`."""
-    return cells(rows, ("mean_mm", "rms_mm", "p95_mm", "max_mm"))
-
-
-def angle_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows under `ANGLE_HEADER`."""
-    return cells(rows, ("mean_mrad", "rms_mrad", "max_mrad"))
 
 
 class Workspace(NamedTuple):
@@ -293,9 +287,9 @@ def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     lines += ["", *document["remarks"]]
     if document["lack_of_fit"]:
         lines += document["lack_of_fit"]["text"]
-    lines += ["", table(ERROR_HEADER, error_cells(document["errors"]))]
+    lines += ["", table(["error [mm]", *COLUMNS], cells(document["errors"]))]
     if document["orientation"]:
-        lines += ["", table(ANGLE_HEADER, angle_cells(document["orientation"]))]
+        lines += ["", table(["orientation error [mrad]", *COLUMNS], cells(document["orientation"], "mrad"))]
     return "\n".join([*lines, "", result.parameter_table()])
 
 
