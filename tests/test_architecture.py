@@ -38,7 +38,7 @@ FLOORS: dict[str, set[str]] = {
     # rich: progress on a console; jinja2: pages
     "report": {"jinja2", "markupsafe", "matplotlib", "rich"},
     # cvxpy: expressions are hashed by their content
-    "study": {"cvxpy", "distributed", "jinja2", "joblib", "markupsafe", "matplotlib", "pyarrow"},
+    "study": {"cvxpy", "distributed", "joblib", "matplotlib", "pyarrow"},
 }
 """Third-party packages that a folder may import besides those for all; its place is its floor."""
 EVERYWHERE = {"numpy", "scipy"}

@@ -6,14 +6,12 @@ import base64
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.writing import refused, write_files
-from rpim_opt.report.frame import bullets, data_table, facts, page, section
-from rpim_opt.report.markup import Element, tag
+from rpim_opt.report.page import Table, render
 from rpim_opt.study.figures import comparison_figure, picture
 from rpim_opt.study.ranking import Rows, Summary, number, without_figures
 
@@ -50,18 +48,23 @@ def _html(rows: Rows, summary: Summary, vector: bytes, axes: Mapping[str, str], 
     where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
     heading = f"{len({row['method'] for row in rows})} methods on {where}"
     title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
-    source = f"data:image/svg+xml;base64,{base64.b64encode(vector).decode()}"
-    image = tag("img", src=source, alt="ratios to the reference by method, and performance profiles", class_="drawn")
-    parts = [
-        tag("p", headline(summary), class_="lead"),
-        tag("figure", image, tag("figcaption", CAPTION)),
-        *section("Methods", data_table(title, summary.header, summary.cells()), *bullets(summary.notes[:3])),
-        *_by_problem(rows, summary, problems),
-        *_without(rows, problems),
-        *section("How it was made", facts([*axes.items(), *provenance.items()])),
-    ]
-    kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
-    return page(f"Comparison: {heading}", kind, heading, parts, images=True)
+    return render(
+        "comparison.html",
+        images=True,
+        title=f"Comparison: {heading}",
+        kind=f"Comparison of calibrations, {provenance.get('Made', '')[:10]}",
+        heading=heading,
+        lead=headline(summary),
+        image=f"data:image/svg+xml;base64,{base64.b64encode(vector).decode()}",
+        caption=CAPTION,
+        methods=Table(title, summary.header, summary.cells()),
+        notes=summary.notes[:3],
+        metric=summary.metric,
+        problems=problems,
+        medians=_medians(rows, summary, problems),
+        missing=_missing(rows, problems),
+        made=[*axes.items(), *provenance.items()],
+    )
 
 
 def headline(summary: Summary) -> str:
@@ -81,8 +84,8 @@ def headline(summary: Summary) -> str:
     )
 
 
-def _by_problem(rows: Rows, summary: Summary, problems: list[str]) -> list[Element]:
-    """Return the median of every method on every problem, shaded by how near it is to the best there."""
+def _medians(rows: Rows, summary: Summary, problems: list[str]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return text and class of every method's median on every problem: the class is how near it is to the best."""
     of: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         if row.get(summary.metric) is not None:
@@ -91,31 +94,26 @@ def _by_problem(rows: Rows, summary: Summary, problems: list[str]) -> list[Eleme
     best: dict[str, float] = {}
     for (_, problem), value in medians.items():
         best[problem] = min(value, best.get(problem, np.inf))
-    body = []
+    table = []
     for method in (each.method for each in summary.standings):
-        cells = [_cell(medians.get((method, problem)), best.get(problem)) for problem in problems]
-        body.append(tag("tr", tag("th", method, scope="row"), *cells))
-    head = tag("tr", *(tag("th", name, scope="col") for name in ("method", *problems)))
-    title = f"Median {summary.metric} by problem; darker is farther from the best"
-    grid = tag("table", tag("caption", title), tag("thead", head), tag("tbody", *body))
-    return section("By problem", tag("div", grid, class_="wide", tabindex="0", role="region", aria_label=title))
+        cells = []
+        for problem in problems:
+            value = medians.get((method, problem))
+            if value is None:
+                cells.append(("-", "none"))
+            else:
+                shade = int(np.searchsorted(SHADES, value / max(best[problem], np.finfo(float).tiny)))
+                cells.append((number(value), f"shade{shade}"))
+        table.append((method, cells))
+    return table
 
 
-def _cell(value: float | None, best: float | None) -> Element:
-    if value is None or best is None:
-        return tag("td", "-", class_="none")
-    shade = int(np.searchsorted(SHADES, value / max(best, np.finfo(float).tiny)))
-    return tag("td", number(value), class_=f"shade{shade}")
-
-
-def _without(rows: Rows, problems: list[str]) -> list[Element]:
+def _missing(rows: Rows, problems: list[str]) -> Table:
     """Return the replicates without figures, by method and reason."""
-    lines: list[Any] = []
+    lines: list[list[str]] = []
     for (method, status, reason), missing in without_figures(rows).items():
         where = Counter(missing)
         names = "all" if len(where) == len(problems) else ", ".join(where)
         lines.append([method, status, str(len(missing)), names, reason])
-    if not lines:
-        return []
     header = ["method", "status", "replicates", "problems", "reason"]
-    return section("What could not be computed", data_table("Replicates without a figure", header, lines, prose=True))
+    return Table("Replicates without a figure", header, lines, prose=True)
