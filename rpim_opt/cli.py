@@ -243,7 +243,7 @@ def report(
     out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a result as one HTML page that works offline, for whoever has to believe it."""
+    """Write the calibration report: one HTML page that works offline, in the order in which it is signed."""
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.inputs import inside
         from rpim_opt.basics.writing import refused

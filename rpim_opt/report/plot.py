@@ -17,16 +17,9 @@ from rpim_opt.report import charts
 from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments
 
 __all__ = [
-    "error_axes",
-    "error_histogram",
-    "error_vectors",
-    "errors",
-    "l_curve",
-    "parameters",
-    "picard",
-    "selection",
+    "error_axes", "error_histogram", "error_vectors", "errors", "l_curve", "parameters", "picard", "selection",
     "selectors",
-]
+]  # fmt: skip
 
 Axes = Any  # matplotlib's, which is imported by whoever makes the axes
 
@@ -80,21 +73,10 @@ def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None
 
 
 def error_vectors(result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None) -> Axes:
-    """Draw measured positions [m] with their error vectors, enlarged as the title says.
+    """Draw measured positions [m] with their error vectors, of the identified or of the nominal model, in 3D.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    data
-        The rows; the identification data by default.
-    nominal
-        Whether to draw the errors before calibration.
-    ax
-        Matplotlib's 3D axes; new ones by default.
+    The title says how they are enlarged. Arguments as for `errors`.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ro.plot.error_vectors(result, nominal=True).get_title()
@@ -194,15 +176,8 @@ def _program_and_weights(
 def selection(selection: Selection, ax: Axes = None) -> Axes:
     """Draw a selector's score over the weights, and its choice, dashed where it is at an edge.
 
-    Parameters
-    ----------
-    selection
-        The choice with its scores.
-    ax
-        Matplotlib's axes; new ones by default.
+    Arguments as for `errors`.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ro.plot.selection(result.selection).get_ylabel()
@@ -227,19 +202,9 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     """Draw Picard's condition: singular values, coefficients of the data, and coefficients of the solution.
 
     Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
-    noise; the weight damps the directions with s below its root (Hansen 1990, BIT 30:658).
+    noise; the weight, by default that of a result, damps the directions with s below its root (Hansen 1990,
+    BIT 30:658). Arguments as for `l_curve`.
 
-    Parameters
-    ----------
-    of
-        A program, or a result.
-    weight
-        Whose root is drawn, if it is not zero; of a result its own by default.
-    ax
-        Matplotlib's axes; new ones by default.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.picard(result)

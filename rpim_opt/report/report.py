@@ -107,7 +107,7 @@ def page(result: Calibration) -> str:
         cards=_cards(result, map_, accepted),
         warnings=[*([" ".join(composition)] if alarming else []), *summary.warnings(result)],
         acceptance=_acceptance(result, accepted),
-        accuracy=_accuracy(result),
+        accuracy=_accuracy(result, accepted),
         uncertainty=_uncertainty(map_, result),
         parameters=_parameters(result),
         residuals=_residuals(result, [] if alarming else composition),
@@ -186,7 +186,7 @@ def _acceptance(result: Calibration, found: Acceptance | None) -> Section | None
     return {"facts": facts, "reasons": found.reasons}
 
 
-def _accuracy(result: Calibration) -> Section:
+def _accuracy(result: Calibration, accepted: Acceptance | None) -> Section:
     record = result.record
     notes = [summary.nominal_note(result)]
     used = "Identification rows were used to identify the parameters"
@@ -200,7 +200,7 @@ def _accuracy(result: Calibration) -> Section:
         covered = record.held_out.coverage
     elif record.validation is not None:
         covered = predicted(result, record.validation).coverage
-    if covered is not None:
+    if covered is not None and accepted is None:  # whose section says it
         notes.append(
             f"{percent(round(covered, 2))} of the held-out coordinates lie in their 95 % prediction intervals."
         )
