@@ -1,9 +1,9 @@
-"""Mutation score of the numerical core: ``python3 dev.py mutants [COUNT] [FOLDER] [FILE...]``.
+"""Mutation score of the package: ``python3 dev.py mutants [COUNT] [FOLDER] [FILE...]``.
 
-``python3 dev.py coverage [FOLDER]`` goes before: it writes down which test runs which line. Then mutants are drawn at
-random, one change each in the code of the core; the tests that run the changed line are tried, the quickest first,
-until one fails. Each answer is a line of ``FOLDER/mutants.jsonl``; what stands there is not tried again. Those that no
-test fails for are printed.
+``python3 dev.py coverage [FOLDER]`` goes before: it writes down which test runs which line. Then mutants are drawn
+at random, one change each in the code of the package, or of some of its files; the tests that run the changed line
+are tried, the quickest first, until one fails. Each answer is a line of ``FOLDER/mutants.jsonl``; what stands there
+is not tried again. Those that no test fails for are printed.
 """
 
 from __future__ import annotations
@@ -28,19 +28,7 @@ import coverage
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = [
-    "convex/active_set.py", "convex/asked.py", "convex/atoms.py", "convex/by_rows.py", "convex/closed.py",
-    "convex/conic.py", "convex/constraints.py", "convex/coordinates.py", "convex/evidence.py", "convex/faces.py",
-    "convex/feasible.py", "convex/gap.py", "convex/groups.py", "convex/interior.py", "convex/kinks.py",
-    "convex/left_out.py", "convex/line_search.py", "convex/majorize.py", "convex/met.py", "convex/newton.py",
-    "convex/newton_step.py", "convex/objective.py", "convex/posterior.py", "convex/program.py", "convex/quadratic.py",
-    "convex/rows.py", "convex/select_curve.py", "convex/select_linear.py", "convex/select_scores.py",
-    "convex/separated.py", "convex/structure.py", "convex/tree.py", "convex/trust.py", "problem/linear.py",
-    "problem/misfit.py", "problem/moments.py", "problem/rotations.py", "problem/frames.py", "problem/loads.py",
-    "robot/mdh.py", "robot/kinematics.py", "robot/chain.py", "robot/deflection.py", "robot/gravity.py",
-    "robot/parameters.py", "calibration/intervals.py", "calibration/uncertainty.py", "calibration/spread.py",
-    "calibration/loop.py",
-]  # fmt: skip
+PACKAGE = ROOT / "rpim_opt"
 SECONDS = 40.0
 """Of tests (as long as they took once) that are run for a mutant."""
 PATIENCE = 10 * SECONDS
@@ -158,8 +146,9 @@ def mutant(file: str, number: int) -> Mutant:
     return Mutant(file, line, run, before, after, source)
 
 
-def drawn(count: int, files: Sequence[str] = CORE, seed: int = 19) -> list[tuple[str, int]]:
+def drawn(count: int, files: Sequence[str] = (), seed: int = 19) -> list[tuple[str, int]]:
     """Draw places at random, each as likely; the first of many are those of few."""
+    files = files or sorted(str(file.relative_to(PACKAGE)) for file in PACKAGE.rglob("*.py"))
     known = [(file, i) for file in files for i, _ in enumerate(list(places(_tree(file))))]
     random.Random(seed).shuffle(known)
     return known[:count]
@@ -338,7 +327,7 @@ def main(arguments: list[str]) -> int:
     answers = {(row["file"], row["number"]): row["answer"] for row in rows}
     for name in THIRD:
         __import__(name)
-    places_drawn = drawn(int(count), files or CORE)
+    places_drawn = drawn(int(count), files)
     if _fails_unchanged(*places_drawn[0], known):
         print("the tests fail without a change, too")
         return 2

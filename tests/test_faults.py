@@ -10,10 +10,21 @@ from pathlib import Path
 
 import pytest
 
+import rpim_opt as ro
 from rpim_opt import cli
+from rpim_opt.robot.library import find_robot
+from rpim_opt.store.problem_file import problems_folder
 from tests.faults import FAULTS, Audit, Layer
-from tests.fuzz.commands import make_desk
+from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF, make_cell
 
+STUDY = """QUESTION = "Does it run?"
+METRICS = {}
+def cases(quick): return [{"seed": 1}, {"seed": 2}]
+def run(seed): return {"twice": 2.0 * seed}
+def report(rows):
+    from rpim_opt.study import Report
+    return Report("Yes.", {"sum": sum(row["twice"] for row in rows)})
+"""
 AUDIT = Audit()
 COMMANDS = {
     "new": ["new", "deep/made", "--robot", "robot.toml", "--data", "table.csv", "--hold-out", "0.25"],
@@ -33,6 +44,28 @@ COMMANDS = {
 QUICK = ("new", "export again")
 RESUMED = {"study": "deep/study", "compare": "c"}
 """Where what was computed stays, to go on with."""
+
+
+def make_desk(folder: Path) -> None:
+    """Make a folder with a file of every kind."""
+    cell = folder / "cell"
+    make_cell(cell)
+    shutil.copy(cell / "robot.toml", folder / "robot.toml")
+    shutil.copy(cell / "identification.csv", folder / "table.csv")
+    instance = ro.load(cell)
+    ro.store.save_result(ro.calibrate(instance.problem, ro.tikhonov, 1.0), folder / "result.json", instance.record)
+    shutil.copytree(problems_folder() / "scara", folder / "sim")
+    (folder / "arm.urdf").write_text(URDF)
+    ro.robot.write_robot(ro.read_robot(find_robot("irb120")), folder / "arm.csv")
+    (folder / "kinematics.yaml").write_text(KINEMATICS)
+    (folder / "calibration.conf").write_text(CONF)
+    (folder / "targets.csv").write_text("label,q1_deg,q2_deg\nA,0,10\nB,1,2\n")
+    (folder / "poses.csv").write_text("x_mm,y_mm,z_mm\n100,200,300\n300,0,400\n")
+    (folder / "rows.csv").write_text(TRACKED)
+    (folder / "mine.py").write_text(STUDY)
+    (folder / "empty.csv").write_text("")
+    for name in ("binary.xlsx", "binary.parquet"):
+        (folder / name).write_bytes(bytes(range(256)) * 4)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,1 @@
-"""Fuzzing: parsers and whole command lines with inputs that nobody would write.
-
-``test_fuzz.py`` is the bounded version of the suite; ``python -m tests.fuzz`` goes on as long as it is let.
-"""
+"""Readers with inputs that nobody would write, by hypothesis; ``FUZZ=100000 pytest tests/fuzz`` goes on for longer."""
