@@ -21,7 +21,7 @@ SCALES = {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 10.0, "base_mm": 100.0
 BASE = (1.5, -0.8, 0.3, 0.0, 0.0, 0.6)
 TOOL = (0.04, -0.02, 0.11, 0.0, 0.0, 0.0)
 REACH = np.radians(120)
-UNSEEN = 200
+VALIDATION_COUNT = 200
 """Configurations that an arm is judged at."""
 
 
@@ -91,74 +91,71 @@ def simulated_arm(
     base = _small(np.array(BASE)) @ _small(2e-3 * rng.standard_normal(6))
     tool = np.array(TOOL[:3]) + 3e-3 * rng.standard_normal(3)
     limits = np.clip(robot.limits, -REACH, REACH)
-    there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (UNSEEN, robot.dof))
+    there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (VALIDATION_COUNT, robot.dof))
     q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
 
-    moved = _Moved(robot, physics, np.random.default_rng([seed, 5]))
+    motion = _Motion(robot, physics, np.random.default_rng([seed, 5]))
 
-    def seen(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ flange(robot, moved.joints(joints), errors)
+    def measured(joints: Array, level: float, stream: int) -> Dataset:
+        T = base @ flange(robot, motion.joints(joints), errors)
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
-        drawn = np.random.default_rng([seed, stream]).standard_normal(points.shape)
-        return Dataset.of(joints, points + level * drawn, noise)
+        draws = np.random.default_rng([seed, stream]).standard_normal(points.shape)
+        return Dataset.of(joints, points + level * draws, noise)
 
     parameters = model_parameters(robot, base=list(BASE), tools={"": list(TOOL)}).scaled(SCALES)
     identified = ["alpha?", "a?", "d?", "theta?", *KINDS[name], "base_*", "tool_[xyz]"]
-    problem = CalibrationProblem(robot, parameters.identify(identified), seen(q, noise, 2))
-    return SimulatedArm(problem, seen(there, 0.0, 4), seen(there, noise, 4))
+    problem = CalibrationProblem(robot, parameters.identify(identified), measured(q, noise, 2))
+    return SimulatedArm(problem, measured(there, 0.0, 4), measured(there, noise, 4))
 
 
 def flange(robot: Robot, q: Array, errors: Array) -> Array:
     """Return flanges (N, 4, 4) of an arm of revolute joints with a small transform, a row of (dof, 6), behind each."""
-    turned = q @ robot.joint_map.T
+    return _frames(robot, q, errors)[-1]
+
+
+def _frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
+    """Return the frames (N, 4, 4) behind the joints."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, turned.T, errors, strict=True):
-        before = _small(np.array([a, 0, 0, alpha, 0, 0]))
+    frames = []
+    for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
         turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
-        T = T @ before @ turn @ behind @ _small(error)
-    return T
+        T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
+        frames.append(T)
+    return frames
 
 
-class _Moved:
-    """Where joints are when encoders say something else: sag under gravity, and eccentric encoders."""
+class _Motion:
+    """Joint values of encoder values: sag under gravity, and eccentric encoders."""
 
     def __init__(self, robot: Robot, size: float, rng: np.random.Generator) -> None:
         self.robot = robot
         self.size = size
         self.mass = np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1]
         self.phase = rng.uniform(0, 2 * np.pi, robot.dof)
-        self.give = rng.uniform(0.3, 1.0, robot.dof)
-        often = rng.uniform(-np.pi, np.pi, (200, robot.dof))
-        self.most = np.abs(self._torque(often)).max(axis=0)
+        self.compliance = rng.uniform(0.3, 1.0, robot.dof)
+        self.largest = np.abs(self._torque(rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
 
     def joints(self, q: Array) -> Array:
         """Return joint values (N, dof) [rad] of encoder values."""
         if not self.size:
             return q
-        sag = self.give * self._torque(q) / np.maximum(self.most, 1e-9 * self.most.max())
-        moved = q @ self.robot.joint_map.T
-        off = self.size * (sag + np.cos(moved + self.phase) / 3)
+        sag = self.compliance * self._torque(q) / np.maximum(self.largest, 1e-9 * self.largest.max())
+        off = self.size * (sag + np.cos(q @ self.robot.joint_map.T + self.phase) / 3)
         return q + off @ np.linalg.inv(self.robot.joint_map).T
 
     def _torque(self, q: Array) -> Array:
         """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
-        frames = []
-        T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-        for (alpha, a, theta, d, beta), angle in zip(self.robot.mdh, (q @ self.robot.joint_map.T).T, strict=True):
-            turn = np.tile(np.eye(4), (len(q), 1, 1))
-            turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
-            T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ _small(np.array([0, 0, d, 0, beta, 0]))
-            frames.append(T)
+        frames = _frames(self.robot, q, np.zeros((self.robot.dof, 6)))
         places = [frame[:, :3, 3] for frame in frames]
         centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
         down = np.array([0.0, 0.0, -1.0])
-        found = np.zeros(q.shape)
+        torque = np.zeros(q.shape)
         for i, frame in enumerate(frames):
             for mass, centre in zip(self.mass[i:], centres[i:], strict=True):
-                found[:, i] += mass * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
-        return found
+                torque[:, i] += mass * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
+        return torque
 
 
 def _errors(dof: int, rng: np.random.Generator) -> Array:

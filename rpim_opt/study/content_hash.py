@@ -20,6 +20,8 @@ _FOLDERS = [Path(sysconfig.get_path(key)) for key in ("stdlib", "platstdlib", "p
 _FOLDERS += [Path(file).parents[1] for file in (__file__, np.__file__)]
 LIBRARIES = ("<frozen", *{str(folder.resolve()) for folder in _FOLDERS}, *map(str, _FOLDERS))
 """Where code lies that its name and its version stand for."""
+DEEPEST = 10_000
+"""Frames that hashing may stack, some twelve for a function that another one calls."""
 ACCEPTED = "arguments that joblib can hash by their content, or no journal"
 
 
@@ -34,7 +36,12 @@ def content_hash(thing: Any, where: str) -> str:
     InputError
         Names what has no content that can be hashed: a generator, an open file, a lock.
     """
-    return _Hasher(where).hash(thing)
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(limit, DEEPEST))
+    try:
+        return _Hasher(where).hash(thing)
+    finally:
+        sys.setrecursionlimit(limit)
 
 
 class _Hasher(NumpyHasher):

@@ -246,6 +246,15 @@ def test_a_closure_that_holds_nothing_yet_has_a_digest() -> None:
     assert before != after
 
 
+def test_functions_may_call_many_others() -> None:
+    hashes = set()
+    for last in ("return x", "return 2 * x"):
+        space: dict[str, Any] = {}
+        exec("".join(f"def f{k}(x): return f{k + 1}(x)\n" for k in range(300)) + f"def f300(x): {last}", space)
+        hashes.add(content_hash(space["f0"], ""))
+    assert len(hashes) == 2
+
+
 def test_circles_end() -> None:
     loop: list[Any] = [1.0]
     loop.append(loop)
