@@ -126,19 +126,19 @@ def new(
         from rpim_opt.basics.writing import refused
         from rpim_opt.store.raw import understand_tables
 
-        asked = console.asked_of(
+        options = console.table_options(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
             separator=separator, decimal=decimal, within=time_tolerance,
         )  # fmt: skip
         if dry_run:
-            found = understand_tables(robot, data, measurement, asked, urdf_base, urdf_tip)
+            found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip)
             console.show(found, found.content(), as_json)
             return
         from rpim_opt.store.new_folder import new_problem
 
         with refused(folder):
             made = new_problem(
-                folder, robot, data, measurement=measurement, asked=asked, validation=validation, hold_out=hold_out,
+                folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, target=target,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip

@@ -252,14 +252,14 @@ def test_names_that_people_use() -> None:
     found = rename(source, ARM, pose, parse_units("rad,mm,Nm"))
     assert list(found.columns) == list(names.values())
     assert found.left_out == ("temperature", "timestamp")
-    assert found.was["q1_deg"] == "J1 [deg]"
-    assert "sigma_mm" not in found.was
+    assert [each.name for each in found.meant if each.name] == list(names.values())
+    assert [each.column for each in found.meant if each.name] == list(names)
 
 
 def test_joints_may_count_from_zero_or_have_the_files_names() -> None:
     zero = rename({f"q{i}": ["1"] for i in range(6)}, ARM, position, parse_units("deg"))
     assert list(zero.columns) == [f"q{i}_deg" for i in range(1, 7)]
-    assert zero.was["q1_deg"] == "q0"
+    assert (zero.meant[0].column, zero.meant[0].name) == ("q0", "q1_deg")
     joints = ["pan", "lift", "elbow", "w1", "w2", "w3"]
     named = rename({name: ["1"] for name in reversed(joints)}, ARM, position, parse_units("rad"), joints)
     assert list(named.columns) == [f"q{i}_rad" for i in range(6, 0, -1)]

@@ -265,18 +265,26 @@ class Dataset(Tabled):
         >>> len(both), both.label[0], both.robot[-1], len(both.of_robot("right"))
         (18, 'left:T2-1', 'right', 9)
         """
-        blocks: list[Block] = []
-        configuration = []
-        rows = 0
-        count = 0
         for name, part in parts.items():
             if any(part.robot):
                 raise InputError(f"data of '{name}'", "rows of several robots", "those of one")
-            blocks += [replace(block, row=block.row + rows, robot=name) for block in part.blocks]
-            configuration.append(part.configuration + count)
-            rows += len(part)
-            count += int(part.configuration.max()) + 1
-        return cls(tuple(blocks), _unique_labels(list(parts.values()), list(parts)), np.concatenate(configuration))
+        return cls._of_parts(list(parts.values()), list(parts), robots=list(parts))
+
+    @classmethod
+    def _of_parts(cls, parts: Sequence[Dataset], names: Sequence[str], robots: Sequence[str] = ()) -> Dataset:
+        """Return the rows of several datasets, each with configurations of its own."""
+        rows = np.cumsum([0, *(len(part) for part in parts)])
+        first = np.cumsum([0, *(int(part.configuration.max()) + 1 for part in parts)])
+        blocks = tuple(
+            replace(block, row=block.row + rows[i], robot=robots[i] if robots else block.robot)
+            for i, part in enumerate(parts)
+            for block in part.blocks
+        )
+        labels = [label for part in parts for label in part.label]
+        if len(set(labels)) < len(labels):
+            labels = [f"{name}:{label}" for name, part in zip(names, parts, strict=True) for label in part.label]
+        configuration = [part.configuration + first[i] for i, part in enumerate(parts)]
+        return cls(blocks, tuple(labels), np.concatenate(configuration))
 
     def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
         """Return the rows at ``index`` (K,), in that order; a row may be taken more than once."""
@@ -414,9 +422,9 @@ class Dataset(Tabled):
             rows,
             ("",) * measurement.points,
             torque=_beside(torque, "torque", q),
-            payload=_beside(payload, "payload", q[:, 0, 0]),
+            payload=_beside(payload, "payload", rows),
             approach=_beside(approach, "approach", q),
-            columns={name: _column(values, f"column {name}", N) for name, values in columns.items()},
+            columns={name: _beside(values, f"column {name}", rows) for name, values in columns.items()},
             session=named_sessions(session, N),
         )
         return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
@@ -442,17 +450,13 @@ class Dataset(Tabled):
         >>> len(twice), twice.label[0], len(set(twice.configuration))
         (18, 'morning:T2-1', 9)
         """
-        blocks: list[Block] = []
-        configuration = []
-        rows = 0
-        count = 0
-        for part in parts:
-            blocks += [replace(block, row=block.row + rows) for block in part.blocks]
-            configuration.append(part.configuration + count)
-            rows += len(part)
-            count += int(part.configuration.max()) + 1
-        whole = cls(tuple(blocks), _unique_labels(parts, names), np.concatenate(configuration))
-        return replace(whole, configuration=_joined(whole, count))
+        whole = cls._of_parts(parts, names)
+        stop = np.unique(whole.q, axis=0, return_inverse=True)[1]
+        first = np.full(len(whole), len(whole))
+        np.minimum.at(first, stop, whole.configuration)  # of rows at equal joint values
+        joined = np.full(int(whole.configuration.max()) + 1, len(whole))
+        np.minimum.at(joined, whole.configuration, first[stop])
+        return replace(whole, configuration=joined[whole.configuration])
 
 
 def named_sessions(names: Sequence[Any], N: int) -> np.ndarray | None:
@@ -494,21 +498,14 @@ def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:
         raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
 
 
-def _beside(values: Array | None, what: str, like: Array) -> Array | None:
+def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:
     """Return what a row states besides, in the shape of the joint values or with one number a row."""
     if values is None:
         return None
     found = np.asarray(values, dtype=float)
-    if found.size != like.size or not np.isfinite(found).all():
+    if found.size != like.size or found.shape[:1] != like.shape[:1] or not np.isfinite(found).all():
         raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {like.shape}")
     return found.reshape(like.shape)
-
-
-def _column(values: ArrayLike, what: str, N: int) -> Array:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (N,) or not np.isfinite(found).all():
-        raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {(N,)}")
-    return found
 
 
 def _covariance(sigma: float | Array, N: int, k: int) -> Array:
@@ -523,23 +520,6 @@ def _covariance(sigma: float | Array, N: int, k: int) -> Array:
     if wrong or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
         raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
     return covariance
-
-
-def _unique_labels(parts: Sequence[Dataset], names: Sequence[str]) -> tuple[str, ...]:
-    labels = [label for part in parts for label in part.label]
-    if len(set(labels)) < len(labels):
-        labels = [f"{name}:{label}" for name, part in zip(names, parts, strict=True) for label in part.label]
-    return tuple(labels)
-
-
-def _joined(data: Dataset, count: int) -> np.ndarray:
-    """Return the rows' configurations (N,), of which those with rows at equal joint values become one."""
-    stop = np.unique(data.q, axis=0, return_inverse=True)[1]
-    first = np.full(len(data), len(data))
-    np.minimum.at(first, stop, data.configuration)
-    joined = np.full(count, count)
-    np.minimum.at(joined, data.configuration, first[stop])
-    return joined[data.configuration]
 
 
 def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:

@@ -17,7 +17,7 @@ from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
     from rpim_opt.data.record import Requirement
-    from rpim_opt.data.tables.understanding import Asked
+    from rpim_opt.data.tables.layout import TableOptions
 
 # --- output ------------------------------------------------------------------------------------------------
 
@@ -188,23 +188,13 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
     return replace(stated, box=sides or stated.box)
 
 
-def asked_of(
-    units: str,
-    *,
-    columns: str,
-    key: str,
-    quaternion: str,
-    rotation: str,
-    within: float | None = None,
-    **layout: str,
-) -> Asked:
+def table_options(units: str, columns: str, **stated: Any) -> TableOptions:
     """Return what the options of a command state of its raw tables."""
-    from rpim_opt.data.tables.layout import Layout
-    from rpim_opt.data.tables.understanding import Asked
+    from rpim_opt.data.tables.layout import TableOptions
     from rpim_opt.data.tables.units import parse_units
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
-    return Asked(Layout(columns=names, **layout), parse_units(units), quaternion, rotation, key, within)
+    return TableOptions(columns=names, units=parse_units(units), **stated)
 
 
 def listed_words(text: str) -> list[str]:

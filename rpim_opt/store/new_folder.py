@@ -19,8 +19,8 @@ from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Asked
 from rpim_opt.data.tables.units import parse_units
 from rpim_opt.problem.registration.camera import posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras
@@ -63,7 +63,7 @@ def new_problem(
     *,
     measurement: str | None = None,
     units: str = "",
-    asked: Asked | None = None,
+    options: TableOptions | None = None,
     validation: str | Path | None = None,
     hold_out: float | None = None,
     seed: int = 0,
@@ -86,7 +86,7 @@ def new_problem(
         What was measured; by default poses where the table has orientations, else positions.
     units
         Units of columns whose name carries none, ``"deg,mm"``.
-    asked
+    options
         What else is stated of the tables, and their units.
     validation
         A table of measurements for validation.
@@ -122,7 +122,7 @@ def new_problem(
     source = find_source(robot)
     arm = read_arm(source.file, urdf_base, urdf_tip)
     paths = [data] if isinstance(data, str | Path) else data
-    found = understand_of(arm, paths, measurement, asked or Asked(units=parse_units(units)))
+    found = understand_of(arm, paths, measurement, options or TableOptions(units=parse_units(units)))
     if understood is not None:
         understood(found)
     board = stated_target(target)
@@ -210,7 +210,7 @@ class _Reader(NamedTuple):
 
     def beside(self, found: Understanding, columns: Columns, rows: Dataset, validation: str | Path) -> _Parts:
         """Return all rows, and those of a table of its own for validation."""
-        other = understand_of(self.arm, [validation], self.kind.name, found.asked)
+        other = understand_of(self.arm, [validation], self.kind.name, found.options)
         self.rows(validation, other.columns)
         said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; no choice sees it'
         return _Parts({IDENTIFICATION: columns, VALIDATION: other.columns}, rows, said, other.sentences)

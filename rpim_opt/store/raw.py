@@ -16,10 +16,10 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.layout import RawTable, read_raw
+from rpim_opt.data.tables.layout import RawTable, TableOptions, read_raw
 from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Asked, Understood, understand
+from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_source, read_arm
@@ -43,7 +43,7 @@ class Understanding:
         What was understood of every file.
     notes
         How the tables were put together and what was checked, a sentence each.
-    asked
+    options
         What was stated of them.
     file
         The file, or the first of them.
@@ -66,7 +66,7 @@ class Understanding:
     columns: Columns
     tables: tuple[Understood, ...]
     notes: tuple[str, ...]
-    asked: Asked
+    options: TableOptions
     file: str
 
     def __str__(self) -> str:
@@ -130,7 +130,7 @@ def understand_tables(
     robot: str,
     data: Sequence[str | Path],
     measurement: str | None = None,
-    asked: Asked | None = None,
+    options: TableOptions | None = None,
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
 ) -> Understanding:
@@ -147,7 +147,7 @@ def understand_tables(
         Text, Excel or Parquet files.
     measurement
         What was measured; by default poses where the tables have orientations, else positions.
-    asked
+    options
         What is stated of the tables.
     urdf_base, urdf_tip
         Links between which a URDF's robot is.
@@ -163,51 +163,51 @@ def understand_tables(
     >>> import rpim_opt as ro
     >>> _ = Path("joints.csv").write_text("Point,A1,A2,A3,A4,A5,A6\nP1,0,-90,10,20,30,40\nP2,5,-80,0,0,10,0\n")
     >>> _ = Path("points.csv").write_text("Point ID;X [m];Y [m];Z [m]\nP2;0,125;0,2;1,5\nP1;0,5;0,25;1,75\n")
-    >>> asked = ro.data.Asked(units={"angle": "deg"})
-    >>> found = ro.store.understand_tables("ur5e", ["joints.csv", "points.csv"], asked=asked)
+    >>> options = ro.data.TableOptions(units={"angle": "deg"})
+    >>> found = ro.store.understand_tables("ur5e", ["joints.csv", "points.csv"], options=options)
     >>> found.columns["q1_deg"], found.columns["x_m"]
     (['5', '0'], ['0.125', '0.5'])
     >>> found.notes
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
     arm = read_arm(find_source(robot).file, urdf_base, urdf_tip)
-    return understand_of(arm, data, measurement, asked)
+    return understand_of(arm, data, measurement, options)
 
 
 def understand_of(
-    arm: Described, data: Sequence[str | Path], measurement: str | None = None, asked: Asked | None = None
+    arm: Described, data: Sequence[str | Path], measurement: str | None = None, options: TableOptions | None = None
 ) -> Understanding:
     """Return what raw tables of an arm say, as `understand_tables` does."""
-    asked = asked or Asked()
+    options = options or TableOptions()
     paths = [Path(each) for each in data]
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
-    files = [(path, read_raw(path, asked.layout)) for path in paths]
+    files = [(path, read_raw(path, options)) for path in paths]
     if known is None:
         columns = [table.columns for _, table in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
     kind = known or pose
-    tables = _understood(files, arm, kind, asked)
+    tables = _understood(files, arm, kind, options)
     if known is None:
         kind = _kind_of_names(tables, paths[0])
         if kind is not pose:
-            tables = _understood(files, arm, kind, asked)
+            tables = _understood(files, arm, kind, options)
     if kind is pose and any(each.numbered for each in tables):
-        return _ordered(files, arm, asked)
-    return _whole(paths, arm, kind, asked, tables)
+        return _ordered(files, arm, options)
+    return _whole(paths, arm, kind, options, tables)
 
 
-def _understood(files: Files, arm: Described, kind: Measurement, asked: Asked) -> tuple[Understood, ...]:
-    return tuple(understand(path, arm.robot, kind, asked, arm.names, table) for path, table in files)
+def _understood(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> tuple[Understood, ...]:
+    return tuple(understand(path, arm.robot, kind, options, arm.names, table) for path, table in files)
 
 
 def _whole(
-    paths: Sequence[Path], arm: Described, kind: Measurement, asked: Asked, tables: Sequence[Understood]
+    paths: Sequence[Path], arm: Described, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
 ) -> Understanding:
     try:
-        whole = together(tables, arm.robot, kind, asked.key, asked.within)
+        whole = together(tables, arm.robot, kind, options.key, options.within)
     except InputError as error:
         raise error.within(paths[0] if len(paths) == 1 else None) from None
-    return Understanding(kind, whole.columns, tuple(tables), whole.notes, asked, str(paths[0]))
+    return Understanding(kind, whole.columns, tuple(tables), whole.notes, options, str(paths[0]))
 
 
 def _kind_of_names(tables: Sequence[Understood], path: Path) -> Measurement:
@@ -221,13 +221,13 @@ def _kind_of_names(tables: Sequence[Understood], path: Path) -> Measurement:
     return pose if any(form <= stems for form in forms) else position
 
 
-def _ordered(files: Files, arm: Described, asked: Asked) -> Understanding:
+def _ordered(files: Files, arm: Described, options: TableOptions) -> Understanding:
     """Return poses with a quaternion in the order that fits the nominal robot, and say both figures."""
     paths = [path for path, _ in files]
     found: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
     for order in ORDERS:
-        stated = replace(asked, quaternion=order)
+        stated = replace(options, quaternion=order)
         found[order] = _whole(paths, arm, pose, stated, _understood(files, arm, pose, stated))
         data = read_data(found[order].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, pose)
         misfit[order] = float(np.degrees(pose_misfit(arm.robot, data)))

@@ -24,9 +24,10 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.naming import rename
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Asked, understand
+from rpim_opt.data.tables.understanding import understand
 from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.mdh import Robot
 
@@ -267,7 +268,7 @@ def _columns(
 ) -> tuple[Columns, tuple[str, ...], Columns]:
     """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
     if isinstance(source, str | Path):
-        found = understand(Path(source), robot, kind, Asked(units=units))
+        found = understand(Path(source), robot, kind, TableOptions(units=units))
         if found.numbered and kind.name == "pose":
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
         columns, raw = found.columns, found.raw

@@ -15,7 +15,6 @@ from rpim_opt.basics.tables import read_grid
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.layout import Layout
 from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.data.tables.units import parse_units
 
@@ -31,8 +30,7 @@ def write(folder: Path, text: str | bytes, name: str = "raw.csv") -> Path:
 
 
 def read(path: Path, joints: Any = (), robot: Any = ARM, kind: Any = position, **asked: Any) -> Understood:
-    layout = {name: asked.pop(name) for name in list(asked) if name in ("sheet", "separator", "decimal", "encoding")}
-    return understand(path, robot, kind, ro.data.Asked(Layout(**layout), **asked), joints)
+    return understand(path, robot, kind, ro.data.TableOptions(**asked), joints)
 
 
 def book(folder: Path) -> Path:

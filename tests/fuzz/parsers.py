@@ -20,8 +20,8 @@ from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.convex.sentence import sentence
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Asked
 from rpim_opt.data.tables.units import parse_units
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
@@ -145,7 +145,7 @@ def raw(data: bytes, folder: Path) -> None:
     found = None
     for units in ("", "deg,mm"):
         with suppress(ro.InputError):
-            found = understand_of(arm, [path], asked=Asked(units=parse_units(units)))
+            found = understand_of(arm, [path], options=TableOptions(units=parse_units(units)))
     if found is None:
         raise ro.InputError("raw", "nothing", "something")
     counts = {len(cells) for cells in found.columns.values()}

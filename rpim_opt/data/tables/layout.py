@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -37,8 +37,8 @@ WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 
 
 @dataclass(frozen=True)
-class Layout:
-    """What a user states of a raw table; what is empty is found in the file.
+class TableOptions:
+    """What a user states of raw tables; what is empty is found in the files.
 
     Parameters
     ----------
@@ -48,12 +48,23 @@ class Layout:
         Of a text file: ``"cp1252"``, ``"semicolon"``, ``","``.
     columns
         The columns' names, instead of a header; a column called ``-`` is left out.
+    units
+        Of columns whose name carries none, by dimension.
+    quaternion
+        Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
+    rotation
+        ``"vector"`` where rx, ry, rz are a rotation vector (Universal Robots), else roll, pitch, yaw.
+    key
+        The column by which several files are joined; ``"row"`` for the number of the row.
+    within
+        Tolerance [s] where they are joined by the nearest time.
 
     Examples
     --------
-    >>> from rpim_opt.data.tables.layout import Layout
-    >>> Layout(columns=("label", "q1_deg", "x_mm")).columns[1]
-    'q1_deg'
+    >>> import rpim_opt as ro
+    >>> options = ro.data.TableOptions(separator="semicolon", units={"angle": "rad", "length": "m"}, quaternion="xyzw")
+    >>> options.key
+    ''
     """
 
     sheet: str = ""
@@ -61,6 +72,11 @@ class Layout:
     separator: str = ""
     decimal: str = ""
     columns: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    quaternion: str = ""
+    rotation: str = ""
+    key: str = ""
+    within: float | None = None
 
 
 class Head(NamedTuple):
@@ -95,7 +111,7 @@ class RawTable:
     notes: tuple[str, ...] = ()
 
 
-def read_raw(path: Path, layout: Layout | None = None) -> RawTable:
+def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     r"""Return the table of a file as people have them: text of any kind, Excel, Parquet.
 
     Raises
@@ -113,11 +129,11 @@ def read_raw(path: Path, layout: Layout | None = None) -> RawTable:
     >>> list(raw.columns), raw.columns["Joints J1 [deg]"]
     (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
-    layout = layout or Layout()
+    options = options or TableOptions()
     try:
         if path.suffix.lower() == ".parquet":
             return RawTable(read_columns(path))
-        return _table(read_grid(path, layout.sheet, layout.encoding, layout.separator), layout)
+        return _table(read_grid(path, options.sheet, options.encoding, options.separator), options)
     except InputError as error:
         raise error.within(path) from None
 
@@ -130,7 +146,7 @@ def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
     return [i for i, row in enumerate(rows) if all(_is_missing(str(cell)) for cell in row)]
 
 
-def _table(grid: Grid, layout: Layout) -> RawTable:
+def _table(grid: Grid, options: TableOptions) -> RawTable:
     """Return the table among the rows of a file."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
@@ -139,17 +155,17 @@ def _table(grid: Grid, layout: Layout) -> RawTable:
     if most < 2:
         raise InputError("the table", "a header and no rows", "at least one row of numbers")
     full = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
-    heads, above = _heads(grid, full, layout)
+    heads, above = _heads(grid, full, options)
     summing = [i for i in full if _first(grid.rows[i]).lower().rstrip(":") in SUMMARIES]
     rows = [grid.rows[i] for i in sorted(set(full) - set(summing))]
-    _require_width(rows, len(heads), layout)
+    _require_width(rows, len(heads), options)
     columns, heads = _columns(rows, heads)
-    columns, mark = _plain(columns, layout.decimal)
+    columns, mark = _plain(columns, options.decimal)
     columns, heads = _without_units(columns, heads)
-    notes = [*grid.notes, *_about_header(grid, above, layout), *_about_rows(grid, full, above)]
+    notes = [*grid.notes, *_about_header(grid, above, options), *_about_rows(grid, full, above)]
     notes += [f"line {grid.lines[i]} sums others up: left out '{_first(grid.rows[i])}'." for i in summing]
     if mark == ",":
-        notes.append(f"decimal commas: {'as stated' if layout.decimal else 'no comma can part thousands'}.")
+        notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can part thousands'}.")
     return RawTable(columns, heads, tuple(notes))
 
 
@@ -180,12 +196,12 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
     return full
 
 
-def _heads(grid: Grid, full: Sequence[int], layout: Layout) -> tuple[list[Head], list[int]]:
+def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list[Head], list[int]]:
     """Return what stands above every column, and the numbers of the rows of the header."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
     above = _header_rows(grid.rows, full[0], width)
-    if layout.columns:
-        return [Head(name) for name in layout.columns], above
+    if options.columns:
+        return [Head(name) for name in options.columns], above
     if not above:
         found = f"no header above '{', '.join(grid.rows[full[0]][:4])}, ...'"
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
@@ -241,9 +257,9 @@ def _unmerged(line: Sequence[str]) -> list[str]:
     return cells
 
 
-def _about_header(grid: Grid, above: Sequence[int], layout: Layout) -> Iterator[str]:
+def _about_header(grid: Grid, above: Sequence[int], options: TableOptions) -> Iterator[str]:
     """Say where the header is, unless it is the first line alone."""
-    if layout.columns:
+    if options.columns:
         yield "names of columns as stated" + (f", instead of {_lines(grid, above)}." if above else ".")
     elif len(above) > 1:
         yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
@@ -273,14 +289,14 @@ def _lines(grid: Grid, rows: Sequence[int]) -> str:
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
-def _require_width(rows: Sequence[list[str]], width: int, layout: Layout) -> None:
+def _require_width(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
     """Refuse rows that are longer than the header; blank cells at the end may be missing or too many."""
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()
-        lacks_remark = len(row) == width - 1 and width > 2 and not layout.separator
+        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
         if len(row) != width and not lacks_remark:
-            what = "--columns" if layout.columns else "the header"
+            what = "--columns" if options.columns else "the header"
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, numbers
+from rpim_opt.basics.units import split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.layout import Head
@@ -21,19 +22,36 @@ AMBIGUOUS = ("rx", "ry", "rz")
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 Readings = dict[str, Reading]
 """What every column holds, by its name."""
+NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
+         "session": "session of the measurements",
+         "to_marker": "reflector of the second point", "point": "point that was touched or seen",
+         "plane": "plane that was touched",
+         "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw"}  # fmt: skip
+NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
+            r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
+SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
+
+
+class Meant(NamedTuple):
+    """A column: its name in the file, what it means, our name, the unit, and why."""
+
+    column: str
+    meaning: str
+    name: str
+    unit: str
+    why: str
 
 
 class Renamed(NamedTuple):
-    """A table with the names of this package, what they were where they differ, and columns that were left out.
-
-    ``why`` says it of every new name and its unit, ``left_why`` of what was left out.
-    """
+    """A table with the names of this package, and what every column of the file means."""
 
     columns: Columns
-    was: Mapping[str, str]
-    left_out: tuple[str, ...]
-    why: Mapping[str, tuple[str, str]] = {}
-    left_why: Mapping[str, str] = {}
+    meant: tuple[Meant, ...]
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Columns that mean nothing here."""
+        return tuple(each.column for each in self.meant if not each.name)
 
 
 def rename(
@@ -81,14 +99,39 @@ def rename(
     read, left_why = _one_of_each(read)
     ours = {name: each for name, each in read.items() if _is_ours(name, each.stem, numeric, plain)}
     new, why = _with_units(ours, numeric, units)
-    left_out = tuple(name for name in table if name not in ours)
-    return Renamed(
-        {new[name]: _converted(table[name], each, units, new[name]) for name, each in ours.items()},
-        {new[name]: name for name in ours if new[name] != name},
-        left_out,
-        {new[name]: (each.why, why[name]) for name, each in ours.items()},
-        {name: left_why.get(name) or read[name].why or "no column of these measurements" for name in left_out},
-    )
+    meant = []
+    for name in table:
+        if name not in ours:
+            reason = left_why.get(name) or read[name].why or "no column of these measurements"
+            meant.append(Meant(name, "left out", "", "", reason))
+            continue
+        stem, unit = split_unit(new[name])
+        reason = f"{ours[name].why}; unit {why[name]}" if why[name] else ours[name].why
+        shown = new[name].removeprefix(f"{stem}_") if unit else ""
+        meant.append(Meant(name, kind.words.get(stem) or meaning(stem), new[name], shown, reason))
+    return Renamed({new[name]: _converted(table[name], each, units, new[name]) for name, each in ours.items()},
+                   tuple(meant))  # fmt: skip
+
+
+def meaning(stem: str) -> str:
+    """Return what a column of ours is, in words.
+
+    >>> from rpim_opt.data.tables.naming import meaning
+    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
+    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
+    """
+    if stem in NAMES:
+        return NAMES[stem]
+    if stem.startswith("to_"):
+        return f"second point: {meaning(stem.removeprefix('to_'))}"
+    for prefix, word in SPREAD.items():
+        if stem.startswith(prefix):
+            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
+    for pattern, words in NUMBERED.items():
+        match = re.fullmatch(pattern, stem)
+        if match:
+            return words.format(*match.groups())
+    return f"measured {stem}"
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------

@@ -2,77 +2,21 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import UNITS, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.layout import Layout, RawTable, missing_rows, read_raw
+from rpim_opt.data.tables.layout import RawTable, TableOptions, missing_rows, read_raw
 from rpim_opt.data.tables.names import Reading
-from rpim_opt.data.tables.naming import Renamed, rename
+from rpim_opt.data.tables.naming import Meant, rename
 from rpim_opt.data.tables.orientations import from_vectors, quaternion_columns
 from rpim_opt.data.tables.units import split
 from rpim_opt.robot.mdh import Robot
-
-NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
-         "session": "session of the measurements",
-         "to_marker": "reflector of the second point", "point": "point that was touched or seen",
-         "plane": "plane that was touched",
-         "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw"}  # fmt: skip
-NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
-            r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
-SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
-
-
-class Meant(NamedTuple):
-    """A column: its name in the file, what it means, our name, the unit, and why."""
-
-    column: str
-    meaning: str
-    name: str
-    unit: str
-    why: str
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What a user states of raw tables.
-
-    Parameters
-    ----------
-    layout
-        How the cells are written.
-    units
-        Of columns whose name carries none, by dimension.
-    quaternion
-        Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
-    rotation
-        ``"vector"`` where rx, ry, rz are a rotation vector (Universal Robots), else roll, pitch, yaw.
-    key
-        The column by which several files are joined; ``"row"`` for the number of the row.
-    within
-        Tolerance [s] where they are joined by the nearest time.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> asked = ro.data.Asked(units={"angle": "rad", "length": "m"}, quaternion="xyzw")
-    >>> asked.key
-    ''
-    """
-
-    layout: Layout = field(default_factory=Layout)
-    units: Mapping[str, str] | None = None
-    quaternion: str = ""
-    rotation: str = ""
-    key: str = ""
-    within: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +56,7 @@ def understand(
     path: Path,
     robot: Robot,
     kind: Measurement,
-    asked: Asked | None = None,
+    options: TableOptions | None = None,
     joints: Sequence[str] = (),
     table: RawTable | None = None,
 ) -> Understood:
@@ -126,7 +70,7 @@ def understand(
         A text, Excel or Parquet file.
     robot, kind
         Decide which columns there may be.
-    asked
+    options
         What the user states.
     joints
         What the robot's file calls its joints.
@@ -152,38 +96,40 @@ def understand(
     >>> found.columns["q1_deg"], found.meant[1].meaning, found.notes[-1]
     (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
     """
-    asked = asked or Asked()
-    raw = table or read_raw(path, asked.layout)
+    options = options or TableOptions()
+    raw = table or read_raw(path, options)
     try:
-        raw, vectors = _with_quaternions(raw, asked)
-        found = rename(raw.columns, robot, kind, asked.units or {}, joints, raw.heads, asked.quaternion or "wxyz")
+        raw, vectors = _with_quaternions(raw, options)
+        found = rename(raw.columns, robot, kind, options.units, joints, raw.heads, options.quaternion or "wxyz")
     except InputError as error:
         raise error.within(path) from None
     columns, kept, notes = _with_values(found.columns, robot, kind)
     columns, more = _labelled(columns)
-    ours = {found.was.get(name, name): name for name in found.columns}
-    read = {name: Reading(split_unit(ours[name])[0] if name in ours else "") for name in raw.columns}
+    stems = {each.column: split_unit(each.name)[0] for each in found.meant}
+    read = {name: Reading(stems[name]) for name in raw.columns}
+    made = ("qw", "qx", "qy", "qz") if vectors else ()
+    meant = [Meant(name, "rotation vector", "qw, qx, qy, qz", "", "--rotation vector") for name in vectors]
     return Understood(
         path.name,
         columns,
         {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
-        _meant(raw, found, ours, vectors, kind),
+        (*meant, *(each for each in found.meant if each.column not in made)),
         (*raw.notes, *notes, *more),
-        not asked.quaternion and bool(quaternion_columns(read, robot.dof)),
+        not options.quaternion and bool(quaternion_columns(read, robot.dof)),
     )
 
 
-def _with_quaternions(raw: RawTable, asked: Asked) -> tuple[RawTable, tuple[str, ...]]:
+def _with_quaternions(raw: RawTable, options: TableOptions) -> tuple[RawTable, tuple[str, ...]]:
     """Return the table with quaternions for rotation vectors, and the columns that these were."""
-    if not asked.rotation:
+    if not options.rotation:
         return raw, ()
-    if asked.rotation != "vector":
-        raise InputError("--rotation", f"'{asked.rotation}'", "vector, where rx, ry, rz are a rotation vector")
+    if options.rotation != "vector":
+        raise InputError("--rotation", f"'{options.rotation}'", "vector, where rx, ry, rz are a rotation vector")
     stems = {split(name)[0].strip().lower(): name for name in raw.columns}
     names = [stems[stem] for stem in ("rx", "ry", "rz") if stem in stems]
     if len(names) < 3:
         raise InputError("the header", "no columns rx, ry, rz", "three of a rotation vector, or no --rotation")
-    unit = split(names[0])[1] or (asked.units or {}).get("angle", "")
+    unit = split(names[0])[1] or options.units.get("angle", "")
     if not unit:
         raise InputError("the header", f"columns without a unit ({', '.join(names)})", "--units with it, such as rad")
     others = {name: cells for name, cells in raw.columns.items() if name not in names}
@@ -230,49 +176,3 @@ def _labelled(columns: Columns) -> tuple[Columns, list[str]]:
 
 def _unique(labels: Sequence[str]) -> bool:
     return all(labels) and len(set(labels)) == len(labels)
-
-
-def _meant(
-    raw: RawTable, found: Renamed, ours: Mapping[str, str], vectors: Sequence[str], kind: Measurement
-) -> tuple[Meant, ...]:
-    """Return what every column of the file means."""
-    meant = [Meant(name, "rotation vector", "qw, qx, qy, qz", "", "--rotation vector") for name in vectors]
-    for name in raw.columns:
-        if name not in ours:
-            meant.append(Meant(name, "left out", "", "", found.left_why[name]))
-        elif not (vectors and name in ("qw", "qx", "qy", "qz")):
-            new = ours[name]
-            why, unit_why = found.why[new]
-            stem, unit = split_unit(new)
-            shown = new.removeprefix(f"{stem}_") if unit else ""
-            meant.append(
-                Meant(
-                    name,
-                    kind.words.get(stem) or meaning(stem),
-                    new,
-                    shown,
-                    f"{why}; unit {unit_why}" if unit_why else why,
-                )
-            )
-    return tuple(meant)
-
-
-def meaning(stem: str) -> str:
-    """Return what a column of ours is, in words.
-
-    >>> from rpim_opt.data.tables.understanding import meaning
-    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
-    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
-    """
-    if stem in NAMES:
-        return NAMES[stem]
-    if stem.startswith("to_"):
-        return f"second point: {meaning(stem.removeprefix('to_'))}"
-    for prefix, word in SPREAD.items():
-        if stem.startswith(prefix):
-            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
-    for pattern, words in NUMBERED.items():
-        match = re.fullmatch(pattern, stem)
-        if match:
-            return words.format(*match.groups())
-    return f"measured {stem}"
