@@ -451,7 +451,7 @@ class Dataset(Tabled):
         (18, 'morning:T2-1', 9)
         """
         whole = cls._of_parts(parts, names)
-        stop = np.unique(whole.q, axis=0, return_inverse=True)[1]
+        stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)
         first = np.full(len(whole), len(whole))
         np.minimum.at(first, stop, whole.configuration)  # of rows at equal joint values
         joined = np.full(int(whole.configuration.max()) + 1, len(whole))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import INTRINSICS
-from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.measurements.measurement import Measurement, Words, of_fixture
 from rpim_opt.problem.observability import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
@@ -24,32 +23,6 @@ from rpim_opt.robot.plain import exact, toml
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 
 
-class Words(NamedTuple):
-    """How a kind of measurement is spoken of."""
-
-    thing: str = "a reflector"
-    thing_at: str = "The reflector"
-    frame: str = "so the instrument has a frame of its own"
-    noise_of: str = "a laser tracker, and a robot that repeats well"
-    wrong: str = "the reflector was bumped"
-
-
-CAMERA = Words(
-    frame="in the frame of the board", noise_of="corners found to a fifth of a pixel", wrong="a wrong corner"
-)
-WORDS = {
-    "eye_in_hand": CAMERA._replace(thing="a camera", thing_at="The camera (z forwards, x right, y down in the image)"),
-    "eye_to_hand": CAMERA._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
-    "revisit": Words(
-        thing="a tip",
-        thing_at="The tip that touches, a ball's middle,",
-        noise_of="a good robot, a tight fit",
-        wrong="the tip slipped",
-    ),
-}
-"""Of what is on the flange, where it is no reflector."""
-
-
 def problem_text(
     arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], said: Mapping[str, str]
 ) -> tuple[str, list[str]]:
@@ -58,7 +31,7 @@ def problem_text(
 
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
-    words = WORDS.get(kind.name, Words())
+    words = kind.words
     base, how = _base(arm, rows, tools, words)
     parameters = starting_parameters(arm.robot, rows, base, tools)
     touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
@@ -98,7 +71,7 @@ def _cameras(rows: Dataset) -> list[tuple[str, str]]:
 def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], words: Words) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
-    if not {block.measurement.name for block in rows.blocks} & {"position", "pose"}:
+    if not any(block.measurement.registers for block in rows.blocks):
         return arm.base, "The base is as the robot's file has it: these measurements do not depend on it."
     found, _, verdict = locate(arm.robot, rows, tools)
     if same_place(found, arm.base):

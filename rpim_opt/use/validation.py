@@ -269,7 +269,7 @@ def _columns(
     """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
     if isinstance(source, str | Path):
         found = understand(Path(source), robot, kind, TableOptions(units=units))
-        if found.numbered and kind.name == "pose":
+        if found.numbered and "qw" in kind.columns:
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
         columns, raw = found.columns, found.raw
         left_out = tuple(each.column for each in found.meant if each.meaning == "left out")

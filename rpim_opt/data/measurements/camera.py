@@ -18,7 +18,7 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split_unit
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.measurement import Measurement, Words
 from rpim_opt.data.tables.columns import quantities_of, require_unique
 from rpim_opt.data.tables.units import split
 
@@ -109,6 +109,14 @@ def has_pixels(tables: Sequence[Columns]) -> bool:
     return any({"u", "v"} <= {split(name)[0].strip().lower() for name in table} for table in tables)
 
 
+_WORDS = Words(
+    thing="a camera",
+    thing_at="The camera (z forwards, x right, y down in the image)",
+    frame="in the frame of the board",
+    noise_of="corners found to a fifth of a pixel",
+    wrong="a wrong corner",
+    columns={"u": "measured pixel, to the right", "v": "measured pixel, downwards"},
+)
 eye_in_hand = Measurement(
     "eye_in_hand",
     model=on_the_flange,
@@ -122,7 +130,7 @@ eye_in_hand = Measurement(
     accepted=dict.fromkeys(
         TARGET, 'the target\'s points: target = "board.csv", or columns target_x_mm, target_y_mm, target_z_mm'
     ),
-    words={"u": "measured pixel, to the right", "v": "measured pixel, downwards"},
+    words=_WORDS,
     shown_by=has_pixels,
     registers=True,
     turning=True,
@@ -131,7 +139,13 @@ eye_in_hand = Measurement(
 """A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
 in the board's frame, which is the instrument's."""
 
-eye_to_hand = replace(eye_in_hand, name="eye_to_hand", model=beside_the_robot, metres=metres_beside_the_robot)
+eye_to_hand = replace(
+    eye_in_hand,
+    name="eye_to_hand",
+    model=beside_the_robot,
+    metres=metres_beside_the_robot,
+    words=_WORDS._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
+)
 """A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
 camera's frame, which is the instrument's."""
 

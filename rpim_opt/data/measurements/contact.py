@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.distance import distance
-from rpim_opt.data.measurements.measurement import XYZ, Measurement, origin
+from rpim_opt.data.measurements.measurement import XYZ, Measurement, Words, origin
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
@@ -38,6 +38,13 @@ revisit_plane = Measurement(
     touching=True,
     planar=True,
     names=TOUCHED,
+    words=Words(
+        thing="a tip",
+        thing_at="The tip that touches, a ball's middle,",
+        noise_of="a good robot, a tight fit",
+        wrong="the tip slipped",
+        columns={"point": "point that was touched", "plane": "plane that was touched"},
+    ),
 )
 """A touch of a plane that nobody measured: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
 

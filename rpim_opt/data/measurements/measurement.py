@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,23 @@ from rpim_opt.robot.terms import require_columns
 
 XYZ = {"x": "length", "y": "length", "z": "length"}
 """A position's coordinates."""
+
+
+class Words(NamedTuple):
+    """How readers hear of a type: what is on the flange, whose frame it is in, what its noise and a mistake are like.
+
+    ``columns`` says what its columns are: ``{"u": "measured pixel, to the right"}``.
+    """
+
+    thing: str = "a reflector"
+    thing_at: str = "The reflector"
+    frame: str = "so the instrument has a frame of its own"
+    noise_of: str = "a laser tracker, and a robot that repeats well"
+    wrong: str = "the reflector was bumped"
+    columns: Mapping[str, str] = MappingProxyType({})
+
+
+REFLECTOR = Words()
 
 
 def _difference(y: Any, modelled: Any) -> Any:
@@ -84,7 +102,7 @@ class Measurement(Brief):
     accepted
         What a message says is accepted where a column of ``extra`` that it sees is missing, by the column's name.
     words
-        What its columns are, for readers: ``{"u": "measured pixel, to the right"}``.
+        How readers hear of it.
     shown_by
         ``shown_by(tables)``: whether the columns of raw tables can only be of this type, before names are understood.
     registers, turning
@@ -143,7 +161,7 @@ class Measurement(Brief):
     names: tuple[str, ...] = ()
     variants: Mapping[str, Measurement] = field(default_factory=dict)
     accepted: Mapping[str, str] = field(default_factory=dict)
-    words: Mapping[str, str] = field(default_factory=dict)
+    words: Words = REFLECTOR
     shown_by: Callable[[Sequence[Columns]], bool] | None = None
     registers: bool = False
     turning: bool = False

@@ -98,9 +98,10 @@ def _add(
     if (stem, dimension) in columns:
         raise InputError("the header", f"column '{stem}' in two units", "one of them")
     values = si * numbers(cells, label, name) + zero
-    _require_size(values, si, name, label)
+    _require_rows(np.abs(values) <= LARGEST, values / si, name, label, f"a size of at most {LARGEST / si:g}")
     if stem.startswith(SPREADS):
-        _require_positive(values, si, name, label)
+        accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
+        _require_rows(values >= SMALLEST, values / si, name, label, accepted)
     columns[stem, dimension] = values
     if len(known[stem]) == 1:
         columns[stem, ""] = values
@@ -119,18 +120,11 @@ def _require_known(
         )
 
 
-def _require_positive(values: Array, si: float, name: str, label: Sequence[str]) -> None:
-    if not (values >= SMALLEST).all():
-        row = label[int(np.argmin(values >= SMALLEST))]
-        accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
-        raise InputError(f"row {row}, column {name}", f"{values.min() / si:g}", accepted)
-
-
-def _require_size(values: Array, si: float, name: str, label: Sequence[str]) -> None:
-    sane = np.abs(values) <= LARGEST
-    if not sane.all():
-        i = int(np.argmin(sane))
-        raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", f"a size of at most {LARGEST / si:g}")
+def _require_rows(fits: np.ndarray, values: Array, name: str, label: Sequence[str], accepted: str) -> None:
+    """Refuse the first row whose value does not fit."""
+    if not fits.all():
+        i = int(np.argmin(fits))
+        raise InputError(f"row {label[i]}, column {name}", f"{values[i]:g}", accepted)
 
 
 def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
@@ -141,15 +135,11 @@ def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
     sides = [f"approach{i}" for i in range(1, robot.dof + 1)]
     groups = [torques, sides]
     if kind.points == 2:
-        groups += [_second(joints), _second(torques), _second(sides)]
+        groups += [[f"to_{stem}" for stem in group] for group in (joints, torques, sides)]
     for group in groups:
         if any((stem, "") in columns for stem in group):
             required += group
     return required
-
-
-def _second(stems: Sequence[str]) -> list[str]:
-    return [f"to_{stem}" for stem in stems]
 
 
 def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:

@@ -23,10 +23,9 @@ ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 Readings = dict[str, Reading]
 """What every column holds, by its name."""
 NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
-         "session": "session of the measurements",
-         "to_marker": "reflector of the second point", "point": "point that was touched or seen",
-         "plane": "plane that was touched",
-         "rx": "measured roll", "ry": "measured pitch", "rz": "measured yaw"}  # fmt: skip
+         "session": "session of the measurements", "to_marker": "reflector of the second point",
+         "point": "point that was touched or seen", "rx": "measured roll", "ry": "measured pitch",
+         "rz": "measured yaw"}  # fmt: skip
 NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
             r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
 SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
@@ -108,7 +107,7 @@ def rename(
         stem, unit = split_unit(new[name])
         reason = f"{ours[name].why}; unit {why[name]}" if why[name] else ours[name].why
         shown = new[name].removeprefix(f"{stem}_") if unit else ""
-        meant.append(Meant(name, kind.words.get(stem) or meaning(stem), new[name], shown, reason))
+        meant.append(Meant(name, kind.words.columns.get(stem) or meaning(stem), new[name], shown, reason))
     return Renamed({new[name]: _converted(table[name], each, units, new[name]) for name, each in ours.items()},
                    tuple(meant))  # fmt: skip
 

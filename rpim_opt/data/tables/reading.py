@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -79,22 +79,25 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     label = labels(table, N)
     columns = numeric(table, robot, kind, label)
     y = _measured(columns, kind, label, N)
+    q = _of_joints("q", columns, robot, kind, N)
     whole = Block(
         kind,
-        q=_joint_values(columns, robot, kind, N),
+        q=q,
         y=y,
         covariance=covariances(columns, declared, kind, y, label),
         row=np.arange(N),
-        torque=_of_joints("tau", columns, robot, kind, N),
+        torque=_of_joints("tau", columns, robot, kind, N) if ("tau1", "") in columns else None,
         payload=_payload(columns, label),
         approach=_approach(columns, robot, kind, label),
-        columns=_further(columns, robot, kind),
+        columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
         point=_named_points(table, kind, N),
         session=named_sessions(texts(table.get("session", ()), "session"), N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     _require_two_points(whole, markers, label)
-    configuration = _configurations(table, whole.q)
+    configuration: Any = partial(_by_joints, whole.q)  # a third of the time of reading, and not all ask
+    if "configuration" in table:
+        configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
     if {"marker", "to_marker", "fixture"} & set(table):
         blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
@@ -111,11 +114,6 @@ def _named_points(table: Columns, kind: Measurement, N: int) -> np.ndarray | Non
     return np.array(_names(table, columns, N), dtype=object)[:, None] if columns else None
 
 
-def _further(columns: Numbers, robot: Robot, kind: Measurement) -> dict[str, Array]:
-    """Return the columns that terms and measurement see, as far as the table has them."""
-    return {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
-
-
 def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:
     """Return columns side by side, (N, len(stems))."""
     if not stems:
@@ -123,46 +121,22 @@ def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:
     return np.column_stack([columns[stem, ""] for stem in stems])
 
 
-def _side_by_side(points: Sequence[Array]) -> Array:
-    """Return values (N, dof) of every point as one array (N, p, dof); of one point without a copy."""
-    if len(points) == 1:
-        return points[0][:, None]
-    return np.stack(points, axis=1)
-
-
-def _joint_values(columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
-    """Return the joint values (N, p, dof); the second point is in the same configuration unless it states its own."""
-    joints = [f"q{i}" for i in range(1, robot.dof + 1)]
-    points = [_several(columns, joints, N)]
-    if kind.points == 2 and ("to_q1", "") in columns:
-        points.append(_several(columns, [f"to_{stem}" for stem in joints], N))
-    elif kind.points == 2:
-        points.append(points[0])
-    return _side_by_side(points)
-
-
-def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array | None:
-    """Return torques or directions (N, p, dof); the second point's are the first one's unless it states its own."""
-    if (f"{stem}1", "") not in columns:
-        return None
-    names = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
-    points = [_several(columns, names, N)]
-    if kind.points == 2 and (f"to_{stem}1", "") in columns:
-        names = [f"to_{name}" for name in names]
-    if kind.points == 2:
-        points.append(_several(columns, names, N))
-    return _side_by_side(points)
+def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
+    """Return joint values, torques or directions (N, p, dof); a second point without its own has the first's."""
+    own = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
+    points = [own, [f"to_{name}" for name in own] if (f"to_{stem}1", "") in columns else own][: kind.points]
+    values = [_several(columns, names, N) for names in points]
+    return values[0][:, None] if len(values) == 1 else np.stack(values, axis=1)  # of one point without a copy
 
 
 def _approach(columns: Numbers, robot: Robot, kind: Measurement, label: Sequence[str]) -> Array | None:
     """Return from which side the joints came (N, p, dof), -1, 0 or +1."""
+    if ("approach1", "") not in columns:
+        return None
     approach = _of_joints("approach", columns, robot, kind, len(label))
-    if approach is not None:
-        wrong = np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0)))
-        if len(wrong):
-            row, point, joint = wrong[0]
-            where = f"row {label[row]}, column approach{joint + 1}"
-            raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
+    for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
+        where = f"row {label[row]}, column approach{joint + 1}"
+        raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
     return approach
 
 
@@ -201,23 +175,13 @@ def _require_two_points(whole: Block, markers: Sequence[Sequence[str]], label: S
             raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
 
 
-def _configurations(table: Columns, q: Array) -> np.ndarray | Callable[[], np.ndarray]:
-    """Return the number of every row's configuration: as stated, or what finds them by equal joint values.
-
-    That takes a third of the time in which a table is read, and who adds up its rows does not ask.
-    """
-    if "configuration" in table:
-        return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
-    return partial(_by_joints, q)
-
-
 def _by_joints(q: Array) -> np.ndarray:
     """Return the number of every row's configuration by equal joint values (N, p, dof)."""
     joints = q.reshape(len(q), -1)
     first, which = np.unique(joints[:, 0], return_inverse=True)
     if len(first) == len(joints):  # then it alone decides the order, too; to sort numbers is ten times quicker
         return which
-    return np.unique(joints, axis=0, return_inverse=True)[1]
+    return np.unique(joints, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[str]) -> tuple[Block, ...]:

@@ -1,0 +1,81 @@
+"""A measurement type of a stranger's, in one file of the package: every command knows it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot.plain import write_robot
+from tests import ROOT
+from tests.simulate import ARM
+from tests.store.raw_files import off_its_drawing
+
+HEIGHT = '''
+"""A gauge that reads heights alone."""
+
+from rpim_opt.data.measurements.measurement import Measurement, Words
+
+height = Measurement(
+    "height",
+    model=lambda T: T[2, 3],
+    columns={"height": "length"},
+    noise={"height": "length"},
+    words=Words(thing="a stylus", noise_of="a dial gauge", columns={"height": "height that the gauge reads"}),
+)
+TYPES = (height,)
+'''
+COUNT = 80
+NOISE = 0.01
+"""[mm]"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package with the file, a robot, and a raw table of readings."""
+    place = tmp_path_factory.mktemp("own")
+    shutil.copytree(ROOT / "rpim_opt", place / "rpim_opt", ignore=shutil.ignore_patterns("__pycache__"))
+    (place / "rpim_opt" / "data" / "measurements" / "height.py").write_text(HEIGHT)
+    write_robot(ARM, place / "robot.toml")
+    rng = np.random.default_rng(3)
+    q = rng.uniform(-120, 120, (COUNT, 6)).round(4)
+    z = 1e3 * forward_kinematics(off_its_drawing(rng), np.radians(q))[:, 2, 3] + NOISE * rng.normal(size=COUNT)
+    lines = ["Point;" + ";".join(f"J{i} [deg]" for i in range(1, 7)) + ";Height [mm]"]
+    lines += [
+        ";".join([f"P{i}", *map(str, row), f"{reading:.4f}"]) for i, (row, reading) in enumerate(zip(q, z, strict=True))
+    ]
+    (place / "raw.csv").write_text("\n".join(lines))
+    return place
+
+
+def said(place: Path, *command: str) -> str:
+    """Return what a command of the copy prints."""
+    script = "import sys; from rpim_opt.cli import main; sys.argv[0] = 'rpim-opt'; main()"
+    environment = {**os.environ, "PYTHONPATH": str(place)}
+    done = subprocess.run(
+        [sys.executable, "-c", script, *command],
+        cwd=place,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_from_a_raw_table_to_a_validated_robot(place: Path) -> None:
+    table = ["--robot", "robot.toml", "--data", "raw.csv", "--measurement", "height", "--hold-out", "0.25"]
+    assert "height that the gauge reads" in said(place, "new", "cell", *table)
+    assert "a dial gauge" in (place / "cell" / "problem.toml").read_text()
+    said(place, "calibrate", "cell", "--out", "out")
+    found = json.loads(said(place, "validate", "out", "cell/validation.csv", "--json"))
+    assert found["identified"]["rms_mm"] < 3 * NOISE
+    assert found["identified"]["rms_mm"] < 0.1 * found["nominal"]["rms_mm"]
