@@ -466,12 +466,6 @@ def named_sessions(names: Sequence[Any], N: int) -> np.ndarray | None:
     ------
     InputError
         For more or fewer names than rows, and two that differ in signs alone.
-
-    Examples
-    --------
-    >>> from rpim_opt.data.dataset import named_sessions
-    >>> named_sessions(["day 1", "day 2"], 2)
-    array(['day 1', 'day 2'], dtype=object)
     """
     if not len(names):
         return None

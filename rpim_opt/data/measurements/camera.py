@@ -286,12 +286,6 @@ def on_board(table: Columns, board: Board) -> Columns:
     ------
     InputError
         For a table without points, with places of its own, or with a point that no board has.
-
-    Examples
-    --------
-    >>> from rpim_opt.data.measurements.camera import grid_board, on_board
-    >>> list(on_board({"point": ["3"]}, grid_board(2, 2, 0.01)).items())[1:]
-    [('target_x_m', [0.01]), ('target_y_m', [0.01]), ('target_z_m', [0.0])]
     """
     own = [name for name in table if split_unit(name)[0] in TARGET]
     if own:
@@ -312,13 +306,7 @@ def on_board(table: Columns, board: Board) -> Columns:
 
 
 def board_of(data: Dataset) -> dict[str, Array]:
-    """Return the points that the rows of cameras name, by name.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.data.measurements.camera import board_of
-    >>> board_of(ro.load("paper_arm").problem.data)
-    {}
-    """
+    """Return the points that the rows of cameras name, by name."""
     found = {}
     for block in data.blocks:
         if not block.measurement.by_camera or block.point is None:

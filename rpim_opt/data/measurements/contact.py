@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -76,30 +75,6 @@ KNOWN = (known_distance, known_square, known_parallel)
 """What a drawing knows of things that were touched: no measurements, though they have equations."""
 UNNAMED = (revisit_plane, *KNOWN)
 """Ready types that no problem file names as its measurement."""
-
-
-class Known(Protocol):
-    """What a drawing or a certificate states of two touched things: a value [m or rad] and its standard deviation."""
-
-    @property
-    def between(self) -> tuple[str, str]:
-        """The names of the two."""
-        ...
-
-    @property
-    def measurement(self) -> Measurement:
-        """The model of its row."""
-        ...
-
-    @property
-    def value(self) -> float:
-        """What it is."""
-        ...
-
-    @property
-    def sigma(self) -> float:
-        """Its standard deviation."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -186,6 +161,10 @@ class KnownAngle:
         if self.parallel:
             return known_parallel
         return known_square
+
+
+Known = KnownDistance | KnownAngle
+"""What a drawing or a certificate states of two touched things."""
 
 
 def _require_sound(known: Known) -> None:

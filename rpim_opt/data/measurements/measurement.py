@@ -172,13 +172,7 @@ class Measurement(Brief):
 
     @property
     def by_camera(self) -> bool:
-        """Whether a row is where a camera sees a point of a board.
-
-        >>> from rpim_opt.data.measurements.camera import eye_in_hand
-        >>> from rpim_opt.data.measurements.position import position
-        >>> eye_in_hand.by_camera, position.by_camera
-        (True, False)
-        """
+        """Whether a row is where a camera sees a point of a board."""
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:
