@@ -101,8 +101,10 @@ class Monitoring:
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
-    >>> found.alarm, found.beyond, str(found).splitlines()[0]
-    (None, (), 'No drift in 40 checks.')
+    >>> found.alarm, found.beyond, found.drifts, str(found).splitlines()[0]
+    (None, (), False, 'No drift in 40 checks.')
+    >>> found.content()["checks"], found.csv().splitlines()[0]
+    (40, 'label,error_mm,sigmas,allowed_sigmas,sum')
     """
 
     label: tuple[str, ...]
@@ -131,13 +133,7 @@ class Monitoring:
 
     @property
     def drifts(self) -> bool:
-        """Whether one check, their sum, or a parameter shows drift.
-
-        >>> import rpim_opt as ro
-        >>> instance = ro.load("position")
-        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).drifts
-        False
-        """
+        """Whether one check, their sum, or a parameter shows drift."""
         return bool(self.beyond) or self.alarm is not None or self.drift is not None
 
     def content(self) -> dict[str, Any]:
@@ -167,13 +163,7 @@ class Monitoring:
         }
 
     def csv(self) -> str:
-        """Return the chart's points as CSV.
-
-        >>> import rpim_opt as ro
-        >>> instance = ro.load("position")
-        >>> ro.use.monitor(ro.calibrate(instance.problem), instance.validation).csv().splitlines()[0]
-        'label,error_mm,sigmas,allowed_sigmas,sum'
-        """
+        """Return the chart's points as CSV."""
         rows = self._rows()
         return csv_text(list(rows[0]), [[str(cell) for cell in row.values()] for row in rows])
 

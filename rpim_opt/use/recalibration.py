@@ -89,8 +89,8 @@ class Update:
     >>> problem = ro.load("position").problem
     >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
     >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
-    >>> found.changed, found.explained, found.causes[0].p_value > 1e-4
-    (False, True, True)
+    >>> found.changed, found.explained, found.causes[0].p_value > 1e-4, found.content()["readings"]
+    (False, True, True, 8)
     """
 
     result: Calibration
@@ -112,16 +112,7 @@ class Update:
         return self.after.likely
 
     def content(self) -> dict[str, Any]:
-        """Return the figures [mm, deg], all causes, and the earlier calibrations.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
-        >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40))).content()
-        >>> found["changed"], found["readings"], found["earlier"][0]["rows"]
-        (False, 8, 32)
-        """
+        """Return the figures [mm, deg], all causes, and the earlier calibrations."""
         return {
             "changed": self.changed,
             "explained": self.explained,

@@ -1,4 +1,4 @@
-"""A saved calibration on measurements that it has never seen."""
+"""Validation of a calibration on new measurements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
-from rpim_opt.basics.text import table
+from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.held_out_rows import judged
@@ -114,35 +114,30 @@ class Validation:
             "mistake": self.mistake,
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
-        }  # fmt: skip
+        }
 
     def csv(self) -> str:
         """Return the rows as CSV."""
-        cells = {k: [c if isinstance(c, str) else f"{c:.6f}" if np.isfinite(c) else "" for c in column]
-                 for k, column in self._rows().items()}  # fmt: skip
-        return csv_text(cells, zip(*cells.values(), strict=True))
+        rows = self._rows()
+        cells = [[c if isinstance(c, str) else f"{c:.6f}" if np.isfinite(c) else "" for c in v] for v in rows.values()]
+        return csv_text(rows, zip(*cells, strict=True))
 
     def __str__(self) -> str:
         """Return the errors as a table, and the rows beyond their uncertainty by name."""
-        found = self.content()
-        sets = {"nominal": found["nominal"], "identified": found["identified"]}
-        for axis, figures in found["axes"].items():
-            sets[f"  {axis}, mean signed"] = {**figures, "mean_mm": figures["bias_mm"]}
-        rows = [[name, str(s["count"]), *(f"{s[k]:.4f}" for k in ("mean_mm", "rms_mm", "max_mm"))]
-                for name, s in sets.items()]  # fmt: skip
-        turn = found["orientation"]
-        if turn["count"]:
-            figures = [f"{turn[k]:.4f}" for k in ("mean_mrad", "rms_mrad", "max_mrad")]
-            rows.append(["orientation, identified [mrad]", str(turn["count"]), *figures])
+        content = self.content()
+        figures = {"nominal": content["nominal"], "identified": content["identified"]}
+        for axis, of_axis in content["axes"].items():
+            figures[f"  {axis}, mean signed"] = {**of_axis, "mean_mm": of_axis["bias_mm"]}
+        rows = [_row(name, each, "mm") for name, each in figures.items()]
+        if content["orientation"]["count"]:
+            rows.append(_row("orientation, identified [mrad]", content["orientation"], "mrad"))
         tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
         if self.touched:
             tables.append(table(HEADER, scatter_rows(self.touched)))
-        said = [self._judgement(), *self.outside.sentences(), *self.remarks]
-        if self.mistake:
-            said.append(self.mistake)
-        return "\n".join([*tables, *said])
+        sentences = [self._verdict(), *self.outside.sentences(), *self.remarks, self.mistake]
+        return "\n".join([*tables, *filter(None, sentences)])
 
-    def _judgement(self) -> str:
+    def _verdict(self) -> str:
         if not np.isfinite(self.sigmas).any():
             return "The calibration has no covariance for these rows: how large errors may be is not known."
         covered = ""
@@ -150,19 +145,19 @@ class Validation:
             covered = f" {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals of a reading."
         if not self.beyond:
             return f"No row is beyond what the prediction's uncertainty allows.{covered}"
-        named = ", ".join(
-            f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond[:8]
-        )
-        more = f" and {len(self.beyond) - 8} more" if len(self.beyond) > 8 else ""
-        return f"Beyond what the prediction's uncertainty allows: {named}{more}.{covered}"
+        named = [f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
+        return f"Beyond what the prediction's uncertainty allows: {listed(named)}.{covered}"
 
     def _rows(self) -> dict[str, Sequence[Any]]:
-        mm = {f"{axis}_mm": (1e3 * v).tolist() for axis, v in zip("xyz", self.vectors.T, strict=True)}
-        return {
-            "label": self.label, "nominal_mm": (1e3 * self.nominal).tolist(), "error_mm": (1e3 * self.error).tolist(),
-            **mm, "orientation_mrad": (1e3 * self.angle).tolist(), "sigmas": self.sigmas.tolist(),
-            "allowed_sigmas": self.allowed.tolist(),
-        }  # fmt: skip
+        lengths = {"nominal_mm": self.nominal, "error_mm": self.error}
+        lengths |= {f"{axis}_mm": values for axis, values in zip("xyz", self.vectors.T, strict=True)}
+        columns = {name: 1e3 * values for name, values in (lengths | {"orientation_mrad": self.angle}).items()}
+        columns |= {"sigmas": self.sigmas, "allowed_sigmas": self.allowed}
+        return {"label": self.label, **{name: values.tolist() for name, values in columns.items()}}
+
+
+def _row(name: str, figures: Mapping[str, Any], unit: str) -> list[str]:
+    return [name, str(figures["count"]), *(f"{figures[f'{key}_{unit}']:.4f}" for key in ("mean", "rms", "max"))]
 
 
 def validate(result: Calibration, data: Dataset) -> Validation:
@@ -187,14 +182,13 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     nominal = result.nominal_errors(data)
     error = result.errors(data)
     touched = scatter(data, nominal, error)
-    remarks: list[str] = []
-    if touched:
-        remarks = [*contact_remarks(problem), *known_points(problem, data)]
-    return Validation(
-        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"),
-        *judged(result, data), result.outside(data), touched, tuple(remarks),
-        misread(result, data),
-    )  # fmt: skip
+    remarks = (*contact_remarks(problem), *known_points(problem, data)) if touched else ()
+    angle = result.errors(data, "angle")
+    mistake = misread(result, data)
+    outside = result.outside(data)
+    vectors = result.error_vectors(data)
+    judgement = judged(result, data)
+    return Validation(data.label, nominal, error, vectors, angle, *judgement, outside, touched, remarks, mistake)
 
 
 def read_measurements(
