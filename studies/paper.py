@@ -18,7 +18,7 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.baselines import gauss_newton, gradient_descent, linear_least_squares
-from rpim_opt.convex.selection import weight_grid
+from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.problem_file import problems_folder
 from rpim_opt.study import Metric, Report

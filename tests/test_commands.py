@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 import cvxpy as cp
 import numpy as np
 import pytest
+from rpim_opt.convex.interior import Found
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
-from rpim_opt.convex.interior import Found
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.naming import rename

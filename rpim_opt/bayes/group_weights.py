@@ -17,10 +17,10 @@ from rpim_opt.basics.patterns import fits
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.program import pose
 from rpim_opt.convex.quadratic import ridge
-from rpim_opt.convex.select_curve import l_curve
-from rpim_opt.convex.select_held_out import k_fold
-from rpim_opt.convex.select_scores import reml
-from rpim_opt.convex.selection import Selection, grid_of
+from rpim_opt.convex.rules.curve import l_curve
+from rpim_opt.convex.rules.folds import k_fold
+from rpim_opt.convex.rules.scores import reml
+from rpim_opt.convex.rules.selection import Selection, grid_of
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.robot.parameter_names import own_name
 from rpim_opt.robot.parameters import Parameters

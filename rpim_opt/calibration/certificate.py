@@ -8,9 +8,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import NoSolutionFound
-from rpim_opt.convex.feasible import room
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.program import Program, pose
+from rpim_opt.convex.program import Program, feasibility_tolerance, pose
 from rpim_opt.problem.linear import LinearModel
 
 DECREASE = 1e-6
@@ -45,7 +44,7 @@ class Certificate(NamedTuple):
 
     def holds(self, z: Array) -> bool:
         """Whether this is a solution z (n,), to the accuracy of an interior point."""
-        return self.decrease is not None and self.decrease <= DECREASE and self.violation <= room(z)
+        return self.decrease is not None and self.decrease <= DECREASE and self.violation <= feasibility_tolerance(z)
 
 
 def certified(
@@ -69,7 +68,7 @@ def certified(
     violation = program.violation(z)
     gradient = _gradient(program, slope, z, weight)
     try:
-        best = program.inside(program.proven(weight).z, z, weight)
+        best = program.inside(program.solve(weight).z, z, weight)
     except NoSolutionFound:
         return Certificate(gradient, float("inf"), violation, None)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))

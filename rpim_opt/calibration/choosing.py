@@ -10,9 +10,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
+from rpim_opt.convex.rules.scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
+from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
 from rpim_opt.convex.select import Selection, Selector
-from rpim_opt.convex.select_scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
-from rpim_opt.convex.selection import SAME_WEIGHT, require_weight
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this part of the solution, then stays."""
@@ -68,7 +68,7 @@ class Choosing:
 
         At nominal its answer would be about another linear model, and about blunders that no fit has shown yet.
         """
-        if self.settled or self.rule in QUICK or program.separated is None:
+        if self.settled or self.rule in QUICK or not program.separable:
             return self
         return replace(self, weight=NEUTRAL, settled=True)
 

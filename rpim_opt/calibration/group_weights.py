@@ -18,7 +18,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.weighed import calibrated
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import pose
-from rpim_opt.convex.selection import Selection
+from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.source import Source

@@ -18,8 +18,7 @@ from rpim_opt.calibration.choosing import Choosing, choosing
 from rpim_opt.calibration.outcome import Iteration
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.majorize import Squares, on_triangles
-from rpim_opt.convex.objective import Damping
-from rpim_opt.convex.program import Program, pose
+from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
 from rpim_opt.convex.trust import trusted_parts
 from rpim_opt.problem.identified import around
@@ -201,10 +200,7 @@ class Loop:
         """Return the minimum (n,) of a convex program, damped as the state says."""
         weight = state.choice.weight
         with phase("solve"):
-            if state.choice.waiting and state.damping == 0 and not any(self.solver.values()):
-                estimate = program.path([weight], rough=True)[0]  # a rule is asked beside it
-            else:
-                estimate = program.solve(weight, damping=_term(state), **self.solver)
+            estimate = program.solve(weight, damping=_term(state), **self.solver)
         return program.inside(estimate.z, state.z, weight)
 
     def _bent(self, state: State, straight: Array) -> Array:

@@ -77,7 +77,7 @@ def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated
         if isinstance(function, Box):
             units.append(_bounds(function, posed, z))
             continue
-        demands = [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+        demands = [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
         if isinstance(function, Drawn):
             units.append([Stated(function.name, tuple(demands))])
             continue
@@ -136,7 +136,7 @@ def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
     hard: list[Any] = []
     for k, function in enumerate(posed.formulation.constraints):
         if not isinstance(function, Box):
-            hard += [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+            hard += [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
             continue
         lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(posed.parameters))
         room = slack if loosen_boxes else 0.0
@@ -161,7 +161,7 @@ def _of_drawings(posed: Posed) -> dict[str, float]:
             place = drawn.index(function)
             demands += function.loosened(z, posed.parameters, units[place] * slack[place])
         else:
-            demands += [constraint.tree_copy({id(posed.z): z}) for constraint in posed.constraints[k]]
+            demands += [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
     least = _least_sum(slack, demands)
     return {function.name: float(unit * s) for function, unit, s in zip(drawn, units, least, strict=True) if s > 1e-6}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,13 +15,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.asked import Asked, ask, norms
 from rpim_opt.convex.atoms import NORM2, SQUARES, cp
-from rpim_opt.convex.conic import ATTEMPTS, Conic, Solution
+from rpim_opt.convex.canonical import Canonical
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
-from rpim_opt.convex.kinks import kinks
-from rpim_opt.convex.largest import Largest, of_equations, of_norms
-from rpim_opt.convex.separated import Separated
-from rpim_opt.convex.split import Split, split
+from rpim_opt.convex.solvers.solve import Loss
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
 from rpim_opt.convex.terms import Frozen, Term, apart, scalar, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
@@ -29,8 +27,6 @@ from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (SQUARES, NORM2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its triangular factor."""
-TINY = 1e-150
-"""Norms below have no direction."""
 FEW = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
@@ -64,15 +60,15 @@ def declared(formulation: Formulation) -> bool:
 class Posed:
     """Loss, penalty and constraints of a formulation as CVXPY expressions of a residual r and of z.
 
+    A formulation whose functions declare what they are (`declared`) is asked when an expression of it is first needed:
+    what a formula or an active set solves, it solves without CVXPY.
+
     Parameters
     ----------
     formulation
         Whose functions are asked, once.
     shape
         Of the data.
-
-    A formulation whose functions declare what they are (`declared`) is asked when an expression of it is first needed:
-    what a formula solves, it solves without CVXPY.
     """
 
     def __init__(self, formulation: Formulation, shape: Shape):
@@ -84,12 +80,11 @@ class Posed:
         self._lock = threading.RLock()
         self._answers: Asked | None = None
         self._known = declared(formulation)
-        self.speeds: dict[int, Array] = {}  # of constraints whose gradient is the same everywhere, by their id
+        self.constrained = bool(formulation.constraints) or self.limited
         if self._known:
             self.box  # noqa: B018 - limits that do not fit the parameters are refused now
         else:  # what a user's functions say may be another thing later
             self.asked  # noqa: B018
-        self.constrained = bool(formulation.constraints) or self.limited
 
     @cached_property
     def asked(self) -> Asked:
@@ -99,45 +94,25 @@ class Posed:
                 self._answers = ask(self.formulation, self.parameters, self.equations, self.groups)
         return self._answers
 
-    @cached_property
-    def z(self) -> cp.Variable:
-        """The variable (n,) of penalty and constraints."""
-        return self.asked.z
-
-    @cached_property
-    def r(self) -> cp.Variable:
-        """The variable (m,) of the loss."""
-        return self.asked.r
-
-    @cached_property
-    def loss(self) -> Any:
-        """The loss, an expression of r."""
-        return self.asked.loss
-
-    @cached_property
-    def penalty(self) -> Any:
-        """The penalty, an expression of z; None where there is none."""
-        return self.asked.penalty
+    @property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return not self._known and self.asked.predicts
 
     @cached_property
     def constraints(self) -> list[list[Any]]:
         """The constraints of z, one list for every function."""
         return self.asked.constraints
 
-    @cached_property
-    def own(self) -> list[cp.Variable]:
-        """Variables that the functions brought along."""
-        return self.asked.own
-
-    @cached_property
-    def predicts(self) -> bool:
-        """Whether constraints asked for positions, which are linear about some point."""
-        return not self._known and self.asked.predicts
-
-    @cached_property
-    def live(self) -> tuple[Any, Any, list[list[Any]]]:
-        """Loss, penalty and constraints with the user's own parameters, and no copies of them."""
-        return self.asked.live
+    def on_squares(self) -> Posed:
+        """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
+        made = copy.copy(self)
+        for name in ("loss_form", "_quadratic_of_r", "loss", "joint", "inner", "order", "sizes"):
+            vars(made).pop(name, None)
+        formulation = replace(self.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
+        made.formulation, made.equations, made.limited = formulation, self.n + 1, False
+        made.constrained = bool(formulation.constraints)
+        return made
 
     # --- structure ---------------------------------------------------------------------------------------------
 
@@ -146,55 +121,19 @@ class Posed:
         """The quadratic of r that the loss is."""
         if self.limited:
             return None
-        form = self._form(self.formulation.loss, self._sees, "loss_term")
-        if form is None or self.formulation.loss_over == "equation":
+        return self._quadratic_of_r
+
+    @cached_property
+    def _quadratic_of_r(self) -> Quadratic | None:
+        over_equations = self.formulation.loss_over == "equation"
+        size = self.equations if over_equations else len(np.unique(self.groups))
+        form = self._form(self.formulation.loss, size, "loss_term")
+        if form is None or over_equations:
             return form
         if not form.diagonal or form.c.any():
             return None
         which = np.unique(self.groups, return_inverse=True)[1]
         return Quadratic(form.L[which], np.zeros(len(which)), form.constant)  # p_k v_k^2 = p_k |r_k|^2
-
-    @cached_property
-    def separated(self) -> Separated | None:
-        """The sum over equations or configurations, in their `order`, that the loss is; None for other losses."""
-        if self.limited or self.inner or self.loss_form is not None:
-            return None
-        from rpim_opt.convex.tree import rows_of  # CVXPY's tree is read where a loss is none of the squares
-
-        rows = rows_of(self.asked.loss_term.expression, self.asked.loss_term.variable)
-        if rows is None:
-            return None
-        starts = None
-        if self.formulation.loss_over == "configuration":
-            starts = np.flatnonzero(np.diff(self.groups[self.order], prepend=-1))
-        made = Separated(rows, starts, len(self.groups))
-        if made.count == self.r.size and made.holds:
-            return made
-        return None
-
-    @cached_property
-    def worst(self) -> Largest | None:
-        """The largest of equations or configurations, in their `order`, that the loss is; None for other losses."""
-        if self.limited or self.inner or self.loss_form is not None:
-            return None
-        if len(self.groups) != self.r.size:
-            return None
-        from rpim_opt.convex.tree import largest_of  # as above
-
-        term = self.asked.loss_term
-        found = largest_of(term.expression, term.variable)
-        if found is None:
-            return None
-        if self.formulation.loss_over == "equation":
-            return of_equations(found, len(self.groups))
-        return of_norms(found, np.flatnonzero(np.diff(self.groups[self.order], prepend=-1)), len(self.groups))
-
-    @cached_property
-    def order(self) -> np.ndarray:
-        """(m,) equations in the order of their configurations; as they are, where the loss knows each by its place."""
-        if self.formulation.loss_over == "equation":
-            return np.arange(len(self.groups))
-        return np.argsort(self.groups, kind="stable")
 
     @cached_property
     def penalty_form(self) -> Quadratic | None:
@@ -210,32 +149,14 @@ class Posed:
         L = np.vstack([root * D for root, D in zip(form.L, differences, strict=True)])
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
-    @cached_property
-    def split(self) -> Split | None:
-        """The unknowns in which the penalty is a sum of absolute values and norms; None where there are none such."""
-        if self.penalty_form is not None or self.box is None or self.inner or self.penalty is None:
-            return None
-        z = cp.Variable(self.n)
-        found = kinks(self.penalty.tree_copy({id(self.z): z}), z)
-        if found is None:
-            return None
-        return split(found)
-
-    @property
-    def _sees(self) -> int:
-        """Of how many numbers the loss is a function."""
-        if self.formulation.loss_over == "equation":
-            return self.equations
-        return len(np.unique(self.groups))
-
     def _form(self, function: Any, size: int, of: str) -> Quadratic | None:
         """Return the quadratic that loss or penalty is of so many numbers."""
         if function == SQUARES:  # declared; a test holds it against the canonicalization
             return identity(size)
         if isinstance(function, Ready) and function.quadratic is not None:  # so does one against this
             return function.quadratic
-        term: Term = getattr(self.asked, of)
-        return quadratic(term.expression, term.variable)
+        stated: Term = getattr(self.asked, of)
+        return quadratic(stated.expression, stated.variable)
 
     @cached_property
     def limits(self) -> list[tuple[Array, Array]]:
@@ -255,21 +176,115 @@ class Posed:
             return None
         return lower, upper
 
-    # --- values ------------------------------------------------------------------------------------------------
+    @cached_property
+    def canonical(self) -> Canonical:
+        """Penalty and constraints of z in canonical form."""
+        squares = self.formulation.penalty is None or self.penalty_form is not None
+        if squares and all(isinstance(constraint, Box) for constraint in self.formulation.constraints):
+            return Canonical.box(self.n, self.penalty_form, self.limits)
+        penalty = self.asked.penalty if self.asked.penalty is not None else cp.Constant(0.0)
+        with self._lock:
+            return Canonical(penalty, self._flat, self.asked.z)
 
-    def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
-        """Return loss and penalty at numbers; variables of the functions' own are at their best."""
-        if self.inner:
-            return self._best(z, r, weight)
-        return self.loss_of(r), self.penalty_of(z)
+    @property
+    def _flat(self) -> list[Any]:
+        return [constraint for group in self.constraints for constraint in group]
 
     @cached_property
-    def inner(self) -> list[cp.Variable]:
+    def loss(self) -> Loss | None:
+        """What the solver is told of a loss that is no square, or limited by ``largest``."""
+        if self.loss_form is not None:
+            return None
+        asked, over_norms = self.asked, self.formulation.loss_over == "configuration"
+        with self._lock:
+            if not self.limited:
+                return Loss(asked.loss_term.expression, asked.loss_term.variable, (), over_norms)
+            expression = asked.loss
+            if self._quadratic_of_r is not None:
+                expression = cp.Constant(0.0)  # its squares are reduced
+            return Loss(expression, asked.r, (self.limit_of_norms,), False)
+
+    @cached_property
+    def order(self) -> np.ndarray | None:
+        """(m,) sorts equations by configurations; None where they stay as they are."""
+        if self.limited or self.formulation.loss_over == "equation":
+            return None
+        order = np.argsort(self.groups, kind="stable")
+        return order if (np.diff(order) != 1).any() else None
+
+    @cached_property
+    def sizes(self) -> np.ndarray | None:
+        """(N,) equations of every configuration, where the loss gets norms."""
+        if self.limited or self.formulation.loss_over == "equation":
+            return None
+        return np.unique(self.groups, return_counts=True)[1]
+
+    # --- values ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def inner(self) -> list[Any]:
         """Variables of the functions' own in loss or penalty: a value is a minimum over them."""
         if self._known:
             return []
-        ids = {v.id for term in (self.loss, self.penalty) if term is not None for v in term.variables()}
-        return [variable for variable in self.own if variable.id in ids]
+        ids = {v.id for term in (self.asked.loss, self.asked.penalty) if term is not None for v in term.variables()}
+        return [variable for variable in self.asked.own if variable.id in ids]
+
+    @cached_property
+    def joint(self) -> bool:
+        """Whether the loss shares variables with penalty or constraints: then they are one program."""
+        if self._known or not self.asked.own:
+            return False
+        own = {variable.id for variable in self.asked.own}
+        of_loss = own & {v.id for v in self.asked.loss.variables()}
+        others = [*self._flat, *([] if self.asked.penalty is None else [self.asked.penalty])]
+        return bool(of_loss & {v.id for each in others for v in each.variables()})
+
+    def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
+        """Return loss and penalty at numbers; variables of the functions' own are at their best."""
+        if not self.inner:
+            return self.loss_of(r), self.penalty_of(z)
+        with self._lock:
+            if self.joint:
+                return self._together(z, r, weight)
+            own = {variable.id for variable in self.inner}
+            loss = penalty = 0.0
+            if own & {v.id for v in self.asked.loss.variables()}:
+                loss = self._fixed_loss.at_best(self.seen(r))[0]
+            else:
+                loss = self.loss_of(r)
+            if self.asked.penalty is None:
+                return loss, 0.0
+            if own & {v.id for v in self.asked.penalty.variables()}:
+                penalty = self._fixed_penalty.at_best(z)[0]
+            else:
+                penalty = self.penalty_of(z)
+        return loss, penalty
+
+    @cached_property
+    def _fixed_loss(self) -> Canonical:
+        return Canonical(self.asked.loss_term.expression, [], self.asked.loss_term.variable)
+
+    @cached_property
+    def _fixed_penalty(self) -> Canonical:
+        own = {variable.id for variable in self.asked.own}
+        tied = [c for c in self._flat if own & {v.id for v in c.variables()}]
+        return Canonical(self.asked.penalty, tied, self.asked.z)
+
+    def _together(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
+        """Minimize loss + weight penalty over variables that both share, z and r given."""
+        asked = self.asked
+        own = {variable.id for variable in asked.own}
+        tied = [c for c in self._flat if own & {v.id for v in c.variables()}]
+        total = asked.loss if asked.penalty is None else asked.loss + weight * asked.penalty
+        instead = {id(asked.z): cp.Constant(z), id(asked.r): cp.Constant(r)}
+        problem = cp.Problem(cp.Minimize(total.tree_copy(instead)), [c.tree_copy(instead) for c in tied])
+        for variable in problem.variables():
+            variable.save_value(None)
+        problem.solve(solver=cp.CLARABEL)
+        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+            return float("inf"), 0.0
+        penalty = 0.0 if asked.penalty is None else float(asked.penalty.tree_copy(instead).value)
+        return float(asked.loss.tree_copy(instead).value), penalty
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
@@ -310,24 +325,26 @@ class Posed:
         if self.formulation.loss == SQUARES:  # of the residual or of its configurations' norms
             return 2 * r
         seen = self.seen(r)
-        slope = self.slope_seen(seen)
+        slope = self.asked.loss_term.slope(seen)
         if slope is None or self.formulation.loss_over == "equation":
             return slope
-        return (slope / np.maximum(seen, TINY))[self.groups] * r
+        return (slope / np.maximum(seen, 1e-150))[self.groups] * r
 
-    def slope_seen(self, seen: Array) -> Array | None:
-        """Return the gradient of the loss by what it gets, residuals or norms; None where CVXPY knows none."""
-        return self.asked.loss_term.slope(seen)
-
-    def loss_of_norms(self, v: Array) -> float:
-        """Return a loss of the configurations' norms (N,)."""
-        return self.asked.loss_term(v)
-
-    def row_slopes(self, v: Array) -> Array | None:
-        """Return the gradient of the loss by what it gets: residuals (m,) or configurations' norms (N,)."""
-        if self.inner or self.asked.loss_term.variable.size != len(v):
+    def penalty_slope(self, z: Array) -> Array | None:
+        """Return the gradient (n,) of the penalty by z; None where CVXPY knows none."""
+        if self.inner or self.formulation.penalty is None:
             return None
-        return self.asked.loss_term.slope(v)
+        if self.formulation.penalty == SQUARES and self.formulation.penalty_over is None:
+            return 2 * z
+        if self._declared is not None:
+            return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
+        return self._penalty_of_z.slope(z)
+
+    @cached_property
+    def _penalty_of_z(self) -> Term:
+        return apart(self.asked.penalty, self.asked.z)
+
+    # --- what a robust loss trusts -----------------------------------------------------------------------------
 
     def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
@@ -348,98 +365,25 @@ class Posed:
             return None
         return slope[: len(v)]
 
-    def penalty_slope(self, z: Array) -> Array | None:
-        """Return the gradient (n,) of the penalty by z; None where CVXPY knows none."""
-        if self.inner or self.formulation.penalty is None:
-            return None
-        if self.formulation.penalty == SQUARES and self.formulation.penalty_over is None:
-            return 2 * z
-        if self._declared is not None:
-            return 2 * self._declared.matrix.T @ (self._declared.times(z) - self._declared.c)
-        return self._penalty_of_z.slope(z)
-
     @cached_property
-    def _penalty_of_z(self) -> Term:
-        return apart(self.penalty, self.z)
-
-    def _best(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
-        """Minimize over the functions' own variables, z and r given."""
-        given = np.concatenate([z, r])
-        found = self._inner_solution(given, weight)
-        if found is None:
-            return float("inf"), 0.0
-        with self._lock:
-            for variable in self.own:
-                variable.save_value(self._inner_program.values(found, variable))
-            self.z.save_value(z)
-            self.r.save_value(r)
-            loss = float(self.loss.value)
-            penalty = 0.0
-            if self.penalty is not None:
-                penalty = float(self.penalty.value)
-        return loss, penalty
-
-    def _inner_solution(self, given: Array, weight: float) -> Solution | None:
-        """Return the functions' own variables at their best, z and r given; None where nothing solves for them."""
-        nothing = np.zeros((len(given), 0))
-        for attempt in range(len(ATTEMPTS)):  # with all data given, one factorization in three stalls
-            found = self._inner_program.solve(nothing, given, weight, np.empty((0, 0)), np.empty(0), attempt=attempt)
-            if found.status == cp.OPTIMAL:
-                return found
-        return None
-
-    @cached_property
-    def _inner_program(self) -> Conic:
-        own = {variable.id for variable in self.own}
-        tied = [c for group in self.constraints for c in group if own & {v.id for v in c.variables()}]
-        objective, weight = self._objective(self.loss, self.penalty)
-        return Conic(objective, tied, [self.z, self.r], weight)
-
-    # --- programs ----------------------------------------------------------------------------------------------
-
-    def conic(self, loss_apart: bool, penalty_apart: bool) -> Conic:
-        """Return the program in (z, r); a loss or penalty ``apart`` is left out, a quadratic that is added later."""
-        key = (loss_apart, penalty_apart)
-        if key not in self._conics:
-            self._conics[key] = self._made(*key)
-        return self._conics[key]
-
-    @cached_property
-    def _conics(self) -> dict[tuple[bool, bool], Conic]:
-        return {}
-
-    def _made(self, loss_apart: bool, penalty_apart: bool) -> Conic:
-        loss = cp.Constant(0.0) * cp.sum(self.z) if loss_apart else self.loss
-        penalty = None if penalty_apart else self.penalty
-        objective, weight = self._objective(loss, penalty)
-        return Conic(objective, self.all_constraints, [self.z, self.r], weight)
-
-    def _objective(
-        self, loss: cp.Expression, penalty: cp.Expression | None
-    ) -> tuple[cp.Expression, cp.Parameter | None]:
-        if penalty is None:
-            return loss, None
-        weight = cp.Parameter(nonneg=True)
-        return loss + weight * penalty, weight
-
-    @cached_property
-    def projection(self) -> Conic:
-        """The constraints of z alone, with nothing to minimize yet: the distance from a point is added to it."""
-        every = [constraint for group in self.constraints for constraint in group]
-        return Conic(cp.Constant(0.0) * cp.sum(self.z), every, [self.z, self.r], None)
-
-    @cached_property
-    def all_constraints(self) -> list[Any]:
-        """The constraints of z, and of r where ``largest`` bounds it."""
-        every = [constraint for group in self.constraints for constraint in group]
-        if self.limited:
-            every.append(self.largest)
-        return every
-
-    @cached_property
-    def largest(self) -> Any:
+    def limit_of_norms(self) -> Any:
         """The bound of the configurations' norms."""
-        return norms(self.r, self.groups) <= self.formulation.largest
+        return norms(self.asked.r, self.groups) <= self.formulation.largest
+
+    # --- feasibility -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def distance(self) -> Canonical:
+        """The largest change of p (n,) that brings it to the constraints of z, as a function of p."""
+        z, p = self.asked.z, cp.Variable(self.n)
+        with self._lock:
+            return Canonical(cp.norm_inf(z - p), self._flat, p)
+
+    @cached_property
+    def constraints_alone(self) -> Canonical:
+        """The constraints of z, with nothing to minimize."""
+        with self._lock:
+            return Canonical(cp.Constant(0.0), self._flat, self.asked.z)
 
 
 def posed(formulation: Formulation, model: LinearModel) -> Posed:
@@ -527,9 +471,13 @@ class Unposed(Posed):
         self.n = model.A.shape[1]
         self.groups = model.members[0]
         self.equations = len(model.b)
-        self.limited, self.constrained, self.predicts = False, True, False
-        self.constraints, self.own = [], []
-        self.loss_form, self.penalty_form, self.box, self.split = loss_form, penalty_form, None, None
-        self._known = False
-        self.live: Any = lost(formulation.name)
-        self.loss = self.penalty = self.values = self.trusted = self.conic = lost(formulation.name)
+        self.limited, self.constrained = False, True
+        self.constraints = []
+        self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
+        self._known = True
+        self.values = self.trusted = lost(formulation.name)
+
+    @property
+    def asked(self) -> Asked:
+        """Raises InputError."""
+        return lost(self.formulation.name)()

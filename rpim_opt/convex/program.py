@@ -1,32 +1,51 @@
-"""The convex program of one linearization: what it is as a CVXPY problem, and its solutions at any weight."""
+"""The convex program of one linearization: what it is as a CVXPY problem, its values, and its solutions at any weight."""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.phases import phase
 from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.atoms import OPTIMAL, cp
-from rpim_opt.convex.closed import Bounds, minimum, minimum_between, moved, path_between, shares, values
+from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.formulation import Formulation, formulation_of
-from rpim_opt.convex.gap import duality_gap
-from rpim_opt.convex.interior import Found, interior
-from rpim_opt.convex.kinked import minimum_on_faces
-from rpim_opt.convex.met import Met
-from rpim_opt.convex.objective import Damping, Objective
-from rpim_opt.convex.posed import Unposed, posed
-from rpim_opt.convex.written import by_solver, parametrized
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.convex.posed import Posed, Unposed, posed
+from rpim_opt.convex.quadratic import Ridge, ridge
+from rpim_opt.convex.solvers.newton import Rows
+from rpim_opt.convex.solvers.small import Small, Squares, Unsolved
+from rpim_opt.convex.solvers.solve import Minimum, Warm, minimum
+from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.trust import Trusted, kept_equations, outlying
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
-PROVEN = 1e-9
-"""Duality gap, relative to the objective, that proves a minimum."""
+FEASIBLE = 1e-7
+"""By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
+DIFFERENCE = 1e-5
+"""Change of a solution, in scales, over which it is differentiated."""
+TOUCHING = 1e-9
+"""Distance from a bound, in scales, at which a component counts as lying on it."""
+
+
+def feasibility_tolerance(z: Array) -> float:
+    """Return by how many scales z (n,) may miss its constraints."""
+    return FEASIBLE * max(1.0, float(np.max(np.abs(z), initial=0.0)))
+
+
+class Damping(NamedTuple):
+    """|size (z - centre)|^2, added to the objective: the term of Levenberg and Marquardt. Both (n,)."""
+
+    centre: Array
+    size: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,7 +100,7 @@ class Estimate(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Program(Objective):
+class Program(Brief):
     """A formulation applied to a linear model, ready to be solved at any weight.
 
     Parameters
@@ -109,14 +128,20 @@ class Program(Objective):
     (97, 100)
     """
 
-    _met: Met = field(default_factory=Met, repr=False)  # shared with all programs that `on` makes of this one
+    formulation: Formulation
+    model: LinearModel
+    _posed: Posed
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False)  # shared with all programs that `on` makes of this
 
     def __reduce__(self) -> Any:
         return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
 
+    def _short(self) -> str:
+        return f"'{self.formulation.name}' on {self.model._short()}"
+
     def on(self, model: LinearModel) -> Program:
         """Return the program for another model of the same shape, without asking the functions anew."""
-        return Program(self.formulation, model, self._posed, self._met)
+        return Program(self.formulation, model, self._posed, self._kept)
 
     def without(self, out: np.ndarray) -> Program:
         """Return the program without some equations, ``out`` (m,), which become rows of zeros.
@@ -129,10 +154,325 @@ class Program(Objective):
         >>> some.solve(1.0).loss < program.solve(1.0).loss
         True
         """
-        left = replace(self, model=self.model.scaled(np.where(out, 0.0, 1.0)), _met=Met(self._met))
-        if self.separated is not None or self.worst is not None:  # unknowns that whiten all whiten most
-            vars(left)["coordinates"] = self.coordinates.of(~out[self.order])
-        return left
+        return self.apart(self.model.scaled(np.where(out, 0.0, 1.0)))
+
+    def apart(self, model: LinearModel) -> Program:
+        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
+        return replace(self, model=model, _kept={"warm": self._warm.begun(self._warm.z)})
+
+    def on_squares(self, model: LinearModel) -> Program:
+        """Return the same penalty and constraints with the squares of other equations as the loss."""
+        if "squares" not in self._kept:
+            posed = self._posed.on_squares()
+            self._kept["squares"] = posed, {"warm": Warm(posed.canonical)}
+        posed, kept = self._kept["squares"]
+        return Program(posed.formulation, model, posed, kept)
+
+    # --- structure -----------------------------------------------------------------------------------------------
+
+    @property
+    def loss_form(self) -> Quadratic | None:
+        """The quadratic of the residual that the loss is; None where it is something else."""
+        return self._posed.loss_form
+
+    @property
+    def penalty_form(self) -> Quadratic | None:
+        """The quadratic |L z - c|^2 that the penalty is; None where it is something else, or there is none."""
+        return self._posed.penalty_form
+
+    @property
+    def linear_penalty(self) -> bool:
+        """Whether the penalty is quadratic, or there is none: the estimate is then linear in the data."""
+        return self.formulation.penalty is None or self.penalty_form is not None
+
+    @property
+    def quadratic(self) -> bool:
+        """Whether loss and penalty are quadratics, without ``largest``."""
+        return self.loss_form is not None and self.linear_penalty
+
+    @property
+    def separable(self) -> bool:
+        """Whether the loss is a sum over equations or configurations, but no square."""
+        return self._posed.loss is not None and self._posed.loss.summands is not None
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are constraints, or ``largest`` is one."""
+        return self._posed.constrained
+
+    @property
+    def predicts(self) -> bool:
+        """Whether constraints asked for positions, which are linear about some point."""
+        return self._posed.predicts
+
+    @property
+    def inner(self) -> bool:
+        """Whether loss or penalty have variables of their own."""
+        return bool(self._posed.inner)
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
+        >>> for stated in (ro.tikhonov, ro.bounded, ro.lasso, ro.robust):
+        ...     p = ro.convex.pose(stated, model)
+        ...     print(f"{stated.name:17}", p.closed_form, p.quadratic, p.linear_penalty, p.constrained)
+        Tikhonov          True True True False
+        bounded Tikhonov  False True True True
+        lasso             False False False False
+        Huber             False False True False
+        >>> lower, upper = ro.convex.pose(ro.bounded, model).box
+        >>> float(upper.max())  # in units of the scales
+        10.0
+        """
+        return self.quadratic and not self.constrained
+
+    @property
+    def box(self) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (n,) of z, infinite where there is none; None where a constraint is no `Box`."""
+        return self._posed.box
+
+    @cached_property
+    def squared(self) -> LinearModel:
+        """The equations whose squares a quadratic loss sums: |L (A z - b) - c|^2.
+
+        Raises
+        ------
+        InputError
+            For another loss.
+        """
+        form = self.loss_form
+        if form is None:
+            raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
+        return _squared(self.model, form)
+
+    @property
+    def squared_rows(self) -> bool:
+        """Whether the loss is the sum of the equations' squares."""
+        return self.loss_form is not None and self.squared is self.model
+
+    @property
+    def on_triangles(self) -> bool:
+        """Whether triangles of some of the equations, instead of these, give this program of them."""
+        return self._posed.equations == self.model.A.shape[1] + 1 and self.squared_rows
+
+    @cached_property
+    def ridge(self) -> Ridge:
+        """The closed form of a program with quadratic loss and penalty, its constraints left out.
+
+        >>> import cvxpy as cp
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> mine = ro.Formulation("about one", penalty=lambda z: cp.sum_squares(2 * (z - 1)))
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(mine, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> program.penalty_form.value(np.zeros(34)), program.loss_form.diagonal, program.squared.equations
+        (136.0, True, 120)
+        >>> round(program.ridge.degrees_of_freedom(1.0), 1)
+        26.1
+        """
+        return ridge(self.squared, self.penalty_form)
+
+    @property
+    def rows(self) -> tuple[Array, Array]:
+        """A and b as the posed residual has them: the triangle, where that says all."""
+        n = self.model.A.shape[1]
+        if self._posed.equations == len(self.model.b):
+            return self.model.A, self.model.b
+        return self.model.triangle[:, :n], self.model.triangle[:, n]
+
+    @cached_property
+    def _rows(self) -> Rows:
+        """The equations in the order in which the solver has them."""
+        A, b = self.rows
+        order = self._posed.order
+        if order is not None:
+            A, b = A[order], b[order]
+        return Rows(A, b, self._posed.sizes, self.model.triangle)
+
+    @property
+    def _squares(self) -> Squares | None:
+        """The quadratic part of the loss, reduced to n + 1 rows."""
+        form = self._posed._quadratic_of_r
+        if form is None:
+            return None
+        R, n = (self.squared if self.loss_form is not None else _squared(self.model, form)).triangle, self._posed.n
+        return Squares(R[:, :n], R[:, n], np.zeros(n))
+
+    @property
+    def _warm(self) -> Warm:
+        if "warm" not in self._kept:
+            self._kept["warm"] = Warm(self._posed.canonical)
+        return self._kept["warm"]
+
+    # --- values --------------------------------------------------------------------------------------------------
+
+    def value(self, z: Array, weight: float = 1.0) -> tuple[float, float]:
+        """Return loss(A z - b) and penalty(z); variables of the functions' own are at their best for the weight.
+
+        Parameters
+        ----------
+        z
+            (n,) in units of the scales.
+        weight
+            Of the penalty; it matters to variables of the functions' own alone.
+        """
+        A, b = self.rows
+        loss, penalty = self._posed.values(z, A @ z - b, weight)
+        return loss + self.model.offset, penalty
+
+    def objective(self, z: Array, weight: float) -> float:
+        """Return loss(A z - b) + weight penalty(z) of z (n,); infinite outside the functions' domain."""
+        loss, penalty = self.value(z, weight)
+        if weight == 0:
+            return loss
+        return loss + weight * penalty
+
+    def inside(self, z: Array, towards: Array, weight: float) -> Array:
+        """Return z (n,), or where it lies just outside the functions' domain a point inside.
+
+        An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
+        towards another (n,), or towards nominal, or away from it where that lies outside.
+
+        >>> import cvxpy as cp
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> mine = ro.Formulation("entropy", penalty=lambda z: cp.sum(cp.kl_div(z + 1, 1)))
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(mine, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = np.full(34, -1 - 1e-12)  # the entropy ends at -1
+        >>> program.objective(z, 1.0), bool(np.isfinite(program.objective(program.inside(z, z, 1.0), 1.0)))
+        (inf, True)
+        """
+        for share in (0.0, 1e-9, 1e-7, 1e-5, 1e-3, 1e-1):
+            for anchor in (np.zeros_like(z), towards, 2 * z):
+                nearer = z + share * (anchor - z)
+                if np.isfinite(self.objective(nearer, weight)):
+                    return nearer
+        return z
+
+    def norms(self, z: Array) -> Array:
+        """Return the whitened norm of every configuration's residual (N,), in the order of their numbers."""
+        return self.model.norms(self.model.A @ z - self.model.b)
+
+    def violation(self, z: Array) -> float:
+        """Return by how much z (n,) misses the constraints, in units of the scales; of ``largest`` relative to it.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),), largest=100.0)
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve().z
+        >>> round(program.violation(np.eye(34)[0] * 6), 5), bool(np.allclose(program.nearest(3 * z), z, atol=1e-6))
+        (3.51, True)
+        >>> program.excess(z), round(float(program.norms(z).max()), 1)  # sigmas
+        (0.0, 16.4)
+        """
+        return max(self._distance(z), self.excess(z))
+
+    def _distance(self, z: Array) -> float:
+        """Return the largest component of the shortest way to the constraints of z."""
+        if self.box is not None:
+            lower, upper = self.box
+            return float(np.max(np.maximum(lower - z, z - upper), initial=0.0))
+        if not self.formulation.constraints:
+            return 0.0
+        return max(self._posed.distance.at_best(z)[0], 0.0)
+
+    def excess(self, z: Array) -> float:
+        """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
+        if not self._posed.limited:
+            return 0.0
+        return max(0.0, float(np.max(self.norms(z))) / self.formulation.largest - 1)
+
+    def nearest(self, z: Array) -> Array:
+        """Return the point of the constraints of z that is nearest to z (n,); z itself where none is found."""
+        if self.box is not None:
+            return np.clip(z, *self.box)
+        if self._distance(z) <= TOUCHING:
+            return z
+        projection = Small(self._posed.constraints_alone, self._posed.n + 1)
+        n = len(z)
+        squares = Squares(np.vstack([np.eye(n), np.zeros((1, n))]), np.append(z, 0.0), np.zeros(n))
+        try:
+            return projection.solve(squares, 0.0).x[self._posed.constraints_alone.at]
+        except Unsolved:
+            return z
+
+    def meets(self, z: Array) -> bool:
+        """Whether z (n,) meets its constraints as well as is asked for."""
+        return self._distance(z) <= feasibility_tolerance(z) and self.excess(z) <= FEASIBLE
+
+    def gradient(self, z: Array, weight: float) -> Array | None:
+        """Return the gradient (n,) of the objective at z (n,), asked of the functions; None where CVXPY knows none.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> slopes = [np.linalg.norm(program.gradient(z, 1.0)) for z in (np.zeros(34), program.solve(1.0).z)]
+        >>> bool(slopes[1] < 1e-6 * slopes[0])
+        True
+        """
+        A, b = self.rows
+        slope = self._posed.loss_slope(A @ z - b)
+        if slope is None or len(slope) != len(b):
+            return None
+        gradient = A.T @ slope
+        if self.formulation.penalty is None or weight == 0:
+            return gradient
+        price = self._posed.penalty_slope(z)
+        if price is None:
+            return None
+        return gradient + weight * price
+
+    # --- what a robust loss trusts -------------------------------------------------------------------------------
+
+    def trust(self, z: Array) -> Trusted | None:
+        """Return what a robust loss trusts at z (n,); None for a squared loss, which trusts everything.
+
+        Raises
+        ------
+        InputError
+            For a loss without a slope, or one that rests on few equations (minimax).
+        """
+        if self.loss_form is not None:
+            return None
+        return self._trusting(z)[0]
+
+    def _trusting(self, z: Array) -> tuple[Trusted, np.ndarray]:
+        """Return what the loss trusts at z (n,), and which equations (m,) those are."""
+        which, count = self.model.members
+        r = self.model.A @ z - self.model.b
+        norms = self.model.norms(r)
+        keep = (norms <= outlying(norms, count))[which]
+        return self._posed.trusted(norms, count, r[keep]), keep
+
+    def trusted(self, z: Array) -> LinearModel:
+        """Return the squared-loss model that a robust fit amounts to: what it trusts at z (n,), weighed as it does.
+
+        Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model, and it is what
+        every rule for the weight sees. With a squared loss it is that loss's. InputError as for `trust`.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("blunders").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve(1.0).z
+        >>> program.model.equations, program.trusted(z).equations, round(program.trust(z).factor, 3)
+        (150, 132, 1.0)
+        """
+        if self.loss_form is not None:
+            return self.squared
+        trust, keep = self._trusting(z)
+        return kept_equations(self.model, keep, trust.factor)
+
+    # --- solutions -----------------------------------------------------------------------------------------------
 
     def problem(self, weight: float) -> cp.Problem:
         """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
@@ -146,7 +486,37 @@ class Program(Objective):
         InputError
             For a weight that is negative or not finite.
         """
-        return parametrized(self, self._weight(weight)).problem
+        A, b = self.rows
+        data = (
+            cp.Parameter(A.shape, name="A", value=A),
+            cp.Parameter(b.shape, name="b", value=b),
+            cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
+        )
+        return self._written(data, self._posed.asked.live, None)[0]
+
+    def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
+        """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
+        posed, asked = self._posed, self._posed.asked
+        loss, penalty, groups = stated
+        A, b, weight = data
+        z, r = cp.Variable(posed.n, name="z"), cp.Variable(posed.equations, name="r")
+        instead = {id(asked.z): z, id(asked.r): r}
+        groups = [[constraint.tree_copy(instead) for constraint in group] for group in groups]
+        every = [r == A @ z - b]
+        every += [constraint for group in groups for constraint in group]
+        if posed.limited:
+            every.append(posed.limit_of_norms.tree_copy(instead))
+        total = loss.tree_copy(instead) + self.model.offset
+        if penalty is not None:
+            price = penalty.tree_copy(instead)
+            if price.parameters():  # a parameter times a parameter would not be DPP
+                above = cp.Variable(name="penalty")
+                every.append(above >= price)
+                price = above
+            total = total + weight * price
+        if damping is not None:
+            total = total + cp.sum_squares(cp.multiply(damping.size, z - damping.centre))
+        return cp.Problem(cp.Minimize(total), every), z, groups
 
     @one_blas_thread
     def solve(
@@ -162,10 +532,7 @@ class Program(Objective):
 
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
-        have a formula, in a box an active set; a loss that is a sum over rows or configurations (robust, sum of norms,
-        quantiles) with a squared penalty, in a box or without, has Newton's method, one that is the largest of them
-        (minimax) has quadratic programs, both begun where the last minimum was and ended by a duality gap; everything
-        else is Clarabel's, on data that are dimensionless.
+        have a formula; what solves the others is the table of `solvers.solve.minimum`.
 
         Parameters
         ----------
@@ -186,118 +553,20 @@ class Program(Objective):
         """
         begin = time.perf_counter()
         weight = self._weight(weight)
-        box = self.box
         if solver or settings or verbose:
-            asked = solver or cp.CLARABEL
-            estimate = self._judged(by_solver(self, weight, damping, asked, settings or {}, verbose), weight)
+            estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif self.closed_form:
-            estimate = self._at(minimum(self, weight, damping), weight)
-        elif self.quadratic and box is not None:
-            z, multipliers = minimum_between(self, box, weight, damping, near=self._met.begin)
-            self._met.begin = z
-            estimate = self._at(z, weight, shares(self, box, z, multipliers))
-        elif weight > 0 and self.faces is not None:
-            estimate = self._on_faces(weight, damping)
+            estimate = self._at(self._formula(weight, damping), weight)
+        elif self._posed.joint:
+            estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
-            estimate = self._by_rows(weight, damping) or self._by_interior_point(weight, damping)
+            estimate = self._by_structure(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
 
-    def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum in a box, or first one of rows, is looked for from z (n,) on.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = program.solve(1.0).z
-        >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
-        True
-        """
-        self._met.begin = z
-        return self
-
-    def proven(self, weight: float) -> Estimate:
-        """Return the solution at a weight, on evidence that is independent of how it was found.
-
-        Of a loss over rows a duality gap that is computed anew from the functions' own values and slopes
-        (`gap.duality_gap`); where it leaves doubt, an interior point finds the solution, and of a penalty with kinks
-        it is asked anyway.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("blunders").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> abs(program.proven(1.0).objective / program.solve(1.0).objective - 1) < 1e-12
-        True
-        """
-        estimate = self.solve(weight)
-        if estimate.weight > 0 and self.faces is not None:
-            return self._lower_by_interior_point(estimate)
-        if self.separated is None and self.worst is None:
-            return estimate
-        near = self._met.nearest(weight)
-        proposed = None
-        if near is not None and near.kinked.multipliers:
-            proposed = np.empty(len(self.model.b))
-            proposed[self.order] = near.slope
-        gap = duality_gap(self, estimate.z, weight, proposed)
-        if gap <= PROVEN * max(1.0, abs(estimate.objective)):
-            return estimate
-        return self._by_interior_point(weight, None)
-
-    def _lower_by_interior_point(self, estimate: Estimate) -> Estimate:
-        """Return what cones find where that is lower, beyond an interior point's accuracy."""
-        try:
-            other = self._by_interior_point(estimate.weight, None)
-        except NoSolutionFound:
-            return estimate
-        if other.objective < estimate.objective - PROVEN * max(1.0, abs(estimate.objective)):
-            return other
-        return estimate
-
-    def moved(self, by: Array, weight: float, damping: Damping | None = None) -> Array | None:
-        """Return by how far the minimum (n,) of `solve` moves where b moves by (m,), much quicker than solving again.
-
-        None where no formula says it, or not exactly.
-
-        Parameters
-        ----------
-        by
-            (m,) what is added to b.
-        weight, damping
-            As `solve` has them.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> by = np.linspace(-1, 1, 120)
-        >>> there = program.on(program.model.with_values(program.model.b + by))
-        >>> bool(np.allclose(program.moved(by, 1.0), there.solve(1.0).z - program.solve(1.0).z, atol=1e-9))
-        True
-        """
-        if not self.closed_form or self.squared is not self.model:
-            return None
-        return moved(self, weight, damping, self.model.A.T @ by)
-
     @one_blas_thread
-    def path(self, weights: Sequence[float] | Array, near: Array | None = None, rough: bool = False) -> list[Estimate]:
-        """Return the solutions at many weights (K,): all at once by formula, or each from its neighbour.
+    def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
+        """Return the solutions at many weights (K,), zero or more: all at once by formula, or each from its neighbour.
 
-        Parameters
-        ----------
-        weights
-            (K,), zero or more.
-        near
-            A point (n,) near the solution at the largest weight, if one is known.
-        rough
-            Whether points will do whose objective Newton's method expects to be within 1e-10 of the minimum, without a
-            gap that says so: for a rule that compares them.
-
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
@@ -308,23 +577,90 @@ class Program(Objective):
         checked = np.array([self._weight(weight) for weight in weights])
         if self.closed_form:
             Z = self.ridge.minima(checked)
-            rows = zip(Z, checked, *values(self, Z), strict=True)
+            rows = zip(Z, checked, *self._quadratic_values(Z), strict=True)
             return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
-        if self.faces is not None:
-            return self._path_on_faces(checked, near)
-        if self.quadratic and self.box is not None:
-            return self._path_in_box(self.box, checked)
-        found = {weight: self._one(weight, rough) for weight in sorted(set(checked.tolist()), reverse=True)}
+        found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
         return [found[weight] for weight in checked.tolist()]
 
-    def _path_in_box(self, box: Bounds, weights: Array) -> list[Estimate]:
-        """Return the solutions of a quadratic program in a box at many weights."""
-        Z, multipliers = path_between(self, box, weights)
-        rows = zip(Z, weights, *values(self, Z), multipliers, strict=True)
-        return [
-            Estimate(z, float(w), float(loss), float(penalty), shares(self, box, z, held))
-            for z, w, loss, penalty, held in rows
-        ]
+    def beginning(self, z: Array) -> Program:
+        """Return the same program, whose next minimum is looked for from z (n,) on.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve(1.0).z
+        >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
+        True
+        """
+        self._kept["warm"] = self._warm.begun(z)
+        return self
+
+    def moved(self, by: Array, weight: float, damping: Damping | None = None) -> Array | None:
+        """Return by how far the minimum (n,) of `solve` moves where b moves by (m,); None where no formula says it.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> by = np.linspace(-1, 1, 120)
+        >>> there = program.on(program.model.with_values(program.model.b + by))
+        >>> bool(np.allclose(program.moved(by, 1.0), there.solve(1.0).z - program.solve(1.0).z, atol=1e-9))
+        True
+        """
+        if not self.closed_form or not self.squared_rows:
+            return None
+        A, _ = self._stacked(weight, damping)
+        L = np.linalg.qr(A, mode="r")
+        pivots = np.abs(np.diag(L))
+        if len(L) < A.shape[1] or pivots.min(initial=1.0) <= 1e-3 * pivots.max(initial=0.0):
+            return None
+        return np.linalg.solve(L, np.linalg.solve(L.T, self.model.A.T @ by))
+
+    def solve_with_slope(self, weight: float) -> tuple[Estimate, Array | None]:
+        """Return the solution of a loss that is no square, and the loss's slope (m,) there where the solver tells it."""
+        weight = self._weight(weight)
+        if self._posed.joint:
+            return self.solve(weight), None
+        try:
+            found = minimum(self._posed.loss, self._rows, self._warm, weight, self._squares)
+        except Unsolved:
+            return self.solve(weight), None
+        slope = found.slope
+        if slope is not None and self._posed.order is not None:
+            slope = np.empty_like(slope)
+            slope[self._posed.order] = found.slope
+        return self._at(found.z, weight), slope
+
+    def derivative(self, estimate: Estimate) -> Array:
+        """Return K (n, n): the solution of a squared loss moves by -K g where its gradient gets another g (n,) added.
+
+        By differences of the small program's solutions, in steps of a `DIFFERENCE` of a scale.
+        """
+        squares, n = self._squares, self._posed.n
+        if squares is None:
+            raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
+        small = self._warm.program(n + 1)
+        stiff = np.sum(squares.R**2, axis=0) + estimate.weight + np.finfo(float).tiny
+        K = np.empty((n, n))
+        for j, step in enumerate(DIFFERENCE * stiff):
+            moved = [
+                small.solve(replace(squares, g=side * step * np.eye(n)[j]), estimate.weight).x[self._posed.canonical.at]
+                for side in (1.0, -1.0)
+            ]
+            K[:, j] = (moved[1] - moved[0]) / (2 * step)
+        return (K + K.T) / 2
+
+    def largest_slope(self, slope: Array) -> float:
+        """Return max { -slope'z : penalty(z) <= 1 } (n,), the dual norm of a slope; 0 where it is not bounded."""
+        asked = self._posed.asked
+        problem = cp.Problem(cp.Minimize(slope @ asked.z), [asked.penalty <= 1])
+        asked.z.save_value(None)
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return 0.0
+        return -float(problem.value) if problem.status == cp.OPTIMAL else 0.0
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
@@ -340,80 +676,172 @@ class Program(Objective):
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
 
-    def _one(self, weight: float, rough: bool) -> Estimate:
-        """Return one of many solutions."""
-        if not rough:
-            return self.solve(weight)
-        return self._by_rows(weight, None, rough) or self._by_interior_point(weight, None)
+    def _stacked(self, weight: float, damping: Damping | None) -> tuple[Array, Array]:
+        """Return rows whose squares are the objective of a quadratic program."""
+        n = self._posed.n
+        R = self.squared.triangle
+        A, b = [R[:, :n]], [R[:, n]]
+        if self.penalty_form is not None and weight > 0:
+            A.append(np.sqrt(weight) * self.penalty_form.matrix)
+            b.append(np.sqrt(weight) * self.penalty_form.c)
+        if damping is not None:
+            A.append(np.diag(damping.size))
+            b.append(damping.size * damping.centre)
+        return np.vstack(A), np.concatenate(b)
 
-    def _by_rows(self, weight: float, damping: Damping | None, rough: bool = False) -> Estimate | None:
-        """Return the minimum of a loss that is a sum or the largest over rows, from the last one."""
-        from rpim_opt.convex.by_rows import by_rows
-
-        ended = by_rows(self, weight, damping, self._met.near(weight), rough)
-        if ended is None:
-            return None
-        found, near = ended
-        self._met.keep(weight, near)
-        loss, penalty = near.loss + self.model.offset, self._posed.penalty_of(near.z)
-        z = near.z.copy()  # whoever writes on it does not write on what the next one begins with
-        return Estimate(z, weight, loss, penalty, found.duals, iterations=found.iterations)
-
-    def _on_faces(self, weight: float, damping: Damping | None, start: Array | None = None) -> Estimate:
-        """Return the minimum of a penalty with kinks, or where it is not certain the interior point's, if lower."""
-        found = minimum_on_faces(self, weight, damping, start)
-        estimate = Estimate(found.z, weight, found.loss, found.penalty, found.duals)
-        if found.certain:
-            return estimate
-        try:
-            other = self._by_interior_point(weight, damping)
-        except NoSolutionFound:
-            if found.good:
-                return estimate
-            raise
-        damped = [self._damped_objective(each.z, weight, damping) for each in (other, estimate)]
-        return (other, estimate)[int(np.argmin(damped))]
-
-    def _damped_objective(self, z: Array, weight: float, damping: Damping | None) -> float:
-        value = self.objective(z, weight)
+    def _formula(self, weight: float, damping: Damping | None) -> Array:
+        """Return the unconstrained minimum (n,) of a quadratic program."""
+        form = self.penalty_form
         if damping is None:
-            return value
-        return value + float(np.sum((damping.size * (z - damping.centre)) ** 2))
+            z = self.ridge.minima(np.array([weight]))[0]
+            if form is None or (form.diagonal and bool((form.L == 1).all())):
+                return z
+            A, b = self._stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
+            return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
+        A, b = self._stacked(weight, damping)
+        return np.linalg.lstsq(A, b, rcond=None)[0]
 
-    def _path_on_faces(self, weights: Array, start: Array | None) -> list[Estimate]:
-        """Return the solutions at many weights, each from that of the next larger one."""
-        found: dict[float, Estimate] = {}
-        for weight in sorted({float(weight) for weight in weights}, reverse=True):
-            if weight > 0:
-                found[weight] = self._on_faces(weight, None, start)
-            else:
-                found[weight] = self._by_interior_point(weight, None)
-            start = found[weight].z
-        return [found[float(weight)] for weight in weights]
+    def _quadratic_values(self, Z: Array) -> tuple[Array, Array]:
+        """Return loss and penalty (K,) of many points Z (K, n) of a quadratic program."""
+        R, n = self.squared.triangle, Z.shape[1]
+        loss = np.sum((Z @ R[:, :n].T - R[:, n]) ** 2, axis=1) + self.squared.offset
+        form = self.penalty_form
+        if form is None:
+            return loss, np.zeros(len(Z))
+        return loss, np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
 
-    def _by_interior_point(self, weight: float, damping: Damping | None) -> Estimate:
-        """Return what Clarabel finds in our terms, and where it finds nothing, in CVXPY's."""
-        found = interior(self, weight, damping)
-        if found.z is None:
-            first = found.status
-            found = by_solver(self, weight, damping, cp.CLARABEL, {}, False)
-            if found.z is None and "outside" not in found.status:
-                found = Found(first)
-        return self._judged(found, weight)
+    def _by_structure(self, weight: float, damping: Damping | None) -> Estimate:
+        """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
+        size, centre = (None, None) if damping is None else (damping.size, damping.centre)
+        try:
+            with phase("solve"):
+                found = minimum(
+                    self._posed.loss, self._rows, self._warm, weight, self._squares, size=size, centre=centre
+                )
+        except Unsolved as error:
+            status = STATUS.get(str(error), str(error))
+            return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
+        if weight == 0 and damping is None and not self.constrained and self.formulation.penalty is None:
+            _, s, V = self.model.svd  # nothing says anything of directions that the data do not see: they stay nominal
+            found = replace(found, z=found.z - V[s == 0].T @ (V[s == 0] @ found.z))
+        return self._at(found.z, weight, self._duals(found, weight), found.iterations)
 
-    def _judged(self, found: Found, weight: float) -> Estimate:
-        """Return a solver's point as an estimate, or say why there is none."""
-        if found.z is not None:
-            return replace(self._at(found.z, weight, found.duals, found.iterations), status=found.status)
+    def _duals(self, found: Minimum, weight: float) -> tuple[Array, ...]:
+        """Return the multipliers by constraint function."""
+        posed = self._posed
+        if not posed.formulation.constraints:
+            return ()
+        if posed.canonical.cones is None:
+            return _of_boxes(posed.limits, found.dual)
+        values = posed.canonical.duals(found.x, found.dual)
+        groups = [[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in posed.constraints]
+        return self._by_function(groups)
+
+    def _by_function(self, groups: list[list[Array]]) -> tuple[Array, ...]:
+        """Return multipliers by constraint function: of a box (n,), as if loosened on the side that holds."""
+        together = [np.concatenate([np.empty(0), *group]) for group in groups]
+        pairs = zip(self._posed.formulation.constraints, together, strict=True)
+        return tuple(_of_box(*c.bounds(self.model.parameters), v) if isinstance(c, Box) else v for c, v in pairs)
+
+    def _by_cvxpy(
+        self,
+        weight: float,
+        damping: Damping | None,
+        solver: str,
+        settings: Mapping[str, Any],
+        verbose: bool,
+        first: str = "",
+    ) -> Estimate:
+        """Return the minimum that a solver of CVXPY finds; ``first`` is why another way failed before."""
+        _require_installed(solver)
+        asked = self._posed.asked
+        stated = asked.loss, asked.penalty, asked.constraints
+        problem, z, groups = self._written((*self.rows, weight), stated, damping)
+        for variable in problem.variables():
+            variable.save_value(None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an inaccurate answer is judged by what it misses
+            try:
+                problem.solve(solver=solver, verbose=verbose, **settings)
+            except TypeError as error:
+                if not settings:
+                    raise
+                raise InputError("settings", f"{error}".rstrip("."), f"settings that {solver} knows") from None
+            except (cp.SolverError, ValueError, ArithmeticError, RuntimeError) as error:  # solvers have their own
+                raise self._failure(first or f"an error of {solver}: {error}", weight) from None
+        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
+            raise self._failure(first or problem.status, weight)
+        point = np.array(z.value)
+        if not self.meets(point):
+            missed = self.violation(point)
+            raise self._failure(f"{problem.status}, but outside the constraints by {missed:.1e}", weight)
+        values = [[np.ravel(np.asarray(c.dual_value, dtype=float)) for c in group] for group in groups]
+        iterations = int(problem.solver_stats.num_iters or 0)
+        return replace(self._at(point, weight, self._by_function(values), iterations), status=problem.status)
+
+    def _failure(self, status: str, weight: float) -> NoSolutionFound:
+        """Return why there is no solution."""
         from rpim_opt.convex.conflict import advice, conflict  # of programs without a solution
 
-        status, contradiction = found.status, None
+        contradiction = None
         if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
             contradiction = conflict(self._posed, self.model)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point
         text = advice(self._posed, status, contradiction)
-        raise NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
+        return NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
+
+
+STATUS = {
+    "PrimalInfeasible": "infeasible",
+    "AlmostPrimalInfeasible": "infeasible_inaccurate",
+    "DualInfeasible": "unbounded",
+    "AlmostDualInfeasible": "unbounded",
+}
+"""CVXPY's words for Clarabel's."""
+
+
+def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
+    """Return the equations whose squares a quadratic of the residual sums."""
+    if form.diagonal and (form.L == 1).all() and not form.c.any():
+        return model
+    A, b = form.times(model.A), form.times(model.b) + form.c
+    group = model.group
+    if form.diagonal:
+        counts = form.L > 0  # an equation without weight is none
+        A, b, group = A[counts], b[counts], group[counts]
+    else:
+        group = np.zeros(len(b), dtype=int)  # its rows mix configurations
+    return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant)
+
+
+def _of_boxes(limits: Sequence[tuple[Array, Array]], dual: Array) -> tuple[Array, ...]:
+    """Return the multipliers (n,) of boxes, from those of the rows of `Canonical.box`."""
+    fixed = [low == high for low, high in limits]
+    parts = list(np.split(dual, np.cumsum([np.count_nonzero(f) for f in fixed])))
+    rest = parts.pop()
+    found = []
+    for (low, high), f, part in zip(limits, fixed, parts, strict=True):
+        counts = [np.count_nonzero(np.isfinite(side) & ~f) for side in (low, high)]
+        sides, rest = rest[: sum(counts)], rest[sum(counts) :]
+        found.append(_of_box(low, high, np.concatenate([part, sides])))
+    return tuple(found)
+
+
+def _of_box(lower: Array, upper: Array, values: Array) -> Array:
+    """Return the multipliers (n,) of a box: of fixed components, then of lower and of upper bounds."""
+    sides = [lower == upper, np.isfinite(lower) & (lower < upper), np.isfinite(upper) & (lower < upper)]
+    found = np.zeros(len(lower))
+    for side in sides:
+        part, values = np.split(values, [np.count_nonzero(side)])
+        found[side] += np.abs(part)
+    return found
+
+
+def _require_installed(solver: Any) -> None:
+    if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
+        installed = ", ".join(cp.installed_solvers())
+        raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
 
 
 def pose(formulation: Formulation | str, model: LinearModel) -> Program:

@@ -8,10 +8,10 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.select_curve import corner, l_curve
-from rpim_opt.convex.select_held_out import k_fold, leave_one_out, two_step
-from rpim_opt.convex.select_scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
-from rpim_opt.convex.selection import Selection, Selector
+from rpim_opt.convex.rules.curve import corner, l_curve
+from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
+from rpim_opt.convex.rules.scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
+from rpim_opt.convex.rules.selection import Selection, Selector
 
 __all__ = [
     "Selection",

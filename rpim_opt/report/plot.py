@@ -10,8 +10,8 @@ import numpy as np
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.convex.program import Program
+from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare
-from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.report import charts
 from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments

@@ -21,7 +21,7 @@ from rpim_opt.convex.constraints import Box, Constraint
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
-from rpim_opt.convex.selection import Selector
+from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record, Requirement

@@ -14,7 +14,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.selection import weight_grid
+from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.problem.linear import LinearModel
 
 REQUIREMENTS = ("skglm==0.5", "scikit-learn==1.9.1")

@@ -7,18 +7,14 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex import select_curve
-from rpim_opt.convex.select_curve import (
-    _between,
+from rpim_opt.convex.rules import curve as select_curve
+from rpim_opt.convex.rules.curve import (
     _by_golden_sections,
     _curvature,
-    _first_corner,
-    _peaks,
     menger,
 )
-from rpim_opt.convex.selection import weight_grid
+from rpim_opt.convex.rules.selection import weight_grid
 from tests.convex.test_select import NOISY, PROGRAM
-from tests.simulate import simulated
 
 
 def lengths(z: Array, model: ro.problem.LinearModel = NOISY) -> Array:
@@ -42,52 +38,6 @@ def test_the_curvature_is_that_of_the_curve() -> None:
     assert np.count_nonzero(moving) > 12
     assert found[moving] == pytest.approx(near[moving], rel=2e-3, abs=2e-3)
     assert found[moving].min() < 0 < found[moving].max()
-
-
-def test_a_score_is_the_curvature_of_the_points_that_were_solved() -> None:
-    model = simulated(configurations=20, noise=1e-4, seed=1)[0].linearize(np.zeros(34))
-    program = ro.convex.pose(ro.lasso, model)
-    weights = weight_grid(program, 12)[:-1]  # at the last one the penalty is zero, which has no logarithm
-    path = program.path(weights)
-    points = [[0.5 * np.log(each.loss), 0.5 * np.log(each.penalty)] for each in path]
-    assert select_curve._on_grid(program, weights)[1] == pytest.approx(menger(np.array(points)), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("formulation", "kinks"), [(ro.robust, False), (ro.sum_of_norms, True)], ids=["robust", "norms"]
-)
-def test_a_path_that_meets_a_kink_is_looked_at_all_over_the_grid(formulation: ro.Formulation, kinks: bool) -> None:
-    """Where configurations are met exactly, a path bends in jumps, and large steps may miss its sharpest corner."""
-    model = simulated(configurations=15, noise=1e-4, seed=1)[0].linearize(np.zeros(34))
-    weights = weight_grid(ro.convex.pose(ro.tikhonov, model), 40)
-    path = ro.convex.pose(formulation, model).path(weights)
-    met = [np.min(program_norms) <= 1e-3 * np.median(program_norms)
-           for program_norms in (ro.convex.pose(formulation, model).norms(each.z) for each in path)]  # fmt: skip
-    assert any(met) == kinks
-    some, score = select_curve._on_grid(ro.convex.pose(formulation, model), weights)
-    assert (len(some) == len(weights)) == kinks
-    whole = menger(0.5 * np.log([[each.loss, each.penalty] for each in path]))
-    assert some[np.argmax(score)] == weights[np.argmax(whole)]
-    assert score.max() == pytest.approx(whole.max(), rel=1e-3)
-
-
-def test_about_a_corner_two_weights_on_both_sides_are_looked_at_and_its_neighbours() -> None:
-    some = [0, 4, 8, 9, 12, 16, 19]
-    expected = {1: range(9), 2: range(4, 11), 3: range(7, 13), 4: range(9, 17), 5: range(12, 20)}
-    assert {k: _between(some, k, 19) for k in expected} == expected
-    assert _between([0, 1, 2], 1, 2) == range(3)
-    assert _between([0, 1, 2, 3, 4], 2, 4) == range(5)
-
-
-def test_corners_are_what_is_about_as_sharp_as_the_sharpest() -> None:
-    score = np.array([9.0, 1.0, 3.0, 2.0, 4.0, 4.0, 2.5, 2.6, 0.0, 1.9, 1.0, 8.0])
-    assert _peaks(score).tolist() == []  # the largest of all is at the end, where no corner is
-    inside = np.array([0.0, 1.0, 3.0, 2.0, 4.0, 4.0, 1.5, 1.6, 0.0, 1.9, 1.0, 2.0])
-    assert _peaks(inside).tolist() == [2, 4, 5]
-    assert _peaks(-inside).tolist() == []
-    assert _first_corner(inside) == 2
-    assert _first_corner(inside - 1.5 * (np.arange(12) == 2)) == 5  # the end of a flat top
-    assert _first_corner(np.arange(5.0)) == 4
 
 
 class Peak:

@@ -7,9 +7,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt import baselines
+from rpim_opt.convex.rules.folds import held_out_error
+from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.convex.select import SELECTORS
-from rpim_opt.convex.select_held_out import held_out_error
-from rpim_opt.convex.selection import weight_grid
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 from tests import SHARED

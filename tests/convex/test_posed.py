@@ -13,8 +13,8 @@ import rpim_opt as ro
 from rpim_opt.convex.asked import norms
 from rpim_opt.convex.conflict import Stated, _irreducible, _least, conflict, name_of
 from rpim_opt.convex.posed import invariant
-from rpim_opt.convex.select_linear import Rule, linear_rule
-from rpim_opt.convex.selection import EDGES
+from rpim_opt.convex.rules.scores import Rule, linear_rule
+from rpim_opt.convex.rules.selection import EDGES
 from rpim_opt.convex.structure import quadratic
 from rpim_opt.convex.terms import Frozen, Term, listed, scalar, term
 from rpim_opt.problem.linear import LinearModel

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.objective import Damping
-from rpim_opt.convex.program import Estimate
+from rpim_opt.convex.program import Damping, Estimate
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0).scaled(np.full(30, 3.0))

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import select_scores
+from rpim_opt.convex.rules import scores as select_scores
+from rpim_opt.convex.rules.curve import _points, menger
+from rpim_opt.convex.rules.folds import AHEAD, _end_of_fall, _held_out, held_out_error
+from rpim_opt.convex.rules.scores import _lowest
+from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import SELECTORS, disagreement
-from rpim_opt.convex.select_curve import _points, menger
-from rpim_opt.convex.select_held_out import AHEAD, _end_of_fall, _held_out, held_out_error
-from rpim_opt.convex.select_linear import _lowest
-from rpim_opt.convex.selection import Selection, weight_grid
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 from tests.simulate import simulated
@@ -156,13 +156,13 @@ def test_a_corner_at_an_edge_is_none(best: int, said: str, monkeypatch: pytest.M
     def curvature(program: Any, weights: np.ndarray) -> np.ndarray:
         return 5.0 - np.abs(np.log(weights / grid[best]))
 
-    monkeypatch.setattr("rpim_opt.convex.select_curve._curvature", curvature)
+    monkeypatch.setattr("rpim_opt.convex.rules.curve._curvature", curvature)
     chosen = ro.l_curve(PROGRAM)
     assert chosen.weight == pytest.approx(grid[best], rel=1e-5)
     assert chosen.interior == (not said)
     assert said in chosen.note
     monkeypatch.setattr(
-        "rpim_opt.convex.select_curve._curvature", lambda program, weights: -curvature(program, weights) - 99
+        "rpim_opt.convex.rules.curve._curvature", lambda program, weights: -curvature(program, weights) - 99
     )
     none = ro.l_curve(PROGRAM)
     assert (none.weight, none.interior) == (grid[0], False)
@@ -326,7 +326,7 @@ def test_two_steps_say_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) -> No
     def error(program: Any, weights: np.ndarray, parts: Any = None) -> np.ndarray:
         return np.abs(np.arange(len(weights)) - best) + 1.0
 
-    monkeypatch.setattr("rpim_opt.convex.select_held_out._left_out_error", error)
+    monkeypatch.setattr("rpim_opt.convex.rules.folds._left_out_error", error)
     chosen = ro.two_step(PROGRAM)
     assert chosen.interior == (0 < best < 9)
     assert ("a wider search would go on" in chosen.note) != chosen.interior
@@ -337,7 +337,7 @@ def test_holding_out_says_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) ->
     def error(program: Any, weights: np.ndarray, parts: Any = None) -> np.ndarray:
         return np.abs(np.arange(len(weights)) - best) + 1.0
 
-    monkeypatch.setattr("rpim_opt.convex.select_held_out.held_out_error", error)
+    monkeypatch.setattr("rpim_opt.convex.rules.folds.held_out_error", error)
     chosen = _held_out(PROGRAM, "mine", None)
     assert chosen.weight == chosen.weights[best]
     assert chosen.interior == (0 < best < 199)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.select_curve import _curvature, menger
-from rpim_opt.convex.select_held_out import held_out_error
-from rpim_opt.convex.selection import weight_grid
+from rpim_opt.convex.rules.curve import _curvature, menger
+from rpim_opt.convex.rules.folds import held_out_error
+from rpim_opt.convex.rules.selection import weight_grid
 from tests.convex.test_formulation import model
 from tests.simulate import simulated
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,14 +11,98 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.quadratic import ridge, robot_alone
-from rpim_opt.convex.select_linear import Rule, Squared, influence, linear_rule
-from rpim_opt.convex.selection import Score, Selection, weight_grid, with_rows
+from rpim_opt.convex.quadratic import Ridge, ridge, robot_alone
+from rpim_opt.convex.rules.selection import (
+    Score,
+    Selection,
+    edge,
+    grid_of,
+    least_between,
+    on_squares,
+    weight_grid,
+    with_rows,
+)
+from rpim_opt.convex.structure import Quadratic, identity
+from rpim_opt.problem.linear import LinearModel
 
 TOGETHER = 250_000
 """Frequencies of residuals that are in memory together, of many weights."""
 
 
+@dataclass(frozen=True, eq=False)
+class Squared:
+    """What a linear rule sees: equations, penalty, and their closed form."""
+
+    model: LinearModel
+    penalty: Quadratic
+    form: Ridge
+
+    @property
+    def spare(self) -> int:
+        """Equations besides those that the directions without penalty take."""
+        return self.model.equations - self.form.fixed
+
+
+def penalty_of(program: Program) -> Quadratic:
+    """Return the squared penalty of a program, |z|^2 where it has none."""
+    return program.penalty_form or identity(program.model.A.shape[1])
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A score of the weight that is least at the choice; with ``local`` an interior minimum goes before an edge."""
+
+    name: str
+    score: Callable[[Squared], Score]
+    note: str
+    local: bool = False
+
+
+def linear_rule(program: Program, rule: Rule) -> Selection:
+    """Minimize a score of the linear estimator over a grid from the singular values, refined between its points."""
+    if program.penalty_form is None:
+        found = f"formulation '{program.formulation.name}'"
+        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
+        raise InputError(f"selector {rule.name}", found, accepted)
+    if program.loss_form is None:
+        program.trusted(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
+    squared = Squared(program.squared, penalty_of(program), program.ridge)
+    return _least(rule, squared)
+
+
+def _least(rule: Rule, squared: Squared) -> Selection:
+    """Return the choice of a rule for given squares."""
+    weights = grid_of(squared.form)
+    score_at = rule.score(squared)
+    score = score_at(weights)
+    best = _lowest(score, rule.local)
+    if not 0 < best < len(weights) - 1:
+        return Selection(float(weights[best]), rule.name, weights, score, False, edge(best))
+    weight, _ = least_between(score_at, weights, best)
+    return Selection(weight, rule.name, weights, score, True, rule.note)
+
+
+def _lowest(score: Array, local: bool) -> int:
+    if local:
+        valleys = np.flatnonzero((score[1:-1] <= score[:-2]) & (score[1:-1] < score[2:])) + 1
+        if len(valleys):
+            return int(valleys[np.argmin(score[valleys])])
+    return int(np.argmin(score))
+
+
+def influence(squared: Squared) -> tuple[Array, Array, Array]:
+    """Return Q (m, p), s^2 (p,) and the values y (m,) with influence matrix Q diag(s^2 / (s^2 + weight)) Q'.
+
+    Directions that the penalty leaves free stand beside the others with infinite s^2, and y is measured from the
+    penalty's centre.
+    """
+    model, form = squared.model, squared.form
+    Q, Q_free = form.hat_rows(model.A)
+    s2 = np.concatenate([form.s[form.seen] ** 2, np.full(form.fixed, 1e300)])
+    return np.hstack([Q, Q_free]), s2, model.b - model.A @ form.offset
+
+
+@on_squares
 def reml(program: Program) -> Selection:
     """Choose the most likely weight: restricted maximum likelihood, with the noise level profiled out.
 
@@ -75,6 +160,7 @@ def _restricted_likelihood(squared: Squared) -> Score:
     return score
 
 
+@on_squares
 def gcv(program: Program) -> Selection:
     """Choose by generalized cross-validation: minimize rho(w) / (m - dof(w))^2 (Golub, Heath and Wahba 1979).
 
@@ -88,6 +174,7 @@ def gcv(program: Program) -> Selection:
     return linear_rule(program, _gcv_rule("gcv", 1.0, "smallest generalized cross-validation error"))
 
 
+@on_squares
 def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
     """Choose by cross-validation that charges more for degrees of freedom: rho(w) / (m - gamma dof(w))^2.
 
@@ -139,6 +226,7 @@ def _gcv_rule(name: str, gamma: float, note: str) -> Rule:
     return Rule(name, of, note)
 
 
+@on_squares
 def discrepancy(program: Program) -> Selection:
     """Choose the largest weight that fits as well as the declared noise allows (Morozov 1966).
 
@@ -182,6 +270,7 @@ def _misfit(squared: Squared) -> Score:
     return score
 
 
+@on_squares
 def quasi_optimality(program: Program) -> Selection:
     """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
 
@@ -200,6 +289,7 @@ def quasi_optimality(program: Program) -> Selection:
     return linear_rule(program, Rule("quasi_optimality", of, "least change of the solution", local=True))
 
 
+@on_squares
 def ncp(program: Program) -> Selection:
     """Choose where the residual looks most like white noise: normalized cumulative periodogram (Hansen et al. 2006).
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Estimate, Program
-from rpim_opt.convex.selection import Selection, least_between, weight_grid
+from rpim_opt.convex.rules.selection import Selection, least_between, on_squares, weight_grid
 
 SLOWEST = 1e-200
 """Squared speed below which a curve stands still."""
@@ -14,15 +14,12 @@ TINY = np.finfo(float).tiny
 """Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
 SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
-GRID, STRIDE = 60, 4
-"""Weights among which a corner is sought where each takes solving, and every which of them where the path is smooth."""
-TELLING = 500
-"""Norms that tell their median well enough."""
-MET = 1e-3
-"""Part of the median residual below which one counts as zero."""
+GRID = 60
+"""Weights among which a corner is sought where each takes solving."""
 GOLDEN = (1 + 5**0.5) / 2
 
 
+@on_squares
 def l_curve(program: Program) -> Selection:
     """Choose the corner of the L-curve: the largest curvature of (ln |A z - b|, ln |z|).
 
@@ -41,9 +38,10 @@ def l_curve(program: Program) -> Selection:
         weights = weight_grid(program)
         score = _curvature(program, weights)
     else:
-        weights, score = _on_grid(program, weight_grid(program, GRID))
+        weights = weight_grid(program, GRID)
+        score = menger(_points(program.path(weights)))
     best = int(np.argmax(score))
-    if program.faces is not None:
+    if not program.linear_penalty:
         best = _first_corner(score)
     if not score[best] > 0:
         best = 0
@@ -53,60 +51,6 @@ def l_curve(program: Program) -> Selection:
     if program.closed_form:
         weight = _refined(program, weights, score, best)
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
-
-
-def _on_grid(program: Program, weights: Array) -> tuple[Array, Array]:
-    """Return weights and the curvatures there: all of a grid, or of a smooth loss those about the sharpest corners.
-
-    A smooth path is looked at in large steps first, and then at every weight of the grid about its corners, until the
-    sharpest one and both its neighbours have theirs: they are then as sharp as on all of the grid. Kinks at norms of
-    zero leave a path smooth while no configuration is met exactly.
-    """
-    found = None
-    loss = program.separated
-    if loss is not None and (not loss.kinks or loss.away is not None):
-        found = _about_corners(program, weights, bool(loss.kinks))
-    if found is None:
-        return weights, menger(_points(program.path(weights)))
-    return found
-
-
-def _about_corners(program: Program, weights: Array, kinks: bool) -> tuple[Array, Array] | None:
-    """Return weights about the sharpest corners and the curvatures there; None where the path meets a kink."""
-    last = len(weights) - 1
-    places = {*range(0, last, STRIDE), last}
-    met: dict[int, Array] = {}
-    while True:
-        some = sorted(places)
-        new = [k for k in some if k not in met]
-        path = program.path(weights[new], rough=True)
-        if kinks and any(_meets(program, estimate) for estimate in path):
-            return None
-        met |= dict(zip(new, _points(path), strict=True))
-        score = menger(np.array([met[k] for k in some]))
-        around = {near for k in _peaks(score) for near in _between(some, k, last)}
-        if around <= places:
-            return weights[some], score
-        places |= around
-
-
-def _meets(program: Program, estimate: Estimate) -> bool:
-    """Whether an estimate meets a configuration exactly."""
-    norms = program.norms(estimate.z)
-    usual = np.median(norms[:: max(1, len(norms) // TELLING)])
-    return bool(np.min(norms) <= MET * usual)
-
-
-def _peaks(score: Array) -> np.ndarray:
-    """Return the corners that are about as sharp as the sharpest."""
-    inner = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] >= score[2:])) + 1
-    return inner[score[inner] >= max(SHARP * np.max(score), TINY)]
-
-
-def _between(some: list[int], k: int, last: int) -> range:
-    """Return the places from one neighbour of a place to the other, and two of the grid on both sides at least."""
-    first = min(some[k - 1], max(some[k] - 2, 0))
-    return range(first, max(some[k + 1], min(some[k] + 2, last)) + 1)
 
 
 def _first_corner(score: Array) -> int:
@@ -186,6 +130,7 @@ def menger(points: Array) -> Array:
     return np.concatenate([[0.0], inner, [0.0]])
 
 
+@on_squares
 def corner(program: Program, tolerance: float = 0.01) -> Selection:
     """Search the corner of the L-curve without a grid: golden sections by Menger curvature, any formulation.
 
@@ -232,7 +177,7 @@ class _Curve:
 
     def point(self, t: float) -> Array:
         if t not in self.seen:
-            self.seen[t] = _points(self.program.path([np.exp(t)], rough=True))[0]
+            self.seen[t] = _points(self.program.path([np.exp(t)]))[0]
         return self.seen[t]
 
     def curvature(self, a: float, b: float, c: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ LEAST, MOST = 1e-9, 1e-6
 """Between which parts of its largest weight a grid of a penalty with kinks begins: below the first, what it adds to the
 objective is less than the accuracy to which that is known."""
 
+HOMOGENEOUS = 1e-9
+"""Relative deviation of penalty(2 z) from 2 penalty(z) that is rounding."""
 AROUND = 5
 """Weights on either side of the choice that a notebook shows."""
 
@@ -92,6 +95,34 @@ class Selection(Tabled):
 
 Selector = Callable[[Program], Selection]
 
+
+def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
+    """Make a rule see a robust loss as the linear estimator that its fit amounts to (`Program.trusted`).
+
+    What a robust loss trusts depends on the weight: the rule is asked again until its answer stays.
+    """
+
+    @wraps(rule)
+    def chosen(program: Program, *given: Any, **options: Any) -> Selection:
+        if not program.separable or program.formulation.penalty is None:
+            return rule(program, *given, **options)
+        weight, selection = 1.0, None
+        for _ in range(ROUNDS):
+            z = program.solve(weight).z
+            selection = rule(program.on_squares(program.trusted(z)), *given, **options)
+            if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED:
+                break
+            weight = max(selection.weight, SMALLEST)
+        if selection is None:
+            raise InputError("selector", "no choice", "a rule that answers")
+        return selection
+
+    return chosen
+
+
+ROUNDS, SETTLED = 6, 0.02
+"""Rounds of a rule over a robust loss, and the change of the weight's logarithm that ends them."""
+
 Score = Callable[[Array], Array]
 """From weights (K,) to what a rule compares, (K,)."""
 
@@ -143,13 +174,29 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     if program.quadratic:
         return grid_of(program.ridge, count)
     weights = grid_of(ridge(program.model, program.penalty_form), count)
-    if program.faces is None:
-        return weights
-    largest = program.faces.largest()
+    largest = _largest(program)
     if largest is None:
         return weights
     least = float(np.clip(weights[0], LEAST * largest, MOST * largest))
     return np.geomspace(least, largest, count)
+
+
+def _largest(program: Program) -> float | None:
+    """Return the weight from which a penalty leaves nothing to identify; None where there is none.
+
+    Of a positively homogeneous penalty it is the dual norm of the loss's slope g at nominal:
+    max { -g'z : penalty(z) <= 1 }.
+    """
+    if program.linear_penalty or program.inner or program.loss_form is None:
+        return None
+    n = program.model.A.shape[1]
+    slope = program.gradient(np.zeros(n), 0.0)
+    probe = np.cos(np.arange(1, n + 1))
+    once, twice = program.value(probe)[1], program.value(2 * probe)[1]
+    if slope is None or program.value(0 * probe)[1] != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:
+        return None
+    found = program.largest_slope(slope)
+    return found if found > 0 else None
 
 
 def grid_of(form: Ridge, count: int = 200) -> Array:
@@ -174,7 +221,7 @@ def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
     do not differ from the best's, or their weights hardly from its own.
 
     >>> import numpy as np
-    >>> from rpim_opt.convex.selection import searched
+    >>> from rpim_opt.convex.rules.selection import searched
     >>> weights, score, best = searched(lambda w: 1 + np.log(w / 3) ** 2, np.geomspace(1e-3, 1e3, 7))
     >>> bool(abs(np.log(weights[best] / 3)) < 0.05), len(weights)
     (True, 19)

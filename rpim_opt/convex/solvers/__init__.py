@@ -1,0 +1,1 @@
+"""Solvers of one convex program, chosen by its structure."""
