@@ -154,7 +154,6 @@ ELSEWHERE = {
     "rpim_opt.calibration.acceptance",
     "rpim_opt.calibration.expected",
     "rpim_opt.calibration.group_weights",
-    "rpim_opt.convex.by_rows",
     "rpim_opt.convex.conflict",
     "rpim_opt.bayes.population",
     "rpim_opt.convex.sentence",
@@ -170,7 +169,7 @@ UNUSED = {
     "calibrate --help": {"numpy", "scipy", "casadi", "cvxpy"},
     "robots": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.sparse"},
     # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
-    SMALL: {*HEAVY, "rpim_opt.convex.active_set", *ELSEWHERE},
+    SMALL: {*HEAVY, *ELSEWHERE},
     f"{SMALL} --variant bounded": {*HEAVY, *ELSEWHERE},
     f"{SMALL} --selector learned": {*HEAVY, *ELSEWHERE},
     "inspect paper_arm": HEAVY,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rpim_opt import cli
-from rpim_opt.convex.interior import Found
+from rpim_opt.convex.solvers.small import Unsolved
 from rpim_opt.store.problem_file import problems_folder
 
 KEYS = {"nominal", "identification", "validation", "weight", "selector", "formulation", "converged", "iterations",
@@ -190,9 +190,13 @@ def test_fewer_equations_than_needed(monkeypatch, capsys, folder) -> None:
     assert "12 equations for 26 parameters" in capsys.readouterr().err
 
 
+def no_luck(*_: object, **__: object) -> None:
+    raise Unsolved("out of luck")
+
+
 def test_a_solver_failure_writes_nothing(monkeypatch, capsys, folder) -> None:
-    for solver in ("interior", "by_solver"):
-        monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
+    monkeypatch.setattr("rpim_opt.convex.program.minimum", no_luck)
+    monkeypatch.setattr("cvxpy.Problem.solve", no_luck)
     out = folder / "out"
     assert run(monkeypatch, "calibrate", str(folder), "--formulation", "minimax", "--out", str(out)) == 3
     assert "out of luck" in capsys.readouterr().err

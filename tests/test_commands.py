@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 import cvxpy as cp
 import numpy as np
 import pytest
-from rpim_opt.convex.interior import Found
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
@@ -30,7 +29,7 @@ from rpim_opt.use.validation import validate
 from tests import SHARED
 from tests.robot.test_exchange import CONF, YAML_PLAIN
 from tests.simulate import ARM, simulated
-from tests.test_cli import run
+from tests.test_cli import no_luck, run
 
 BENCH, REAL = SHARED / "bench", SHARED / "data"
 HEADER = ["x1", "y1", "z1", *(f"joint_{i}" for i in range(1, 7))]
@@ -530,9 +529,8 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
 
 
 def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
-    for solver in ("interior", "by_solver"):
-        monkeypatch.setattr(f"rpim_opt.convex.program.{solver}", lambda *_: Found("out of luck"))
-    monkeypatch.setattr("rpim_opt.convex.by_rows.by_rows", lambda *_: None)
+    monkeypatch.setattr("rpim_opt.convex.program.minimum", no_luck)
+    monkeypatch.setattr("cvxpy.Problem.solve", no_luck)
     assert run(monkeypatch, "calibrate", str(made), "--formulation", "minimax", "--json") == 3
     said = capsys.readouterr()
     assert said.out == ""

@@ -10,7 +10,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.phases import phase
 from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
 from rpim_opt.convex.select import Selection, Selector
 
@@ -22,8 +21,8 @@ NEUTRAL = 1.0
 """The weight that takes declared noise and scales at their word."""
 TOLD = float(np.log(SAME_WEIGHT))
 """By how much logarithms of weights differ that searches tell apart."""
-QUICK = (reml, gcv, robust_gcv, discrepancy, quasi_optimality, ncp)
-"""Rules that solve a few programs at most."""
+SAME_ROBUST = 1e-6
+"""The same of a robust loss, whose fit does not depend on how the measurements are stored: nor does its weight."""
 RUNS = 0.1
 """A lower end of weights below this part of the last one has run away."""
 PATIENCE = 10
@@ -52,6 +51,8 @@ class Choosing:
         Whether it stays for good: a number, an answer that was confirmed, or one that ended a quarrel.
     note
         What a reader must know of it.
+    robust
+        Whether the loss is a sum over rows, but no square.
     """
 
     rule: Selector | None
@@ -62,13 +63,14 @@ class Choosing:
     settled: bool = False
     final: bool = False
     note: str = ""
+    robust: bool = False
 
-    def begun(self, program: Program) -> Choosing:
-        """Return the choice where the loop begins: of a loss over rows, a dear rule is asked where weight 1 leads.
+    def begun(self) -> Choosing:
+        """Return the choice where the loop begins: of a robust loss, a rule is asked where weight 1 leads.
 
-        At nominal its answer would be about another linear model, and about blunders that no fit has shown yet.
+        At nominal its answer would be about outliers that no fit has shown yet.
         """
-        if self.settled or self.rule in QUICK or not program.separable:
+        if self.settled or not self.robust:
             return self
         return replace(self, weight=NEUTRAL, settled=True)
 
@@ -111,7 +113,8 @@ class Choosing:
         if self.final:
             return self
         again = replace(self, settled=False).asked(program)
-        if self.answers and _same(again.weight, self.weight, _told_apart(again.selection)):
+        apart = SAME_ROBUST if self.robust and program.closed_form else _told_apart(again.selection)
+        if self.answers and _same(again.weight, self.weight, apart):
             return replace(self, settled=True, final=True, note=again.note)
         return again
 

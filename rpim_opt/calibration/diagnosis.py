@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.trust import RARE, Trusted, outlying, trusted_parts
+from rpim_opt.convex.trust import RARE, Trusted, outlying, trusted_rows
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.source import Source
@@ -41,7 +41,7 @@ def trust(problem: Source, formulation: Formulation, program: Program, x: Array)
     source = in_parts(problem)
     if source.keeps_rows or program.formulation is formulation:
         return program.trust(x / problem.parameters.free.scale)
-    return trusted_parts(source, x, formulation)
+    return trusted_rows(source, x, formulation)
 
 
 def trusted(problem: Source, program: Program, trust: Trusted | None, x: Array) -> LinearModel:
@@ -82,7 +82,7 @@ def held(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
     if box is None or not program.formulation.constraints:
         return ()
     parameters = program.model.parameters
-    multiplier = np.sum(program.solve(weight).duals, axis=0)
+    multiplier = np.sum(program.beginning(z).solve(weight).duals, axis=0)
     loss = program.value(z)[0]
     rows = program.model.equations
     near = np.minimum(z - box[0], box[1] - z) < 1e-6 * (1 + np.abs(z))

@@ -20,7 +20,7 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.majorize import Squares, on_triangles
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
-from rpim_opt.convex.trust import trusted_parts
+from rpim_opt.convex.trust import trusted_rows
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
@@ -128,7 +128,7 @@ class Loop:
         """Ask for the weight; the objective follows it."""
         choice = state.choice
         if not choice.answers and self.most > FEW:
-            choice = choice.begun(state.program)
+            choice = choice.begun()
         if not choice.settled:
             choice = choice.asked(self._judged(state))
         if choice.weight == state.choice.weight and state.history:
@@ -154,12 +154,14 @@ class Loop:
         return replace(state, choice=choice, merit=_merit(state.program, state.z, choice.weight))
 
     def _judged(self, state: State) -> Program:
-        """Return the program that a selector sees: of squares that stand for a robust loss, those that it trusts."""
-        if self.reweigh is None:
+        """Return the program that a rule sees: of a robust loss the linear estimator that its fit amounts to."""
+        if not state.choice.robust:
             return state.program
         x = self.source.parameters.free.scale * state.z
-        model = self.source.linearize(x, trusted_parts(self.source, x, self.asked))
-        return state.program.on(around(model, *self.about))
+        trust = trusted_rows(self.source, x, self.asked)
+        if self.reweigh is None:
+            return state.program.on_squares(trust(state.program.model, state.z)[0])
+        return state.program.on(around(self.source.linearize(x, trust), *self.about))
 
     def advanced(self, state: State) -> State:
         """Return the state after one attempt at a step."""
@@ -457,6 +459,7 @@ def _begun(loop: Loop, formulation: Formulation, choice: Choosing, start: Array 
     if start is not None:
         program.beginning(z)
     size = np.linalg.norm(program.model.A, axis=0)
+    choice = replace(choice, robust=loop.reweigh is not None or program.separable)
     merit = _merit(program, z, choice.weight)
     slope = float(np.linalg.norm(2 * model.A.T @ model.b))
     return State(z, program, choice, merit, size, slope=slope, floor=_floor(merit))

@@ -55,7 +55,7 @@ def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
     drawn = [constraint for constraint in program.formulation.constraints if isinstance(constraint, Drawn)]
     if not drawn:
         return ()
-    duals = dict(zip(map(id, program.formulation.constraints), program.solve(weight).duals, strict=True))
+    duals = dict(zip(map(id, program.formulation.constraints), program.beginning(z).solve(weight).duals, strict=True))
     misfit = program.objective(z, weight)
     return tuple(_price(each, program, z, misfit, duals[id(each)]) for each in drawn)
 

@@ -140,7 +140,7 @@ class Canonical:
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
 
     def at_best(self, fixed: Array) -> tuple[float, Array]:
-        """Return the least objective where the variable is fixed at numbers, and x (N,); infinite where there is none."""
+        """Return the least objective at a fixed variable, and x (N,); infinite where there is none."""
         import clarabel
         from scipy import sparse
 
@@ -180,7 +180,7 @@ class Canonical:
         return self._chain.invert(raw, self._inverse)
 
     def part(self, kept: np.ndarray, owner: np.ndarray) -> Canonical:
-        """Return the form of some entries of the variable: ``owner`` (m,) is the entry that an inequality is about, or -1.
+        """Return the form of some entries of the variable; ``owner`` (m,) is the entry of every inequality, or -1.
 
         Other entries' inequalities and columns are left out.
         """

@@ -346,14 +346,10 @@ class Posed:
 
     # --- what a robust loss trusts -----------------------------------------------------------------------------
 
-    def trusted(self, norms: Array, count: np.ndarray, residuals: Array) -> Trusted:
+    def trusted(self, norms: Array, count: np.ndarray) -> Trusted:
         """Return what the loss trusts, by its slopes at as many numbers as it keeps."""
-        name = self.formulation.name
-        if self.inner:
-            return trusted(name, lambda _: None, norms, count, None)
-        if self.formulation.loss_over == "configuration":
-            return trusted(name, self._slope_of_some, norms, count, None)
-        return trusted(name, self._slope_of_some, norms, count, residuals)
+        slope_at = (lambda _: None) if self.inner else self._slope_of_some
+        return trusted(self.formulation.name, slope_at, norms, count, self.formulation.loss_over)
 
     def _slope_of_some(self, v: Array) -> Array | None:
         """Return the loss's slopes at numbers, the others being zero."""

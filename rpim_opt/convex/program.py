@@ -1,4 +1,4 @@
-"""The convex program of one linearization: what it is as a CVXPY problem, its values, and its solutions at any weight."""
+"""The convex program of one linearization: as a CVXPY problem, its values, and its solutions at any weight."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
-DIFFERENCE = 1e-5
+DIFFERENCE = 1e-4
 """Change of a solution, in scales, over which it is differentiated."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
@@ -199,6 +199,11 @@ class Program(Brief):
     def constrained(self) -> bool:
         """Whether there are constraints, or ``largest`` is one."""
         return self._posed.constrained
+
+    @property
+    def polyhedral(self) -> bool:
+        """Whether penalty and constraints are squares, equations and inequalities, without other cones."""
+        return self._posed.canonical.polyhedral
 
     @property
     def predicts(self) -> bool:
@@ -448,10 +453,9 @@ class Program(Brief):
     def _trusting(self, z: Array) -> tuple[Trusted, np.ndarray]:
         """Return what the loss trusts at z (n,), and which equations (m,) those are."""
         which, count = self.model.members
-        r = self.model.A @ z - self.model.b
-        norms = self.model.norms(r)
+        norms = self.norms(z)
         keep = (norms <= outlying(norms, count))[which]
-        return self._posed.trusted(norms, count, r[keep]), keep
+        return self._posed.trusted(norms, count), keep
 
     def trusted(self, z: Array) -> LinearModel:
         """Return the squared-loss model that a robust fit amounts to: what it trusts at z (n,), weighed as it does.
@@ -618,7 +622,7 @@ class Program(Brief):
         return np.linalg.solve(L, np.linalg.solve(L.T, self.model.A.T @ by))
 
     def solve_with_slope(self, weight: float) -> tuple[Estimate, Array | None]:
-        """Return the solution of a loss that is no square, and the loss's slope (m,) there where the solver tells it."""
+        """Return the solution of a loss that is no square, and where the solver tells it the loss's slope (m,)."""
         weight = self._weight(weight)
         if self._posed.joint:
             return self.solve(weight), None
@@ -632,24 +636,28 @@ class Program(Brief):
             slope[self._posed.order] = found.slope
         return self._at(found.z, weight), slope
 
-    def derivative(self, estimate: Estimate) -> Array:
-        """Return K (n, n): the solution of a squared loss moves by -K g where its gradient gets another g (n,) added.
+    def derivative(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e.
 
-        By differences of the small program's solutions, in steps of a `DIFFERENCE` of a scale.
+        By differences of the small program's solutions, in steps that move a parameter by `DIFFERENCE` of a scale.
         """
         squares, n = self._squares, self._posed.n
         if squares is None:
             raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
-        small = self._warm.program(n + 1)
-        stiff = np.sum(squares.R**2, axis=0) + estimate.weight + np.finfo(float).tiny
-        K = np.empty((n, n))
-        for j, step in enumerate(DIFFERENCE * stiff):
-            moved = [
-                small.solve(replace(squares, g=side * step * np.eye(n)[j]), estimate.weight).x[self._posed.canonical.at]
-                for side in (1.0, -1.0)
-            ]
-            K[:, j] = (moved[1] - moved[0]) / (2 * step)
-        return (K + K.T) / 2
+        _, s, V = np.linalg.svd(squares.R)
+        seen = s > RANK_TOLERANCE * s[0]
+        s, V = s[seen], V[: len(s)][seen]
+        small, at = self._warm.program(n + 1), self._posed.canonical.at
+        here = estimate.z
+        D = np.empty((n, len(s)))
+        for j in range(len(s)):
+            y = squares.y + DIFFERENCE * (squares.R @ V[j])
+            try:
+                there = small.solve(replace(squares, y=y), estimate.weight).x[at]
+            except Unsolved:  # as if there were no constraints, and |z|^2 the penalty
+                there = here + DIFFERENCE * s[j] ** 2 / (s[j] ** 2 + estimate.weight) * V[j]
+            D[:, j] = (there - here) / (DIFFERENCE * s[j])
+        return D, self.squared.A @ (V.T / s)
 
     def largest_slope(self, slope: Array) -> float:
         """Return max { -slope'z : penalty(z) <= 1 } (n,), the dual norm of a slope; 0 where it is not bounded."""

@@ -82,9 +82,12 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
 
 
 def trusted(
-    name: str, slope_at: Callable[[Array], Array | None], norms: Array, count: np.ndarray, residuals: Array | None
+    name: str, slope_at: Callable[[Array], Array | None], norms: Array, count: np.ndarray, over: str
 ) -> Trusted:
     """Return what a robust formulation trusts: its factor is the median of loss'(v) / (2 v) over what it keeps.
+
+    v are the norms of the configurations; of a loss over equations norm / sqrt(count), each equation's share of it, so
+    that it does not matter how the measurements are stored.
 
     Parameters
     ----------
@@ -94,8 +97,8 @@ def trusted(
         The loss's slopes at numbers v, one each.
     norms, count
         (N,) whitened norms of the configurations, and how many equations each has.
-    residuals
-        Of the trusted equations, where the loss gets equations, and not norms.
+    over
+        ``"equation"`` or ``"configuration"``.
 
     Raises
     ------
@@ -103,9 +106,10 @@ def trusted(
         For a loss without a slope, or one that rests on few equations (minimax).
     """
     noise = noise_level(norms, count)
-    v = norms[norms <= limits(noise, len(norms), count)]
-    if residuals is not None:
-        v = np.abs(residuals)
+    keep = norms <= limits(noise, len(norms), count)
+    v = norms[keep]
+    if over == "equation":
+        v = v / np.sqrt(count[keep])
     v = np.maximum(v, SMALL)
     found, accepted = f"formulation '{name}'", "another selector: l_curve, corner, k_fold, or a number"
     slope = slope_at(v)
@@ -119,17 +123,11 @@ def trusted(
     return Trusted(noise, len(norms), factor)
 
 
-def trusted_parts(source: Source, x: Array, formulation: Formulation) -> Trusted:
-    """Return what a robust formulation trusts of measurements in parts at the deviations x (n,) [SI].
-
-    Where the loss gets equations, those of a configuration count as alike.
-    """
+def trusted_rows(source: Source, x: Array, formulation: Formulation) -> Trusted:
+    """Return what a robust formulation trusts of measurements, wherever they stand, at deviations x (n,) [SI]."""
     norms, count = source.configuration_errors(x)
-    residuals = None
-    if formulation.loss_over == "equation":
-        residuals = norms / np.sqrt(count)
 
     def slope_at(v: Array) -> Array | None:
         return term(formulation.loss, len(v), f"formulation '{formulation.name}', loss").slope(v)
 
-    return trusted(formulation.name, slope_at, norms, count, residuals)
+    return trusted(formulation.name, slope_at, norms, count, formulation.loss_over)

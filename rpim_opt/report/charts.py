@@ -13,7 +13,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.selection import Selection
+from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
 

@@ -28,8 +28,8 @@ from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, lost
 from rpim_opt.convex.posed import Unposed
 from rpim_opt.convex.program import Program, pose
-from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.rules.selection import Selection
+from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Block, Dataset, named_sessions

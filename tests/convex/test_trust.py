@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import rpim_opt as ro
-from rpim_opt.convex.trust import Trusted, kept_equations, limits, noise_level, outlying, trusted, trusted_parts
+from rpim_opt.convex.trust import Trusted, kept_equations, limits, noise_level, outlying, trusted, trusted_rows
 from rpim_opt.problem.linear import LinearModel
 from tests.simulate import simulated
 
@@ -94,21 +94,20 @@ def test_a_factor_is_the_losss_over_the_squares() -> None:
     """Huber's loss is the square within its threshold, and falls behind it as threshold / v."""
     norms = np.array([0.1, 1.0, 1.2, 3.0, 3.1, 3.2, 3.3, 1e9])
     count = np.full(8, 3)
-    assert trusted("f", huber_slope, norms[:3], count[:3], None).factor == 1.0
-    some = trusted("f", huber_slope, norms, count, None)
+    assert trusted("f", huber_slope, norms[:3], count[:3], "configuration").factor == 1.0
+    some = trusted("f", huber_slope, norms, count, "configuration")
     assert some.factor == pytest.approx(1.5 / 3.0, rel=1e-12)  # the median of seven: the blunder is not among them
     assert some.configurations == 8
     assert some.noise == pytest.approx(noise_level(norms, count), rel=1e-12)
 
 
 def test_a_factor_by_equations_is_that_of_their_sizes() -> None:
-    norms, count = np.full(4, 2.0), np.full(4, 3)
-    residuals = np.array([-3.0, 3.0, -3.0, 1.0, -6.0])
-    assert trusted("f", huber_slope, norms, count, residuals).factor == pytest.approx(0.5, rel=1e-12)
+    norms, count = np.full(4, 3.0 * np.sqrt(3)), np.full(4, 3)  # three sigmas of each equation
+    assert trusted("f", huber_slope, norms, count, "equation").factor == pytest.approx(1.5 / 3.0, rel=1e-12)
 
 
 def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
-    found = trusted("f", np.ones_like, np.zeros(3), np.full(3, 3), None)
+    found = trusted("f", np.ones_like, np.zeros(3), np.full(3, 3), "configuration")
     assert found.factor == pytest.approx(0.5e6, rel=1e-12)
 
 
@@ -122,12 +121,7 @@ def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
 )
 def test_a_loss_that_has_no_factor_is_named(slope: Any, said: str) -> None:
     with pytest.raises(ro.InputError, match=f"formulation 'mine': found {said}, accepted: another selector"):
-        trusted("mine", slope, np.full(5, 2.0), np.full(5, 3), None)
-
-
-def test_nothing_that_is_trusted_has_no_factor() -> None:
-    with pytest.raises(ro.InputError, match="a loss that rests on a few equations"):
-        trusted("mine", huber_slope, np.full(3, 2.0), np.full(3, 3), np.zeros(0))
+        trusted("mine", slope, np.full(5, 2.0), np.full(5, 3), "configuration")
 
 
 def test_what_parts_trust_is_what_whole_data_do() -> None:
@@ -135,7 +129,7 @@ def test_what_parts_trust_is_what_whole_data_do() -> None:
     x = ro.calibrate(instance.problem, ro.robust, 1.0).x
     z = x / instance.problem.parameters.free.scale
     program = ro.convex.pose(ro.robust, instance.problem.linearize(x))
-    whole, parts = program.trust(z), trusted_parts(instance.problem, x, ro.robust)
+    whole, parts = program.trust(z), trusted_rows(instance.problem, x, ro.robust)
     assert whole is not None
     assert (parts.noise, parts.factor) == pytest.approx((whole.noise, whole.factor), rel=1e-9)
     assert parts.configurations == whole.configurations
@@ -147,5 +141,5 @@ def test_parts_take_the_equations_of_a_configuration_as_alike() -> None:
     formulation = replace(ro.robust, loss=cp.norm1, loss_over="equation")
     norms, count = instance.problem.configuration_errors(x)
     typical = norms[norms <= outlying(norms, count)] / np.sqrt(3)
-    parts = trusted_parts(instance.problem, x, formulation)
+    parts = trusted_rows(instance.problem, x, formulation)
     assert parts.factor == pytest.approx(np.median(0.5 / typical), rel=0.2)

@@ -21,6 +21,12 @@ ROOT = Path(__file__).parents[2]
 FILE = Path(__file__).with_name("results.json")
 LIMITS = {"x": 1e-9, "weight": 1e-8, "objective": 1e-8, "std": 1e-7, "expanded": 1e-7, "hyperparameters": 1e-3}
 """Largest differences that are rounding: of x by prior scale, of all else relative."""
+INTENDED = {
+    "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
+    "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
+    "paper_arm:misprints": ("x", "weight", "objective", "std"),  # what a rule sees of a robust loss is decided anew
+}
+"""What may differ by more, and why."""
 
 
 def problems() -> list[tuple[str, str | None]]:
@@ -116,7 +122,7 @@ def main(what: str, *chosen: str) -> int:
     beyond = 0
     for key, told in new.items():
         by = differences(told, old[key])
-        over = [k for k, limit in LIMITS.items() if not by[k] <= limit]
+        over = [k for k, limit in LIMITS.items() if not by[k] <= limit and k not in INTENDED.get(key, ())]
         beyond += bool(over)
         text = "  ".join(f"{k} {v:.1e}" for k, v in by.items())
         print(f"{key:28} {text}  rms {old[key]['rms_mm']} -> {told['rms_mm']}  {' '.join(over)}", flush=True)

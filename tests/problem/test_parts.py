@@ -13,7 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.convex.majorize import Squares
-from rpim_opt.convex.trust import trusted_parts
+from rpim_opt.convex.trust import trusted_rows
 from rpim_opt.problem import parts as parts_module
 from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster, whole_configurations
 
@@ -176,7 +176,7 @@ def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationPro
     assert here.noise_variance == pytest.approx(there.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)
-    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trusted_parts(whole, chosen.x, ro.robust)))
+    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trusted_rows(whole, chosen.x, ro.robust)))
     # the weight stays from where steps are shorter than a thousandth of the solution
     assert chosen.weight == pytest.approx(ro.reml(squared).weight, rel=1e-2)
 

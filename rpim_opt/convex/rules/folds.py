@@ -17,6 +17,8 @@ from rpim_opt.problem.linear import from_triangle, reduced_rows
 
 SOME = 6
 """Configurations that are left out by solving, to see how exact the approximation is."""
+EXACTLY = 60
+"""Configurations up to which a program with cones is solved without each of them."""
 INEXACT = 0.05
 """Relative error of the approximation from which a choice says how to do without it."""
 AHEAD = 5
@@ -41,8 +43,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     """Choose by leaving every configuration out once and predicting it, all its equations together.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
-    With constraints or another penalty the same with H = 2 A K A', where K is the derivative of the solution by its
-    gradient (approximate leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the
+    With constraints or another penalty the same with H = A dz/db, the derivative of the solution (approximate leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the
     note says how exact it is. Of a loss that is no sum over rows (minimax), those are solved that have an influence.
 
     Parameters
@@ -193,7 +194,7 @@ def _held_out(program: Program, name: str, parts: Sequence[np.ndarray] | None, e
     return Selection(float(weights[best]), name, weights, score, interior, note)
 
 
-# --- errors of what is left out ----------------------------------------------------------------------------------------
+# --- errors of what is left out --------------------------------------------------------------------------------
 
 
 def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray] | None = None) -> Array:
@@ -206,7 +207,7 @@ def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray]
 
 
 def _left_out_error(program: Program) -> Score:
-    """Return what gives `held_out_error` of configurations left out one by one, with as little solving as there can be."""
+    """Return what gives `held_out_error` of configurations left out one by one, with little solving."""
     if program.closed_form and program.squared_rows:
         squares = _of_squares(Squared(program.squared, penalty_of(program), program.ridge))
         return lambda weights: np.sqrt(squares(weights) / len(program.model.b))
@@ -307,8 +308,13 @@ def _of_squares(squared: Squared) -> Score:
 
 
 def _approximates(program: Program) -> bool:
-    """Whether the derivative of the solution by its gradient tells what leaving a configuration out changes."""
-    return program.loss_form is not None and program.loss_form.diagonal and not program.closed_form
+    """Whether the derivative of the solution tells what leaving a configuration out changes.
+
+    Cones bend the solution's path: with few configurations, all of them are solved without.
+    """
+    if program.loss_form is None or not program.loss_form.diagonal or program.closed_form:
+        return False
+    return program.polyhedral or len(np.unique(program.model.group)) > EXACTLY
 
 
 def _approximately(program: Program) -> Predicted:
@@ -317,12 +323,13 @@ def _approximately(program: Program) -> Predicted:
     rows = by_size(model.group)
 
     def norms(estimate: Estimate) -> Array:
-        K = program.derivative(estimate)
+        D, U = program.derivative(estimate)
         r = model.A @ estimate.z - model.b
         found = np.zeros(sum(len(each.configurations) for each in rows))
         for places, configurations in rows:
             A = model.A[places]
-            M = np.eye(places.shape[1])[:, :, None] - np.einsum("gin,nm,gjm->ijg", A, 2 * K, A, optimize=True)
+            hat = np.einsum("gin,nr,gjr->ijg", A, D, U[places], optimize=True)
+            M = np.eye(places.shape[1])[:, :, None] - (hat + hat.transpose(1, 0, 2)) / 2
             found[configurations] = np.linalg.norm(_solved(M, r[places.T]), axis=0)
         return found
 

@@ -120,7 +120,7 @@ def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
     return chosen
 
 
-ROUNDS, SETTLED = 6, 0.02
+ROUNDS, SETTLED = 4, 0.02
 """Rounds of a rule over a robust loss, and the change of the weight's logarithm that ends them."""
 
 Score = Callable[[Array], Array]

@@ -210,7 +210,7 @@ class Newton:
         at, T, weight = self.penalty.at, self.rows.whitened[1], self.weight
         self.x = x
         r = self._residual(z)
-        size = max(abs(self._total(r)), 1e-12)
+        size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
         for _ in range(most):
             gradient, H = self._model(r, h)
             self.point = self._solved(z, gradient, H)

@@ -22,7 +22,7 @@ FACES = 8
 """Faces that are tried before Clarabel is asked for one."""
 
 
-class Unsolved(Exception):
+class Unsolved(RuntimeError):
     """A program that the solver does not solve; its argument is the solver's word."""
 
 
@@ -168,7 +168,8 @@ class Small:
         x0[p.at] = self._centre(squares, weight)
         matrix, bound = d.rows(squares, A, b, x0)
         P, q = d.objective(squares, weight, x0)
-        scale = 1.0 / max(1.0, np.abs(q).max(), 1e-3 * weight)  # tolerances are absolute below one
+        residual = np.abs(bound[:k]).max(initial=0.0)
+        scale = 1.0 / max(1.0, np.abs(q).max(), 1e-3 * weight, residual)  # tolerances are absolute below one
         P.data *= scale
         status = ""
         for settings in ATTEMPTS:
@@ -192,7 +193,6 @@ class Small:
         slope = z[d.link] if self.loss is not None else None
         return Point(x[: p.size], z[own], int(found.iterations), rest, slope), s[own]
 
-
     def _centre(self, squares: Squares | None, weight: float) -> Array:
         """Return a point (n,) near the minimum: the last one, or that of the squares with some weight on |z|^2."""
         last = self.near[self.penalty.at]
@@ -211,7 +211,7 @@ class _Data:
         from scipy import sparse
 
         p, k, loss, sizes = small.penalty, small.rows, small.loss, small.sizes
-        n, N = len(p.at), p.size
+        N = p.size
         m = 0
         if loss is not None:
             m = len(loss.at) if sizes is None else int(sizes.sum())
