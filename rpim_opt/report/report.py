@@ -27,8 +27,8 @@ from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.program import Estimate, Program, pose
-from rpim_opt.convex.select import compare
 from rpim_opt.convex.rules.selection import Selection, weight_grid
+from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.observability import combination, observe

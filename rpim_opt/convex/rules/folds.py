@@ -43,8 +43,10 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     """Choose by leaving every configuration out once and predicting it, all its equations together.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
-    With constraints or another penalty the same with H = A dz/db, the derivative of the solution (approximate leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the
-    note says how exact it is. Of a loss that is no sum over rows (minimax), those are solved that have an influence.
+    With constraints or another penalty the same with H = A dz/db, the derivative of the solution (approximate
+    leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the note says how exact it
+    is. With cones and few configurations all are solved; of a loss that is no sum over rows (minimax), those that have
+    an influence.
 
     Parameters
     ----------
