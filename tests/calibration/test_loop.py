@@ -221,7 +221,7 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
     there = program.on(PROBLEM.linearize(PROBLEM.parameters.free.scale * z))
     length = np.linalg.norm(there.solve(1.0).z - z) / (1 + np.linalg.norm(z))
     assert (length < 0.01) == (away < 0.01)
-    choice = choosing(answering(5.0), True).begun(there)
+    choice = replace(choosing(answering(5.0), True), robust=True).begun()
     before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, quiet=2)
     before = replace(before, merit=_merit(there, z, 1.0))
     after = loop(formulation=ro.robust).advanced(before)

@@ -114,9 +114,3 @@ def at_nominal(problem: ro.CalibrationProblem) -> object:
     """Return the first block as the nominal robot would be seen."""
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
     return replace(problem.data.blocks[0], y=y)
-
-
-def test_what_a_formulation_does_not_know_is_said() -> None:
-    lasso = ro.calibrate(one(), ro.lasso, 1.0)
-    with pytest.raises(AttributeError, match=r"rpim_opt\.store\.save_result"):
-        lasso.save  # noqa: B018

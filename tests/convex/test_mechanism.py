@@ -208,6 +208,7 @@ def test_storage_decides_nothing(formulation: str, rule: str) -> None:
         assert found.z == pytest.approx(whole.z, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [ro.leave_one_out, ro.k_fold, ro.l_curve, ro.corner, ro.two_step])
 @pytest.mark.parametrize(
     ("loss", "penalty", "constraints"),
