@@ -16,7 +16,7 @@ from rpim_opt.problem.registration.camera import camera_blocks
 
 MOST = 20
 """Points of a table; of others one row says how many there are."""
-HEADER = ["touches by point [mm]", "touches", "RMS before", "RMS after", "largest after"]
+HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
 
 
 # --- cameras ----------------------------------------------------------------------------------------------------------
