@@ -15,6 +15,7 @@ from rpim_opt.basics.units import UNITS, display, split_unit
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.program import Program
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameters import Parameters
 
 FAR = 100.0
@@ -258,15 +259,6 @@ def _root(precision: Array) -> Array:
     return (vectors[:, kept] * np.sqrt(values[kept])).T * unit
 
 
-class Table(Protocol):
-    """What has a table of parameters: a problem."""
-
-    @property
-    def parameters(self) -> Parameters:
-        """All of them."""
-        ...
-
-
 class Spread(Protocol):
     """What the covariance of a result has besides its equations and its penalty."""
 
@@ -285,7 +277,7 @@ class Result(Protocol):
     """What a prior needs of an earlier result: a `Calibration` has it."""
 
     @property
-    def problem(self) -> Table:
+    def problem(self) -> Source:
         """What was asked."""
         ...
 
