@@ -123,7 +123,7 @@ def new(
 ) -> None:
     """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
     with console.progress():
-        from rpim_opt.basics.writing import refused
+        from rpim_opt.basics.files import refused
         from rpim_opt.store.raw import understand_tables
 
         options = console.table_options(
@@ -198,7 +198,7 @@ def calibrate(
     decided.
     """
     with console.progress() as say:
-        from rpim_opt.basics.phases import clock
+        from rpim_opt.basics.threads import clock
         from rpim_opt.calibration.causes import named
         from rpim_opt.report.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
@@ -245,8 +245,7 @@ def report(
 ) -> None:
     """Write the calibration report: one HTML page that works offline, in the order in which it is signed."""
     with _loaded(result) as (loaded, say):
-        from rpim_opt.basics.inputs import inside
-        from rpim_opt.basics.writing import refused
+        from rpim_opt.basics.files import inside, refused
         from rpim_opt.report.report import write_report
 
         say("writing the report")
@@ -424,8 +423,8 @@ def export(
 ) -> None:
     """Write the identified robot for other tools: all files that are asked for, or none."""
     with _loaded(result) as (loaded, _):
-        from rpim_opt.robot.plain import write_robodk, write_robot
-        from rpim_opt.robot.ur_kinematics import write_ur_kinematics
+        from rpim_opt.robot.formats.tables import write_robodk, write_robot
+        from rpim_opt.robot.formats.universal_robots import write_ur_kinematics
         from rpim_opt.use.export import (
             export_ur_calibration,
             export_urdf,
@@ -507,7 +506,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
-    from rpim_opt.basics.writing import refused
+    from rpim_opt.basics.files import refused
     from rpim_opt.store.simulation import write_simulation
 
     with refused(out or problem):
@@ -567,10 +566,10 @@ def study(
 
     With --gate exit code 1 if a metric got worse.
     """
-    from rpim_opt.basics.progress import shown
+    from rpim_opt.basics.text import progress_bar
     from rpim_opt.study.studies import regressions, run_study
 
-    with shown(name, not as_json) as say:
+    with progress_bar(name, not as_json) as say:
         report, folder = run_study(name, quick, workers, scheduler, resume, redraw, out, progress=say)
     worse: list[str] = []
     if gate:
@@ -632,9 +631,9 @@ def compare(
 def robots(as_json: Json = False) -> None:
     """List the ready robots that a problem file may name."""
     from rpim_opt.basics.text import table
+    from rpim_opt.robot.formats.tables import read_robot
     from rpim_opt.robot.library import find_robot
     from rpim_opt.robot.library import robots as names
-    from rpim_opt.robot.mdh import read_robot
 
     ready = {name: read_robot(find_robot(name)) for name in names()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
@@ -697,8 +696,7 @@ def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
     if out is None:
         return []
-    from rpim_opt.basics.inputs import inside
-    from rpim_opt.basics.writing import refused
+    from rpim_opt.basics.files import inside, refused
     from rpim_opt.store.result_file import save_result
 
     file = inside(out, "result.json", "the file", out)

@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.basics.phases import clock
 from rpim_opt.basics.text import markdown
-from rpim_opt.basics.threads import cores, on_all_cores, one_blas_thread
+from rpim_opt.basics.threads import clock, cores, on_all_cores, one_blas_thread
 from rpim_opt.convex import conic
 from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.problem.linear import reduced_rows

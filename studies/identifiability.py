@@ -15,8 +15,8 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import markdown
-from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.baselines import gauss_newton, levenberg_marquardt
 from rpim_opt.problem.observability import combination
 from rpim_opt.problem.problem import CalibrationProblem

@@ -33,9 +33,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.basics.files import write_json
+from rpim_opt.basics.files import write_bytes, write_json, write_text
 from rpim_opt.basics.text import markdown
-from rpim_opt.basics.writing import write_bytes, write_text
 from rpim_opt.study import Metric, Report
 
 QUESTION = "Is rpim_opt more accurate than pybotics, robotkinecal, figaroh and SciPy on the same measurements?"

@@ -157,7 +157,7 @@ ELSEWHERE = {
     "rpim_opt.convex.conflict",
     "rpim_opt.bayes.population",
     "rpim_opt.convex.sentence",
-    "rpim_opt.robot.urdf",
+    "rpim_opt.robot.formats.urdf",
     "cattrs",
 }
 """What a plain calibration has no use of: a limit, cameras, a drawing's words, a result file."""

@@ -22,8 +22,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.naming import rename
 from rpim_opt.data.tables.units import parse_units
-from rpim_opt.robot.chain import link_of
-from rpim_opt.robot.kinematics import frame_numbers
+from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
 from tests import SHARED
@@ -47,7 +46,7 @@ def urdf_text(mdh: np.ndarray, tool: np.ndarray, fixed: bool = True) -> str:
         parts.append(f'<link name="{child}"/><joint name="{name}" type="{kind}">{ends}{origin}{limit}</joint>')
 
     for i, row in enumerate(mdh, start=1):
-        joint("revolute", f"J{i}", f"link_{i - 1}" if i > 1 else "base_link", f"link_{i}", link_of(*row[:4]))
+        joint("revolute", f"J{i}", f"link_{i - 1}" if i > 1 else "base_link", f"link_{i}", numeric_link(*row[:4]))
     if fixed:
         joint("fixed", "mount", f"link_{len(mdh)}", "smr", tool)
     return "\n".join([*parts, "</robot>"])
@@ -76,7 +75,7 @@ def write_csv(path: Path, header: list[str], rows: np.ndarray) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-TOOL = link_of(a=0.03, theta=0.4, d=0.06)
+TOOL = numeric_link(a=0.03, theta=0.4, d=0.06)
 
 
 def write_cell(folder: Path) -> Path:
@@ -84,7 +83,7 @@ def write_cell(folder: Path) -> Path:
     rng = np.random.default_rng(5)
     (folder / "arm.urdf").write_text(urdf_text(ARM.mdh, TOOL))
     mdh = ARM.mdh + np.array([1e-3, 3e-4, 1e-3, 3e-4, 0.0]) * rng.normal(size=ARM.mdh.shape)
-    (folder / "true.urdf").write_text(urdf_text(mdh, TOOL @ link_of(a=3e-4, d=-4e-4)))
+    (folder / "true.urdf").write_text(urdf_text(mdh, TOOL @ numeric_link(a=3e-4, d=-4e-4)))
     for name, count, noise in (("measured.csv", 40, 3e-5), ("later.csv", 100, 0.0)):
         q = rng.uniform(-2, 2, (count, 6))
         p = urdf_points(folder / "true.urdf", q)

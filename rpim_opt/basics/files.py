@@ -1,100 +1,138 @@
-"""Files at the border: TOML in, checked against a model; JSON out, whole or not at all."""
+"""Files in and out: ordinary ones of a bounded size are read, and what is written is whole or as it was before."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
+import stat
+import tempfile
 import tomllib
 from collections import Counter
-from functools import cache
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import to_jsonable_python
+from rpim_opt.basics.exceptions import InputError, RpimError, choices
 
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, read_text
-from rpim_opt.basics.units import UNITS, number, quantities
-from rpim_opt.basics.writing import write_text
+try:
+    import fcntl
+except ImportError:  # Windows: what a kill leaves there stays
+    fcntl = None
 
-Length = Annotated[float, "length"]
-Angle = Annotated[float, "angle"]
-Mass = Annotated[float, "mass"]
+LARGEST_TEXT = 2**24
+"""Bytes that a description may have: a hundred times what the largest public ones need."""
+LARGEST_DATA = 2**30
+"""Bytes that a table or a result may have: some million rows."""
 _DEEP = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++\s*+\.\s*+){100}")
 """Dotted keys, which are read in a time that grows with the square of their length."""
 _HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 """Escapes that JSON reads one by one, whether or not two of them make a character."""
-Name = Annotated[str, Field(max_length=200)]
-"""A name or a pattern of names: long ones would take for ever to be matched."""
+ENDING = ".part"
+"""Of folders in which files are written."""
 
 
-class Misfit(ValueError):
-    """A key that a table cannot have: pydantic adds where it stands."""
-
-    def __init__(self, key: str, found: str, accepted: str):
-        super().__init__(found)
-        self.key = key
-        self.found = found
-        self.accepted = accepted
+# Reading
 
 
-class Table(BaseModel):
-    """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
+def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
+    """Refuse what is no ordinary file of at most ``largest`` bytes; a pipe or device would be read for ever.
 
-    A field annotated ``Length``, ``Angle`` or ``Mass`` (or listing several) is given under its name plus a unit.
+    Raises
+    ------
+    InputError
+        Saying what is there instead, or what the folder holds with one of the ``endings``.
     """
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-    @classmethod
-    @cache
-    def _dimensions(cls) -> dict[str, tuple[str, ...]]:
-        known = {unit.dimension for unit in UNITS.values()}
-        return {
-            name: tuple(m for m in field.metadata if m in known)
-            for name, field in cls.model_fields.items()
-            if any(m in known for m in field.metadata)
-        }
-
-    @model_validator(mode="before")
-    @classmethod
-    def _to_si(cls, table: Any) -> Any:
-        if not isinstance(table, dict):
-            return table
-        dimensions = cls._dimensions()
-        plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
-        others = {key: value for key, value in table.items() if key not in plain}
-        si = _quantities(others, dimensions, plain)
-        kept = {key: value for key, value in table.items() if key not in others}
-        return kept | si
-
-
-def _quantities(table: dict[str, Any], dimensions: dict[str, tuple[str, ...]], plain: list[str]) -> dict[str, Any]:
-    """Return the quantities of a table [SI]; a stem may stand there once, whatever its unit."""
     try:
-        values = quantities(table, dimensions, convert=_scaled, also=plain)
-    except InputError as error:
-        key = ""
-        if error.where.startswith("key "):
-            key = error.where.removeprefix("key ")
-        raise Misfit(key, error.found, error.accepted) from None
-    si: dict[str, Any] = {}
-    for (stem, _), value in values.items():
-        if stem in si:
-            raise Misfit(stem, "the same quantity twice", "one of them")
-        si[stem] = value
-    return si
+        found = path.stat()
+    except FileNotFoundError:
+        accepted = "a file there"
+        near = _near(path, endings)
+        if near:
+            accepted = choices(path.name, near)
+        raise InputError("the file", "nothing", accepted, path) from None
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        raise InputError("the file", str(error), "a readable file", path) from None
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError("the file", _kind(found.st_mode), "an ordinary file", path)
+    if found.st_size > largest:
+        raise InputError("the file", f"{found.st_size} bytes", f"a file of at most {largest} bytes", path)
 
 
-def _scaled(value: Any, where: str, si: float) -> Any:
-    if isinstance(value, list):
-        return [_scaled(v, where, si) for v in value]
-    return number(value, where) * si
+def _near(path: Path, endings: Sequence[str]) -> list[str]:
+    try:
+        return sorted(p.name for p in path.parent.iterdir() if p.suffix in endings)
+    except OSError:
+        return []
 
 
-Model = TypeVar("Model", bound=BaseModel)
+def _kind(mode: int) -> str:
+    if stat.S_ISDIR(mode):
+        return "a folder"
+    return "a pipe, a socket or a device"
+
+
+def read_bytes(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> bytes:
+    """Return a file's content; errors as `require_file` has them."""
+    require_file(path, largest, endings)
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(largest + 1)
+    except OSError as error:
+        raise InputError("the file", str(error), "a readable file", path) from None
+    if len(content) > largest:  # grown since, or a file of the system that states no size
+        raise InputError("the file", f"more than {largest} bytes", f"a file of at most {largest} bytes", path)
+    return content
+
+
+def read_text(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> str:
+    """Return a file's text; errors as `require_file` has them, and for what is no UTF-8."""
+    content = read_bytes(path, largest, endings)
+    try:
+        return content.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise InputError("the file", str(error), "a readable UTF-8 text file", path) from None
+
+
+def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
+    """Return the path of a file that a folder names, which must lie in that folder.
+
+    A folder may come from somebody else: what it names elsewhere is neither read nor written, be it by an absolute
+    path, by ``..`` or by a link.
+
+    Raises
+    ------
+    InputError
+        With ``where`` and ``file`` as the place of the name.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.basics.files import inside
+    >>> inside(Path("cell"), "tables/june.csv", "key identification").name
+    'june.csv'
+    >>> try:
+    ...     inside(Path("cell"), "../june.csv", "key identification")
+    ... except ro.InputError as error:
+    ...     print(error)
+    key identification: found '../june.csv', accepted: the name of a file in the folder.
+    """
+    path = folder / name
+    accepted = "the name of a file in the folder"
+    try:
+        home = Path(os.path.realpath(folder))
+        place = Path(os.path.realpath(path))
+        parts = Path(name).parts
+        lies_in = place != home and place.is_relative_to(home)
+    except (OSError, ValueError) as error:
+        raise InputError(where, str(error), accepted, file) from None
+    if not parts or ".." in parts or Path(name).is_absolute() or not lies_in:
+        raise InputError(where, f"{name!r}", accepted, file)
+    return path
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -112,52 +150,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep
         raise InputError("the TOML text", str(error), "TOML 1.0", path) from None
-
-
-def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
-    """Return ``content`` as ``model``, or raise an InputError for the first thing that does not fit."""
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        misfit = (first.get("ctx") or {}).get("error")
-        where = _where(first["loc"])
-        if isinstance(misfit, Misfit):
-            where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
-            raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
-        if first["type"] == "missing":
-            raise InputError(f"key {where}", "nothing", "this key is required", file) from None
-        wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
-
-
-def _where(loc: tuple[int | str, ...]) -> str:
-    """Format pydantic's location the way a person counts: ``joint 3.a``."""
-    text = ""
-    for part in loc:
-        if isinstance(part, str) and part.startswith("list["):  # which of several types, and no key
-            continue
-        text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
-    return text
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
-    write_text(path, _json(content))
-
-
-def json_text(content: Any) -> str:
-    """Return any content as JSON: arrays as lists, paths as texts, what is not finite as null."""
-    return _json(to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: value.tolist()))
-
-
-def _json(content: Any) -> str:
-    """Return JSON; a row of numbers stands on one line.
-
-    A text cannot be taken for such a row, since JSON escapes its line breaks.
-    """
-    text = json.dumps(content, indent=2, allow_nan=False)
-    return re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text) + "\n"
 
 
 def read_json(path: Path) -> Any:
@@ -205,3 +197,211 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal digits."""
     return sha256(read_bytes(path, LARGEST_DATA)).hexdigest()
+
+
+# Writing
+
+
+@contextmanager
+def refused(path: object) -> Iterator[None]:
+    """Turn what the system refuses while ``path`` is written into a sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RpimError(f"{path}: cannot be written: {error}.") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text so that ``path`` holds either the whole new text or what it held before."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write bytes so that ``path`` holds either all of them or what it held before, also after a power failure.
+
+    A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A
+    device or pipe gets the bytes as they are.
+    """
+    write_files({path: data})
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write several files as `write_bytes` does: all of them, or none.
+
+    None is touched before the bytes of all are on the disk; when one cannot be put in its place those before it, and
+    folders that were made for them, are taken back.
+    """
+    streams = {path: data for path, data in contents.items() if _is_stream(path)}
+    with undoing() as folders, ExitStack() as stack, undoing() as renames:
+        made: dict[Path, Path] = {}
+        for path, data in contents.items():
+            if path in streams:
+                continue
+            place = Path(os.path.realpath(path))
+            if place.is_dir():
+                raise IsADirectoryError(21, "a folder is there", str(place))
+            make_folder(place.parent, folders)
+            folder = stack.enter_context(scratch_folder(place))
+            made[place] = folder / "file"
+            _write_through(made[place], data, place)
+        for place, file in made.items():
+            if len(contents) > 1:
+                _keep_old(place, file, renames)
+            file.replace(place)
+        for path, data in streams.items():
+            path.write_bytes(data)
+        for folder in {place.parent for place in made}:
+            _settle(folder)
+
+
+@contextmanager
+def undoing() -> Iterator[ExitStack]:
+    """Collect what takes steps back; it is carried out, the last first, only when what follows fails."""
+    with ExitStack() as steps:
+        yield steps
+        steps.pop_all()
+
+
+def make_folder(folder: Path, steps: ExitStack) -> None:
+    """Make a folder and those above it; the steps take them back while nothing is in them."""
+    if folder.is_dir():
+        return
+    make_folder(folder.parent, steps)
+    with suppress(FileExistsError):  # somebody else just made it
+        folder.mkdir()
+        steps.callback(_remove_empty, folder)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _keep_old(place: Path, file: Path, steps: ExitStack) -> None:
+    """Keep what is at a place beside the file that replaces it, for the case that a later one cannot be replaced."""
+    old = file.with_name("old")
+    try:
+        os.link(place, old)
+    except FileNotFoundError:
+        steps.callback(_take_away, place, file)
+        return
+    except OSError:  # a file system without links
+        shutil.copy2(place, old)
+    steps.callback(old.replace, place)
+
+
+def _take_away(place: Path, file: Path) -> None:
+    """Remove a file that was put where none was."""
+    if not file.exists():
+        place.unlink(missing_ok=True)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether something is there that cannot be replaced: a pipe, a device."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def _write_through(file: Path, data: bytes, place: Path) -> None:
+    """Write a new file and wait until it is on the disk; mode and owner are those of the file at ``place``."""
+    with file.open("xb") as stream:
+        _keep_mode(stream.fileno(), place)
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _keep_mode(handle: int, place: Path) -> None:
+    try:
+        known = place.stat()
+    except OSError:
+        return
+    if not os.access(place, os.W_OK):
+        raise PermissionError(13, "the file there is write-protected", str(place))
+    if hasattr(os, "fchown"):
+        with suppress(OSError):  # only the owner's superuser may give a file away
+            os.fchown(handle, known.st_uid, known.st_gid)
+        os.fchmod(handle, stat.S_IMODE(known.st_mode))
+
+
+def _settle(folder: Path) -> None:
+    """Wait until a folder's new names are on the disk."""
+    with suppress(OSError):  # some file systems do not know that
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def scratch_folder(place: Path) -> Iterator[Path]:
+    """Make a folder beside ``place`` for what will be moved there, and remove it in the end.
+
+    A kill leaves it, and the next one for the same place removes it: a lock tells which ones somebody still uses.
+    """
+    for left in place.parent.glob(f".{_literal(place.name)}.*{ENDING}"):
+        _remove_left(left)
+    with ExitStack() as stack:
+        folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
+        while not _lock(folder, stack):  # somebody took it for one that was left
+            folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        yield folder
+
+
+def _literal(name: str) -> str:
+    """Return a name as a pattern that it alone meets."""
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _lock(folder: Path, stack: ExitStack, unlockable: bool = True) -> bool:
+    """Lock a folder until the stack ends; return whether it is there and nobody else has it.
+
+    ``unlockable`` is the answer where locks are not to be had.
+    """
+    if fcntl is None:
+        return unlockable
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+    except OSError:
+        return False
+    stack.callback(os.close, handle)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return unlockable
+    return folder.exists() and folder.stat().st_ino == os.fstat(handle).st_ino
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove a folder that a killed process left."""
+    with ExitStack() as stack:
+        if _lock(folder, stack, unlockable=False):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    write_text(path, _json(content))
+
+
+def json_text(content: Any) -> str:
+    """Return any content as JSON: arrays as lists, paths as texts, what is not finite as null."""
+    from pydantic_core import to_jsonable_python
+
+    return _json(to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: value.tolist()))
+
+
+def _json(content: Any) -> str:
+    """Return JSON; a row of numbers stands on one line.
+
+    A text cannot be taken for such a row, since JSON escapes its line breaks.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False)
+    return re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text) + "\n"

@@ -25,7 +25,8 @@ from zipfile import ZipFile
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.inputs import LARGEST_DATA, read_bytes, read_text, require_file
+from rpim_opt.basics.files import LARGEST_DATA, read_bytes, read_text, require_file
+from rpim_opt.basics.units import numeral
 
 WIDEST = 1000
 """Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
@@ -376,11 +377,8 @@ def numbers(cells: Sequence[Any], labels: Sequence[str], column: str) -> np.ndar
 
 def _number(cell: Any, row: str, column: str) -> float:
     text = "" if cell is None else str(cell).strip()
-    try:
-        value = math.nan if isinstance(cell, bool | np.bool_) or "_" in text else float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+    value = math.nan if isinstance(cell, bool | np.bool_) else numeral(text)
+    if math.isnan(value):
         raise InputError(f"row {row}, column {column}", f"'{text[:40]}'", "a finite number")
     return value
 

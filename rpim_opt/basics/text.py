@@ -1,19 +1,22 @@
-"""Tables as text and for notebooks."""
+"""Text: tables, lists and figures as people read them, objects in one line or as a table, and progress."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from html import escape
+from importlib.util import find_spec
 from io import StringIO
+from typing import Any
 from unicodedata import category
-
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a plain-text table; the first column is aligned left, the others right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
     grid = Table(*header, box=SIMPLE_HEAD, pad_edge=False)
     for column in grid.columns[1:]:
         column.justify = "right"
@@ -101,3 +104,142 @@ def percent(share: float) -> str:
     ('95 %', '99.9 %')
     """
     return f"{100 * share:.4g} %"
+
+
+# Objects
+
+
+MOST = 60
+"""Rows of a table in a notebook."""
+YES_OR_NO = {True: "yes", False: "no"}
+LONGEST = 60
+"""Characters of a title in one line."""
+
+
+class Brief:
+    """What says what it is in one short line; `_short` is that line without the class's name.
+
+    >>> import rpim_opt as ro
+    >>> ro.load("position").problem.robot
+    <Robot 'ABB IRB 120-3/0.58', 6 joints>
+    """
+
+    def _short(self) -> str:
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        return f"<{type(self).__name__} {self._short()}>"
+
+
+class Tabled(Brief):
+    """What is a table besides: `_frame_rows` are its rows by column, whose names carry units."""
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        raise NotImplementedError
+
+    def _shown_rows(self) -> list[dict[str, Any]]:
+        """Return the rows for a notebook, where they are others."""
+        return self._frame_rows()
+
+    def _notes(self) -> Sequence[str]:
+        """Return sentences below the table."""
+        return ()
+
+    def to_frame(self) -> Any:
+        """Return its table as a data frame (pandas, or polars where that is missing).
+
+        Raises
+        ------
+        InputError
+            Where neither is installed.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> frame = ro.load("position").problem.parameters.to_frame()
+        >>> list(frame.columns)
+        ['parameter', 'unit', 'nominal', 'scale', 'tolerance', 'identified']
+        """
+        from rpim_opt.basics.tables import frame_of
+
+        return frame_of(self._frame_rows())
+
+    def _repr_html_(self) -> str:
+        """Return the table for a notebook."""
+        return as_html(self._shown_rows(), self._notes(), f"{type(self).__name__} {self._short()}")
+
+
+def as_html(rows: Sequence[dict[str, Any]], notes: Sequence[str], title: str = "") -> str:
+    """Return rows as a table of HTML with a line above and sentences below; columns without any value are left out."""
+    head: list[str] = []
+    if rows:
+        head = [key for key in rows[0] if any(row[key] is not None for row in rows)]
+    cells = [[_cell(row[key]) for key in head] for row in rows[:MOST]]
+    if len(rows) > MOST:
+        notes = [f"... and {len(rows) - MOST} rows more.", *notes]
+    return html_table(head, cells, notes=notes, title=title)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return YES_OR_NO[value]
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_cell, value))
+    return str(value)
+
+
+def counted(count: int, word: str) -> str:
+    """Return a number with a word: ``1 row``, ``3 rows``."""
+    if count == 1:
+        return f"1 {word}"
+    return f"{count} {word}s"
+
+
+def shortened(text: str) -> str:
+    """Return the beginning of a title."""
+    if len(text) <= LONGEST:
+        return text
+    return text[: LONGEST - 3] + "..."
+
+
+# Progress
+
+
+Progress = Callable[[int, int], None]
+"""Receives how many of how many are done."""
+
+
+@contextmanager
+def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress]:
+    """Give what receives how many of how many are done.
+
+    Parameters
+    ----------
+    name
+        What stands before the bar.
+    wanted
+        Whether there is a bar on stderr, if that is a terminal or a notebook with widgets; or a function of one's own.
+    """
+    if callable(wanted):
+        yield wanted
+        return
+    from rich import progress
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    columns = (
+        progress.TextColumn(name),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeRemainingColumn(),
+    )
+    drawable = console.is_jupyter and find_spec("ipywidgets") is not None  # which rich asks for, with a warning
+    visible = wanted and (console.is_terminal or drawable)
+    with progress.Progress(*columns, console=console, transient=True, disable=not visible) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, every: bar.update(task, completed=done, total=every)

@@ -1,25 +1,23 @@
-"""Threads: one for linear algebra, whose matrices are small; all cores for blocks of rows, whose number is large."""
+"""Threads and time: all cores for blocks of rows, one thread for small matrices, and seconds by phase."""
 
 from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-from rpim_opt.basics.phases import beside
-
 Function = TypeVar("Function", bound=Callable[..., Any])
-_lock = threading.Lock()
-_inside = 0
-_limit: Any = None
-_worker = threading.local()
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
+_worker = threading.local()
 
 
 def cores() -> int:
@@ -43,50 +41,18 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     workers = min(cores(), len(waiting))
     if workers < 2 or getattr(_worker, "busy", False):
         return [function(item) for item in waiting]
-    turns = iter(range(len(waiting)))  # each taken by one thread
-    answers: dict[int, Answer] = {}
-    errors: dict[int, Exception] = {}
-
-    def work() -> None:
-        for k in turns:
-            try:
-                answers[k] = function(waiting[k])
-            except Exception as error:
-                errors[k] = error
-                _spend(turns)
-
-    with beside(workers) as counted:
-        share = counted(work)
-        others: list[Future[None]] = []
-        _worker.busy = True
-        try:
-            for _ in range(workers - 1):
-                others.append(_threads(cores(), os.getpid()).submit(share))
-            share()  # here, too: where all others are busy, and wait for what this thread holds, it ends all the same
-        finally:
-            _worker.busy = False
-            _spend(turns)
-            wait([other for other in others if not other.cancel()])
-    if errors:  # turns are taken in order: the first error is always the same
-        raise errors[min(errors)]
-    return [answers[k] for k in range(len(waiting))]
-
-
-def _spend(turns: Iterator[int]) -> None:
-    """Leave nothing to do: after an error, or Ctrl-C, nobody goes on."""
-    for _ in turns:
-        pass
-
-
-@lru_cache(maxsize=1)
-def _threads(count: int, process: int) -> ThreadPoolExecutor:
-    """Return threads that stay: to start them takes as long as a block. A process has its own, a fork none of them."""
-    return ThreadPoolExecutor(count, initializer=_begin)
+    with beside(workers) as counted, ThreadPoolExecutor(workers, initializer=_begin) as pool:
+        return list(pool.map(counted(function), waiting))
 
 
 def _begin() -> None:
     """Mark a thread as one of those that work at once: it starts no others."""
     _worker.busy = True
+
+
+_lock = threading.Lock()
+_inside = 0
+_limit: Any = None
 
 
 @lru_cache(maxsize=1)
@@ -120,3 +86,98 @@ def one_blas_thread(function: Function) -> Function:
                     _limit.__exit__(None, None, None)
 
     return limited  # type: ignore[return-value]
+
+
+# Phases
+
+
+PHASES = ("evaluation", "reduction", "canonicalization", "solve", "selection")
+_running: ContextVar[Clock | None] = ContextVar("clock", default=None)
+
+
+class Clock:
+    """Seconds by phase; a phase inside another one counts for itself alone."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
+        self.started = self._since = time.perf_counter()
+        self._stack: list[str] = []
+
+    def switch(self, phase: str | None) -> None:
+        """Begin a phase, or end the one that runs."""
+        now = time.perf_counter()
+        if self._stack:
+            self.seconds[self._stack[-1]] += now - self._since
+        self._since = now
+        if phase is None:
+            self._stack.pop()
+        else:
+            self._stack.append(phase)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a phase runs."""
+        return bool(self._stack)
+
+    def rows(self) -> list[tuple[str, float]]:
+        """Return the seconds of every phase, and what is left of the time since the clock was made."""
+        other = time.perf_counter() - self.started - sum(self.seconds.values())
+        return [*self.seconds.items(), ("other", other)]
+
+
+@contextmanager
+def clock() -> Iterator[Clock]:
+    """Measure what runs inside: ``with clock() as c: calibrate(...)``, then ``c.rows()``."""
+    running = Clock()
+    token = _running.set(running)
+    try:
+        yield running
+    finally:
+        _running.reset(token)
+
+
+@contextmanager
+def beside(workers: int) -> Iterator[Callable[[Callable[..., Any]], Callable[..., Any]]]:
+    """Count the phases of threads that work at once: ``with beside(2) as counted: threads.map(counted(work), ...)``.
+
+    A second in each of several threads is one second; what runs inside a phase of the caller's counts for that phase.
+    """
+    running = _running.get()
+    clocks: list[Clock] = []
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        if running is None:
+            return function
+        inside = running.busy
+
+        def timed(*arguments: Any) -> Any:
+            with clock() as own:
+                if not inside:
+                    clocks.append(own)
+                return function(*arguments)
+
+        return timed
+
+    yield counted
+    if running is not None:
+        for own in clocks:
+            for name, seconds in own.seconds.items():
+                running.seconds[name] += seconds / workers
+
+
+class phase:  # noqa: N801 - used like a function
+    """Count what runs inside as a phase, if a clock runs: ``with phase("solve"): ...``."""
+
+    __slots__ = ("_clock", "_name")
+
+    def __init__(self, name: str):
+        self._name = name
+        self._clock = _running.get()
+
+    def __enter__(self) -> None:
+        if self._clock is not None:
+            self._clock.switch(self._name)
+
+    def __exit__(self, *_: object) -> None:
+        if self._clock is not None:
+            self._clock.switch(None)

@@ -1,9 +1,10 @@
-"""Units at the border: names carry them as a suffix (``d_mm``, ``q1_deg``), inside everything is SI."""
+"""Units and names at the border: a suffix states the unit (``d_mm``, ``q1_deg``), inside everything is SI."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -79,7 +80,7 @@ DISPLAY = {
 """The unit in which a dimension is shown and written."""
 
 
-_LONGEST = max(map(len, UNITS))
+_LONGEST_UNIT = max(map(len, UNITS))
 
 
 @cache
@@ -120,7 +121,7 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     """
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
-    place = name.find("_", max(len(name) - _LONGEST - 1, 0))
+    place = name.find("_", max(len(name) - _LONGEST_UNIT - 1, 0))
     while place >= 0:  # the first that fits is the longest
         unit = UNITS.get(name[place + 1 :])
         if unit is not None:
@@ -148,6 +149,20 @@ def number(value: Any, where: str) -> float:
         except OverflowError:  # an integer beyond all doubles
             pass
     raise InputError(where, repr(value)[:60], "a finite number")
+
+
+def numeral(text: str) -> float:
+    """Return the finite number that a text in ASCII is, as Python writes it; NaN for every other text.
+
+    >>> from rpim_opt.basics.units import numeral
+    >>> numeral("1.5e-3"), numeral("1_000"), numeral("inf")
+    (0.0015, nan, nan)
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
 def require_size(value: Any, where: str, unit: Unit) -> None:
@@ -209,3 +224,17 @@ def quantities(
 
 def _accepted(dimensions: Mapping[str, tuple[str, ...]]) -> list[str]:
     return [name for stem, of in dimensions.items() for name in spelled(stem, of, 3)]
+
+
+LONGEST = 200
+"""Characters of a pattern: longer ones, which nobody writes, would take for ever to be matched."""
+
+
+def fits(name: str, pattern: str) -> bool:
+    """Return whether a pattern (``d?``, ``theta[23]``, ``tool_*``) matches a name; one that is too long matches none.
+
+    >>> from rpim_opt.basics.units import fits
+    >>> fits("d2", "d?"), fits("theta2", "theta[13]"), fits("a", "*" * 1000)
+    (True, False, False)
+    """
+    return len(pattern) <= LONGEST and fnmatchcase(name, pattern)

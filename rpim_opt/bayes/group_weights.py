@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.patterns import fits
+from rpim_opt.basics.units import fits
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.program import pose
 from rpim_opt.convex.quadratic import ridge

@@ -11,9 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.phases import phase
-from rpim_opt.basics.shown import Brief
-from rpim_opt.basics.text import joined
+from rpim_opt.basics.text import Brief, joined
+from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, scale_covariance
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import Stated

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.patterns import fits
+from rpim_opt.basics.units import fits
 from rpim_opt.bayes import statements
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths, penalized
 from rpim_opt.bayes.statements import Result, Statement, posterior
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.robot.mdh import MDH
-from rpim_opt.robot.overlay import Overlay, is_joint_offset
-from rpim_opt.robot.parameter_names import MDH_DIMENSION, of_session, own_name
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
+from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
+from rpim_opt.robot.parameters import Parameters, overlay
 
 OFFSETS = "joint offsets"
 """The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
@@ -296,12 +295,11 @@ class Prior:
         """
         free = parameters.free
         identified = parameters.identified
-        table = Overlay(parameters.names, parameters.dimensions, parameters.groups)
-        centre = table.on(np.zeros(len(parameters)), self.centre, "prior, table centre", signed=True)
+        centre = overlay(parameters, np.zeros(len(parameters)), self.centre, "prior, table centre", signed=True)
         widths = parameters.scale
         if widened:
             widths = default_widths(parameters, self.joint_offset, self.frames)
-        width = table.on(widths, self.scale, "prior, table scale")
+        width = overlay(parameters, widths, self.scale, "prior, table scale")
         rows, values, replaced = [np.zeros((0, len(free)))], [np.zeros(0)], np.zeros(len(free), dtype=bool)
         for each in self.statements:
             more, right, whole = each.on(parameters)
@@ -371,8 +369,7 @@ class Prior:
 
     def _fixed(self, parameters: Parameters) -> np.ndarray:
         """Return which identified parameters have a width that is no part of any size: tools, and what is stated."""
-        table = Overlay(parameters.names, parameters.dimensions, parameters.groups)
-        stated = np.isfinite(table.on(np.full(len(parameters), np.nan), self.scale, "prior, table scale"))
+        stated = np.isfinite(overlay(parameters, np.full(len(parameters), np.nan), self.scale, "prior, table scale"))
         of_base = np.array([_of_base(name) for name in parameters.names])
         return (parameters.placed & (stated | ~of_base))[parameters.identified]
 

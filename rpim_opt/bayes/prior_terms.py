@@ -15,7 +15,7 @@ from rpim_opt.convex.atoms import SQUARES, cp, named
 from rpim_opt.convex.constraints import Ready
 from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.structure import Quadratic
-from rpim_opt.robot.overlay import is_joint_offset
+from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
 FIXED = -1

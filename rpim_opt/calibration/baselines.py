@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import optimize
 from rpim_opt.problem.problem import CalibrationProblem
 
 __all__ = [
@@ -102,7 +102,7 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
         return problem.linearize(scale * z).A
 
     jac: Any = slope
-    found = optimize.least_squares(
+    found = scipy.optimize.least_squares(
         residual, np.zeros_like(scale), jac=jac, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200
     )
     return Baseline(scale * found.x, int(found.nfev), "Levenberg-Marquardt")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import phase
 from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight

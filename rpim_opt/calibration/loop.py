@@ -12,7 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import phase
 from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.choosing import Choosing, choosing
 from rpim_opt.calibration.outcome import Iteration

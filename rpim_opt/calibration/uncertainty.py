@@ -12,8 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.shown import Tabled
-from rpim_opt.basics.text import table
+from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor, coverage_factors
 from rpim_opt.calibration.result import Calibration, Prediction

@@ -17,9 +17,8 @@ from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.select import disagreement
 from rpim_opt.data.record import Earlier
-from rpim_opt.robot.family import EXPECTED
-from rpim_opt.robot.overlay import is_joint_offset
-from rpim_opt.robot.parameter_names import EXPANSION, of_session, own_name
+from rpim_opt.robot.extensions import EXPECTED
+from rpim_opt.robot.parameter_names import EXPANSION, is_joint_offset, of_session, own_name
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
 """Outlying rows and active bounds that are named one by one."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import sparse
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import Given
@@ -132,5 +132,5 @@ def norms(r: Any, group: np.ndarray) -> Any:
     place[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
     shape = (len(count), int(count.max()))  # shorter groups are filled with zeros
     at = (which * shape[1] + place, np.arange(len(group)))
-    pick = sparse.csr_array((np.ones(len(group)), at), (shape[0] * shape[1], len(group)))
+    pick = scipy.sparse.csr_array((np.ones(len(group)), at), (shape[0] * shape[1], len(group)))
     return cp.norm(cp.reshape(pick @ r, shape, order="C"), 2, axis=1)

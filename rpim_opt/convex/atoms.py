@@ -5,14 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
-
-from rpim_opt.basics.late import Late
 
 if TYPE_CHECKING:
     import cvxpy as cp
 else:
-    cp = Late("cvxpy")
+
+    class _Late(ModuleType):
+        """CVXPY, imported when something of it is first used."""
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("__"):  # what doctest and inspect ask of every module is no use of it
+                raise AttributeError(name)
+            return getattr(import_module(self.__name__), name)
+
+    cp = _Late("cvxpy")
 
 OPTIMAL, INFEASIBLE, UNBOUNDED = "optimal", "infeasible", "unbounded"
 INFEASIBLE_INACCURATE = "infeasible_inaccurate"

@@ -11,8 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.patterns import fits
-from rpim_opt.basics.units import display
+from rpim_opt.basics.units import display, fits
 from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.drawn import parse
 from rpim_opt.convex.structure import Quadratic

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import sparse
 from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.posed import invariant
@@ -90,7 +90,7 @@ class Squares:
         across = slope / (2 * v)
         along = np.maximum(self._along(model, z, which, v, priced), LEAST_CURVATURE * across)
         u = r / v[which]
-        along_u = sparse.csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
+        along_u = scipy.sparse.csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
         projected = along_u @ model.A  # u'A, group by group
         A = np.sqrt(across)[which, None] * model.A
         A += ((np.sqrt(along) - np.sqrt(across))[which] * u)[:, None] * projected[which]

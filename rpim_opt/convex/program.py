@@ -13,9 +13,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.phases import phase
-from rpim_opt.basics.shown import Brief
-from rpim_opt.basics.threads import one_blas_thread
+from rpim_opt.basics.text import Brief
+from rpim_opt.basics.threads import one_blas_thread, phase
 from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.formulation import Formulation, formulation_of

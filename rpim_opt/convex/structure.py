@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import sparse
 from rpim_opt.convex.atoms import cp
 
 DENSE = 2000
@@ -98,8 +98,8 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
     start = data["param_prob"].var_id_to_col[variable.id]
     own = start + np.arange(variable.size)
     rest = np.setdiff1d(np.arange(len(data["c"])), own)
-    P: Any = sparse.csr_array(data["P"])
-    A: Any = sparse.csc_array(data["A"])
+    P: Any = scipy.sparse.csr_array(data["P"])
+    A: Any = scipy.sparse.csc_array(data["A"])
     if A.shape[0] != len(rest):
         return None
     H: Any = P[own][:, own]
@@ -107,10 +107,10 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
     if not len(rest):
         return H, g
     try:
-        factors = sparse.linalg.splu(sparse.csc_matrix(A[:, rest]))
+        factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(A[:, rest]))
     except RuntimeError:  # singular: they do not follow from v
         return None
-    M = -sparse.csr_array(factors.solve(A[:, own].toarray()))
+    M = -scipy.sparse.csr_array(factors.solve(A[:, own].toarray()))
     d = factors.solve(np.asarray(data["b"], dtype=float))
     cross, inner = P[own][:, rest], P[rest][:, rest]
     H = H + cross @ M + M.T @ cross.T + M.T @ inner @ M
@@ -120,7 +120,7 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
 
 def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
     """Complete the square of 1/2 v'H v + g'v + at_zero; None where it has no minimum, or is too large to factor."""
-    H = sparse.coo_array(H)
+    H = scipy.sparse.coo_array(H)
     off = H.row != H.col
     if not np.any(H.data[off]):
         diagonal = np.bincount(H.row, H.data, minlength=len(g)) / 2

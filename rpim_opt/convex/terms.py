@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import sparse
 from rpim_opt.convex.atoms import cp
 
 
@@ -137,7 +137,7 @@ class Term:
                 found = self.expression.grad.get(self.variable)
         if found is None:
             return None
-        if not sparse.issparse(found):
+        if not scipy.sparse.issparse(found):
             return np.atleast_1d(np.asarray(found, dtype=float)).ravel()
         return np.asarray(found.todense()).ravel()
 

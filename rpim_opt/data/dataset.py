@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.shown import Brief, Tabled, counted
+from rpim_opt.basics.text import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position

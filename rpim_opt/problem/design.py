@@ -10,8 +10,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.shown import Brief, counted
 from rpim_opt.basics.tables import numbers, read_columns
+from rpim_opt.basics.text import Brief, counted
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.shown import Tabled, counted
-from rpim_opt.basics.statistics import statistics
-from rpim_opt.basics.text import listed, table, three_digits
+from rpim_opt.basics.text import Tabled, counted, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import KNOWN

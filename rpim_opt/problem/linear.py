@@ -11,9 +11,8 @@ from scipy.linalg import lapack
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.phases import phase
-from rpim_opt.basics.shown import Brief, counted
-from rpim_opt.basics.threads import on_all_cores
+from rpim_opt.basics.text import Brief, counted
+from rpim_opt.basics.threads import on_all_cores, phase
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10

@@ -8,20 +8,20 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import transform
 from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import posed
 from rpim_opt.problem.registration.closed_forms import Fit, hand_eye, register_arm, transforms
+from rpim_opt.robot.formats.tables import read_mdh
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.plain import read_mdh
 
 MOST_ROWS = 300
 """Rows that are tried, evenly spread where there are more."""
@@ -164,7 +164,7 @@ def _angles(robot: Robot, q: Array, measured: Array) -> Array | None:
     except InputError:
         return None
     error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
-    return transform.Rotation.from_matrix(error).magnitude()
+    return scipy.spatial.transform.Rotation.from_matrix(error).magnitude()
 
 
 def pose_misfit(robot: Robot, data: Dataset) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.shown import Brief
+from rpim_opt.basics.text import Brief
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.source import Source

@@ -22,9 +22,9 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Model
 
 ROWS = 4096
 """Rows that are weighed and reduced together, of losses that are no squares."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.phases import phase
-from rpim_opt.basics.shown import Tabled, counted
+from rpim_opt.basics.text import Tabled, counted
+from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.identified import Identified, identified_of
@@ -21,10 +21,9 @@ from rpim_opt.problem.row_functions import Evaluation, Kept, measured_torques, r
 from rpim_opt.problem.scatter import Scatter, Stack, joint_slopes, shifts, stacked
 from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.model import with_terms
-from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, with_terms
+from rpim_opt.robot.terms import Model
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -13,16 +13,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.registry import READY
-from rpim_opt.robot.deflection import Statics
 from rpim_opt.robot.evaluation import SYMBOLS, evaluate_rows, write_rows
-from rpim_opt.robot.gravity import Gravity
+from rpim_opt.robot.extensions import Statics
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
-from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.open_model import asked_by
+from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import (
     EXPANSION,
     REFERENCE,
@@ -33,8 +31,7 @@ from rpim_opt.robot.parameter_names import (
     tool_prefix,
 )
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.posture import Posture, Symbol
-from rpim_opt.robot.terms import Term
+from rpim_opt.robot.terms import Posture, Symbol, Term, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -367,7 +364,7 @@ class Needs(NamedTuple):
         used = parameters.identified | (parameters.nominal != 0)
         names = {parameters.names[i] for i in np.flatnonzero(used)}
         terms = [name for name in names if of_term(name)]
-        asked = asked_by(robot.model, robot.joint_types, names.__contains__)
+        asked = dependencies(robot.model, robot.joint_types, names.__contains__)
         return cls(
             torques=asked.torques or any(name.startswith("compliance") for name in terms),
             moments=asked.gravity or any(name.startswith("bend") for name in terms),
@@ -435,7 +432,7 @@ def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
 def _sees_approach(robot: Robot, name: str) -> bool:
     if not robot.model.terms:
         return False
-    return asked_by(robot.model, robot.joint_types, lambda other: other == name).approach
+    return dependencies(robot.model, robot.joint_types, lambda other: other == name).approach
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:

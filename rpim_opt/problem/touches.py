@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import sparse
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.problem.scatter import Stack
 
@@ -505,7 +505,7 @@ def _apart(stack: Stack) -> Iterator[Stack]:
     V = stack.instrument[0]
     U = stack.unit[0]
     related = (np.abs(V) > ROUNDING * np.abs(V).max(initial=0.0)) | (np.abs(U) > ROUNDING)
-    number = sparse.csgraph.connected_components(related | np.eye(k, dtype=bool))[1]
+    number = scipy.sparse.csgraph.connected_components(related | np.eye(k, dtype=bool))[1]
     for part in (np.flatnonzero(number == i) for i in range(number.max(initial=-1) + 1)):
         yield Stack(
             index=stack.index[:, part],

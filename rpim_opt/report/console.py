@@ -95,7 +95,7 @@ def progress() -> Iterator[Callable[[str], None]]:
 
 def written_to(path: Path | None, text: str) -> list[Path]:
     """Write a text where a path is given, and return the paths written."""
-    from rpim_opt.basics.writing import refused, write_text
+    from rpim_opt.basics.files import refused, write_text
 
     if path is None:
         return []

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.writing import refused, write_text
+from rpim_opt.basics.files import refused, write_text
 from rpim_opt.report.chart import Chart, Picture
 from rpim_opt.report.charts import checks_charts, mm
 from rpim_opt.use.monitoring import Monitoring

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
-from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
-from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.acceptance import Acceptance
 from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.held_out_rows import judged as predicted

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.text import joined, percent, table
 from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.lack_of_fit import judged

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import transform
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, numeric_link
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH, Robot
 
 NEAR_PARALLEL = 0.1
@@ -77,7 +77,7 @@ class Chain:
 def same_place(one: Array, other: Array) -> bool:
     """Return whether two frames (6,) are within `SAME_PLACE`."""
     T = np.linalg.inv(numeric_frame(one)) @ numeric_frame(other)
-    angle = transform.Rotation.from_matrix(T[:3, :3]).magnitude()
+    angle = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).magnitude()
     return bool(np.linalg.norm(T[:3, 3]) < SAME_PLACE[0] and angle < SAME_PLACE[1])
 
 
@@ -122,15 +122,15 @@ def describe(
     start = chain.origins[0] @ turns[0]
     coaxial = np.abs(start[:2, 2:]).max() < 1e-12 and start[2, 2] > 0
     # C_i commutes with joint i's motion: Rot(z) Trans(z)
-    C = np.linalg.inv(start) if coaxial else link_of(d=-start[:3, 2] @ start[:3, 3])
+    C = np.linalg.inv(start) if coaxial else numeric_link(d=-start[:3, 2] @ start[:3, 3])
     base = np.eye(4) if coaxial else start @ C
     for i in range(n - 1):
         step = turns[i].T @ chain.origins[i + 1] @ turns[i + 1]
         theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, near[i, 2], near[i, 3], parallel)
         table[i, 2:] = theta, d, beta
         table[i + 1, :2] = alpha, a
-        G[i] = np.linalg.inv(C @ link_of(theta=theta, d=d)) @ turns[i].T
-        C = np.linalg.inv(step) @ C @ link_of(theta=theta, d=d, beta=beta) @ link_of(alpha=alpha, a=a)
+        G[i] = np.linalg.inv(C @ numeric_link(theta=theta, d=d)) @ turns[i].T
+        C = np.linalg.inv(step) @ C @ numeric_link(theta=theta, d=d, beta=beta) @ numeric_link(alpha=alpha, a=a)
     table[-1, 2:4] = _turned(-np.arctan2(C[1, 0], C[0, 0]), near[-1, 2]), -C[2, 3]
     G[-1] = turns[-1].T
     return table + 0.0, base, turns[-1].T @ chain.tail, G
@@ -146,8 +146,8 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Ar
 
     (O_1 with the base in place of G_0^-1.) What joint i's own zero and place are wrong by moves the frame of link i.
     """
-    before = [base, *(np.linalg.inv(g) @ link_of(beta=row[4]) for g, row in zip(G, table, strict=True))]
-    origins = [b @ link_of(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
+    before = [base, *(np.linalg.inv(g) @ numeric_link(beta=row[4]) for g, row in zip(G, table, strict=True))]
+    origins = [b @ numeric_link(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
     return origins, before[-1] @ tool
 
 
@@ -193,9 +193,9 @@ def without_beta(robot: Robot) -> Robot:
     n = robot.dof
     if table[-1, 4]:
         raise InputError("robot", f"beta{n} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint")
-    before = [np.eye(4), *(link_of(beta=row[4]) for row in table[:-1])]
-    origins = [b @ link_of(*row[:4]) for b, row in zip(before, table, strict=True)]
-    origins[0] = link_of(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
+    before = [np.eye(4), *(numeric_link(beta=row[4]) for row in table[:-1])]
+    origins = [b @ numeric_link(*row[:4]) for b, row in zip(before, table, strict=True)]
+    origins[0] = numeric_link(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
     plain = describe(Chain.about_z(origins, np.eye(4)), table, 1e-10)[0]
     plain[0, :2] = table[0, :2]
     plain[:, 4] = 0.0
@@ -207,18 +207,13 @@ def without_beta(robot: Robot) -> Robot:
     return result
 
 
-def link_of(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
-    """Return the link's transform (4, 4) as numbers."""
-    return numeric_link(alpha, a, theta, d, beta)
-
-
 def _to_axis(axis: Array) -> Array:
     """Return the smallest turn (4, 4) that takes z to a unit vector."""
     T = np.eye(4)
     v = np.cross([0.0, 0.0, 1.0], axis)
     s = float(np.linalg.norm(v))
     turn = v / s if s > 0 else np.array([1.0, 0.0, 0.0])  # to -z: about x
-    T[:3, :3] = transform.Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
     return T
 
 
@@ -244,10 +239,45 @@ def _step(M: Array, theta0: float, d0: float, parallel: float) -> tuple[float, f
         a = -a
     theta = np.arctan2(x[1], x[0])
     beta = np.arctan2(-x[2], np.hypot(x[0], x[1]))
-    w = np.linalg.inv(link_of(theta=theta, beta=beta))[:3, :3] @ v
+    w = np.linalg.inv(numeric_link(theta=theta, beta=beta))[:3, :3] @ v
     return _turned(theta, theta0), float(d), float(beta), float(np.arctan2(-w[1], w[2])), float(a)
 
 
 def _turned(angle: float, near: float) -> float:
     """Return the angle plus the full turns that bring it nearest to another."""
     return float(angle + 2 * np.pi * np.round((near - angle) / (2 * np.pi)))
+
+
+# Numbers in the files of robots
+
+XACRO = ".xacro"
+ROUNDING = 1e-14
+"""Of numbers of an arm of a metre, and of an angle's cosine."""
+
+
+def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:
+    """Return ``data`` with the bytes from start to end replaced by texts, everything else as it was."""
+    for (start, end), text in sorted(edits.items(), reverse=True):
+        data = data[:start] + text.encode() + data[end:]
+    return data
+
+
+def reach(table: Array, *frames: Array) -> float:
+    """Return the length of an arm stretched out [m], at least one, with the frames (4, 4) at its ends.
+
+    Places on it are rounded in proportion.
+    """
+    ends = sum(float(np.linalg.norm(T[:3, 3])) for T in frames)
+    return max(float(np.abs(table[:, 1::2]).sum()) + ends, 1.0)
+
+
+def origin_numbers(T: Array, old: Array, size: float) -> tuple[str | None, str | None]:
+    """Return an origin's new xyz and rpy as texts that read back exactly; None for what is as it was.
+
+    ``size`` is the arm's `reach` [m].
+    """
+    six = frame_numbers(T) + 0.0  # no negative zeros
+    texts = [" ".join(repr(float(v)) for v in part) for part in (six[:3], six[3:])]
+    moved = np.abs(T[:3, 3] - old[:3, 3]).max() > ROUNDING * size
+    turned = np.abs(T[:3, :3] - old[:3, :3]).max() > ROUNDING
+    return texts[0] if moved else None, texts[1] if turned else None

@@ -15,10 +15,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.robot.evaluation import call_rows
-from rpim_opt.robot.joint_terms import displacement, motion
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.posture import Posture, Symbol
-from rpim_opt.robot.terms import Term
+from rpim_opt.robot.terms import Posture, Symbol, Term, displacement, motion
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -71,9 +69,9 @@ def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> li
     return [rotation_x(alpha), translation(x=a), rotation_z(theta), translation(z=d), rotation_y(beta)]
 
 
-def numeric_link(*numbers: float) -> Array:
-    """Return the link's transform (4, 4) of alpha, a, theta, d and beta as numbers."""
-    return _link()(*numbers).full()
+def numeric_link(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
+    """Return the link's transform (4, 4) as numbers."""
+    return _link()(alpha, a, theta, d, beta).full()
 
 
 @lru_cache(maxsize=1)

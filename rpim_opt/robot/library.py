@@ -1,4 +1,4 @@
-"""The robot that a problem names: a file of any kind, or one of the ready robots."""
+"""The robot that a problem names: a file of any format, or one of the ready robots."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.inputs import inside, require_file
-from rpim_opt.robot.chain import Described
-from rpim_opt.robot.expanding import XACRO
-from rpim_opt.robot.plain import read_mdh
+from rpim_opt.basics.files import inside, require_file
+from rpim_opt.robot.chain import XACRO, Described
+from rpim_opt.robot.formats.tables import read_mdh
 
 READY = Path(__file__).resolve().parent / "ready"
-
-
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
-OF_OTHERS = {
+REFUSED = {
     XACRO: "a xacro file, which only a command or a script may name: it is carried out",
     ".xml": "an XML file, of MuJoCo or others",
     ".mjcf": "a model of MuJoCo",
@@ -45,27 +42,27 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
         return READY / f"{name}.toml"
     accepted = "a file .toml, .urdf, .csv or .json"
     file = None if folder is None else folder / "problem.toml"
-    other = OF_OTHERS.get(Path(name).suffix.lower())
-    if other:
-        raise InputError("key robot", f"'{name}', {other}", accepted, file)
+    refused = REFUSED.get(Path(name).suffix.lower())
+    if refused:
+        raise InputError("key robot", f"'{name}', {refused}", accepted, file)
     raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, ready)}", file)
 
 
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
     """Return the robot of a file, with base and tool where a URDF states them."""
     if file.suffix in (".urdf", XACRO):
-        from rpim_opt.robot.urdf import read_urdf
+        from rpim_opt.robot.formats.urdf import read_urdf
 
         return read_urdf(file, urdf_base, urdf_tip)
     return Described(read_mdh(file), np.zeros(6), np.zeros(6))
 
 
 class RobotSource(NamedTuple):
-    """Where a new problem's robot comes from: its file, what the problem file says of it, and in words."""
+    """The robot of a new problem: its file, its key in the problem file, and where it comes from."""
 
     file: Path
     stated: str
-    drawing: str
+    origin: str
 
 
 def find_source(robot: str) -> RobotSource:

@@ -1,29 +1,151 @@
-"""The robot as its drawing says: a modified Denavit-Hartenberg table with Hayati's parameter."""
+"""The nominal robot: a modified Denavit-Hartenberg table with Hayati's parameter, joints, limits and gravity."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import Angle, Length, Misfit, Table, read_toml, validate
-from rpim_opt.basics.shown import Brief, shortened
-from rpim_opt.basics.units import LARGEST, UNITS, accepted_units
-from rpim_opt.robot.gravity import Gravity
-from rpim_opt.robot.mounting import Mounting, PayloadTable, of_links, stated_gravity
-from rpim_opt.robot.open_model import Model
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.text import Brief, shortened
+from rpim_opt.basics.units import LARGEST
+from rpim_opt.robot.terms import Model
 
 MDH = ("alpha", "a", "theta", "d", "beta")
 """Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
-
+MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
 FARTHEST = 1e15
 """Size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away."""
+STANDARD = 9.80665
+"""Acceleration of free fall [m/s^2]."""
+Vector = tuple[float, float, float]
+MOUNTINGS: dict[str, Vector] = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
+"""Where gravity points in the robot's base; on a wall the base's x axis points up."""
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Gravity on a robot.
+
+    Parameters
+    ----------
+    direction
+        Where it points in the robot's base frame (frame 0 of the table), made a unit vector.
+    masses
+        Of the links that joints 1 to dof move [kg]. Without: a guess, 5 kg at the last frame's origin and 10 kg at
+        frame 4's, which is good enough to tell how torques go with the configuration: compliance takes up their size.
+    centres
+        Where those masses are in the links' own frames [m], the frames after joints 1 to dof.
+    payload
+        What the flange carries besides [kg].
+    payload_centre
+        Where, in the flange frame [m].
+
+    Raises
+    ------
+    InputError
+        For no direction, masses that are negative, numbers that are not finite or do not fit together.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.robot.Gravity(direction=(0, 0, -9.81), payload=2.5).direction
+    (0.0, 0.0, -1.0)
+    >>> ro.robot.Gravity().mounted("ceiling").direction, ro.robot.Gravity().mounted([0, -2, 0]).direction
+    ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+    >>> ro.robot.Gravity().carrying(1.5, (0, 0, 0.1)).payload_centre
+    (0.0, 0.0, 0.1)
+    """
+
+    direction: Vector = (0.0, 0.0, -1.0)
+    masses: tuple[float, ...] = ()
+    centres: tuple[Vector, ...] = ()
+    payload: float = 0.0
+    payload_centre: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction", _unit(self.direction, "direction of gravity"))
+        object.__setattr__(self, "masses", tuple(_mass(mass, "mass of a link") for mass in self.masses))
+        object.__setattr__(self, "centres", tuple(_vector(each, "centre of a link's mass") for each in self.centres))
+        object.__setattr__(self, "payload", _mass(self.payload, "payload"))
+        object.__setattr__(self, "payload_centre", _vector(self.payload_centre, "centre of the payload"))
+        if len(self.centres) != len(self.masses):
+            raise InputError("gravity", f"{len(self.masses)} masses, {len(self.centres)} centres", "one centre a mass")
+
+    def mounted(self, mounting: str | Sequence[float], base: ArrayLike | None = None) -> Gravity:
+        """Return the same masses on a robot that is mounted so.
+
+        Parameters
+        ----------
+        mounting
+            ``"floor"``, ``"ceiling"``, ``"wall"`` (the base's x axis points up), or where gravity points, three numbers
+            in the robot's base.
+        base
+            (3, 3) rotation of frame 0 of the table in the base that is meant, a URDF's root link for instance.
+
+        Raises
+        ------
+        InputError
+            For another word, or three zeros.
+        """
+        if isinstance(mounting, str):
+            if mounting not in MOUNTINGS:
+                raise InputError("mounting", f"'{mounting}'", choices(mounting, [*MOUNTINGS, "[x, y, z]"]))
+            mounting = MOUNTINGS[mounting]
+        direction = np.array(_unit(mounting, "mounting"))
+        if base is not None:
+            direction = np.asarray(base, dtype=float).T @ direction
+            direction[np.abs(direction) < 1e-15] = 0.0
+        return replace(self, direction=tuple(direction.tolist()))
+
+    def carrying(self, payload: float, centre: Sequence[float] | None = None) -> Gravity:
+        """Return the same with a payload.
+
+        Parameters
+        ----------
+        payload
+            Its mass [kg].
+        centre
+            (3,) where it is in the flange frame [m]; as before by default.
+        """
+        if centre is None:
+            centre = self.payload_centre
+        return replace(self, payload=payload, payload_centre=tuple(centre))
+
+
+def _vector(values: ArrayLike, where: str) -> Vector:
+    """Return three finite numbers, none of them a negative zero."""
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(where, f"{values}", "three finite numbers")
+    x, y, z = (array + 0.0).tolist()
+    return x, y, z
+
+
+def _unit(values: ArrayLike, where: str) -> Vector:
+    """Return three numbers as a unit vector."""
+    vector = _vector(values, where)
+    length = math.hypot(*vector)
+    if abs(length - 1) < 1e-15:
+        return vector
+    if not length > 0:
+        raise InputError(where, f"{list(vector)}", "a vector that points somewhere")
+    array: Array = np.array(vector) / length
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def _mass(value: float, where: str) -> float:
+    if not (0 <= value < math.inf):
+        raise InputError(where, f"{value}", "a mass [kg], not negative")
+    return float(value)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,94 +256,3 @@ def _frozen(values: ArrayLike) -> Array:
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     return array
-
-
-class _JointTable(Table):
-    alpha: Angle = 0.0
-    a: Length = 0.0
-    theta: Angle = 0.0
-    d: Length = 0.0
-    beta: Angle = 0.0
-    type: Literal["revolute", "prismatic"] = "revolute"
-    sign: Literal[1, -1] = 1
-    limits: Annotated[list[float] | None, "angle", "length"] = None
-    mass: Annotated[float | None, "mass"] = None
-    centre_x: Length = 0.0
-    centre_y: Length = 0.0
-    centre_z: Length = 0.0
-
-    @model_validator(mode="before")
-    @classmethod
-    def _limits_fit_the_type(cls, table: Any) -> Any:
-        if isinstance(table, dict):
-            moves = "length" if table.get("type") == "prismatic" else "angle"
-            wrong = [u for u, unit in UNITS.items() if f"limits_{u}" in table and unit.dimension != moves]
-            if wrong:
-                accepted = ", ".join(f"limits_{u}" for u in accepted_units(moves))
-                raise Misfit(f"limits_{wrong[0]}", "a unit that does not fit the joint's type", accepted)
-        return table
-
-
-class _RobotTable(Table):
-    name: str
-    source: str = ""
-    joint: list[_JointTable] = Field(min_length=1)
-    coupling: list[list[Annotated[float, Field(strict=False)]]] | None = None
-    mounting: Mounting | None = None
-    payload: PayloadTable | None = None
-
-
-def read_robot(path: str | Path) -> Robot:
-    """Return the robot of a ``robot.toml`` file (its format: the guide "Your own robot").
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key, what was found and what is accepted.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
-    >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
-    [1.5708, 0.0, 0.0, 0.107, 0.0]
-    """
-    path = Path(path)
-    return robot_of(read_toml(path), path)
-
-
-def robot_of(content: dict[str, Any], path: Path) -> Robot:
-    """Return the robot that the keys of a ``robot.toml`` state, whatever file they come from."""
-    table = validate(_RobotTable, content, path)
-    return Robot(
-        name=table.name,
-        mdh=np.array([[getattr(joint, column) for column in MDH] for joint in table.joint]),
-        joint_types=tuple(joint.type for joint in table.joint),
-        joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ _coupling(table, path),
-        limits=_stated_limits(table, path),
-        source=table.source,
-        gravity=_gravity(table, path),
-    )
-
-
-def _gravity(table: _RobotTable, path: Path) -> Gravity:
-    gravity = stated_gravity(Gravity(), table.mounting, table.payload, path)
-    centres = [(joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint]
-    return of_links(gravity, [joint.mass for joint in table.joint], centres, path)
-
-
-def _coupling(table: _RobotTable, path: Path) -> Array:
-    dof = len(table.joint)
-    if table.coupling is None:
-        return np.eye(dof)
-    if len(table.coupling) != dof or any(len(row) != dof for row in table.coupling):
-        raise InputError("key coupling", f"{table.coupling}", f"{dof} rows of {dof} numbers", path)
-    return np.array(table.coupling)
-
-
-def _stated_limits(table: _RobotTable, path: Path) -> Array:
-    limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
-    for number, pair in enumerate(limits, start=1):
-        if len(pair) != 2 or not pair[0] < pair[1]:
-            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]", path)
-    return np.array(limits, dtype=float)

@@ -1,4 +1,4 @@
-"""What parameters are called, and what their names say: of a joint or a frame, which group, which reflector."""
+"""Names of parameters: of a joint or a frame, of which group, of which reflector."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import re
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
-from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.robot.joint_terms import JOINT_TERMS, terms_of
+from rpim_opt.basics.exceptions import choices
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.robot.terms import Term
+from rpim_opt.robot.terms import JOINT_TERMS
 
-MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
+_OFFSET = re.compile(r"theta\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})(\d+)|(bend)(\d+)_\d+[xyz]")
 
+EXPANSION, REFERENCE = "expansion", "reference_temperature"
+"""By how much all lengths of a robot grow with temperature, and the temperature at which they are nominal."""
+JOINT_OFFSET = "joint_offset"
+"""Stands in tables for every theta."""
 KNOWN = 2**14
 """Names of which what they say is kept: those of a hundred robots, asked for again with every table."""
 
@@ -22,10 +25,6 @@ KNOWN = 2**14
 def own_name(name: str) -> str:
     """Return what the robot itself calls a parameter: ``a2`` for ``left.a2`` of several robots."""
     return name.rpartition(".")[2]
-
-
-EXPANSION, REFERENCE = "expansion", "reference_temperature"
-"""By how much all lengths of a robot grow with temperature, and where they are as on the drawing."""
 
 
 @lru_cache(KNOWN)
@@ -40,19 +39,9 @@ def of_term(name: str) -> bool:
 
 
 @lru_cache(KNOWN)
-def term_of(name: str, dof: int) -> tuple[Term, int]:
-    """Return the term of a parameter, and the joint (from 1) whose parameter it is.
-
-    Raises
-    ------
-    InputError
-        For a parameter that no term of an arm with so many joints has.
-    """
-    for i in range(1, dof + 1):
-        for term in terms_of(dof):
-            if name in term.names(i):
-                return term, i
-    raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
+def is_joint_offset(name: str) -> bool:
+    """Return whether a parameter is the offset of a revolute joint: set at assembly, and not machined."""
+    return _OFFSET.fullmatch(own_name(name)) is not None
 
 
 @lru_cache(KNOWN)

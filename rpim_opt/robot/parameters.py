@@ -1,9 +1,9 @@
-"""The parameters of a calibration: names, nominal values, expected sizes, tolerances, and which are identified."""
+"""The parameters of a calibration: names, nominal values, scales, tolerances, and which are identified."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,13 +12,45 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.patterns import fits
-from rpim_opt.basics.shown import Tabled
-from rpim_opt.basics.units import display
-from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
-from rpim_opt.robot.overlay import Overlay
-from rpim_opt.robot.parameter_names import group_of, known_patterns, of_joint, of_session, own_name
+from rpim_opt.basics.text import Tabled
+from rpim_opt.basics.units import SMALLEST, display, fits, quantities, split_unit
+from rpim_opt.robot.extensions import bend_names
+from rpim_opt.robot.kinematics import FRAME_DIMENSION, numeric_frame, roll_pitch_yaw
+from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot
+from rpim_opt.robot.parameter_names import (
+    EXPANSION,
+    JOINT_OFFSET,
+    REFERENCE,
+    group_of,
+    is_joint_offset,
+    known_patterns,
+    of_joint,
+    of_session,
+    own_name,
+    session_prefix,
+    tool_prefix,
+)
+from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Model, entries_of
 
+_PATTERN = re.compile(r"[*?\[]")
+Entry = tuple[str, str, float, float]
+"""Name, dimension, nominal value and usual size of its deviation [SI]."""
+DEFAULT_SCALE = {
+    ("length", "length"): 1e-3,
+    ("angle", "angle"): 1e-3,
+    ("tool", "length"): 10e-3,
+    ("tool", "angle"): 10e-3,
+    ("session", "length"): 1e-4,
+    ("session", "angle"): 1e-4,
+    ("base", "length"): 100e-3,
+    ("base", "angle"): 100e-3,
+    ("camera", "pixel"): 10.0,
+    ("camera", "ratio"): 1e-3,
+    ("camera", ""): 0.05,
+}
+"""Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
+STEEL = 12e-6
+"""By how much steel grows [1/K]; aluminium by 23e-6."""
 SHOWN = 4
 """Names in one line."""
 
@@ -35,9 +67,9 @@ class Parameters(Tabled):
     dimensions
         ``length``, ``angle``, ``ratio`` or ``compliance``.
     nominal
-        (P,) where the deviations count from [SI].
+        (P,) nominal values, from which deviations count [SI].
     scale
-        (P,) expected size of a deviation, its prior standard deviation [SI].
+        (P,) prior standard deviation of a deviation [SI].
     tolerance
         (P,) largest deviation that a bounded calibration allows [SI]; infinite where there is none.
     identified
@@ -56,8 +88,22 @@ class Parameters(Tabled):
     (114, 34, 'length')
     >>> parameters.take(np.array([0, 5])).names
     ('alpha1', 'alpha2')
-    >>> [name for name, places in zip(parameters.names, parameters.of_frames) if places][:4]
+    >>> [name for name, frame in zip(parameters.names, parameters.of_frames) if frame][:4]
     ['base_x', 'base_y', 'base_z', 'base_rx']
+    >>> bool((parameters.placed == parameters.of_frames).all())  # the data name no session
+    True
+    >>> few = parameters.identify(["d2", "theta2", "ecc_sin2", "tool_rx"]).free
+    >>> few.groups, few.periodic
+    (('angle', 'length', 'angle', 'tool'), array([ True, False, False,  True]))
+
+    Parameters of several robots bear the robot's name unless they are shared:
+
+    >>> problem = ro.load("position").problem
+    >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
+    >>> both.free.names[0], both.of_robot("left").free.names[0], "tool_x" in both.of_robot("right").names
+    ('left.alpha1', 'alpha1', True)
+    >>> both.called("left", "a2"), both.called("left", "tool_x"), len(both), len(both.places_of("right"))
+    ('left.a2', 'tool_x', 222, 114)
     """
 
     names: tuple[str, ...]
@@ -95,15 +141,14 @@ class Parameters(Tabled):
 
     def take(self, index: np.ndarray) -> Parameters:
         """Return the entries at ``index`` (K,), in that order."""
-        return Parameters(
-            tuple(self.names[i] for i in index),
-            tuple(self.dimensions[i] for i in index),
-            self.nominal[index],
-            self.scale[index],
-            self.tolerance[index],
-            self.identified[index],
-            self.own_frames,
-            self.terms,
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in index),
+            dimensions=tuple(self.dimensions[i] for i in index),
+            nominal=self.nominal[index],
+            scale=self.scale[index],
+            tolerance=self.tolerance[index],
+            identified=self.identified[index],
         )
 
     @cached_property
@@ -118,14 +163,6 @@ class Parameters(Tabled):
         ----------
         robot
             Its name; ``""`` for the only one.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
-        >>> both.free.names[0], both.of_robot("left").free.names[0], "tool_x" in both.of_robot("right").names
-        ('left.alpha1', 'alpha1', True)
         """
         if not robot:
             return self
@@ -141,15 +178,7 @@ class Parameters(Tabled):
         robot
             Its name; ``""`` for the only one.
         own
-            What the robot itself calls the parameter.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
-        >>> both.called("left", "a2"), both.called("left", "tool_x")
-        ('left.a2', 'tool_x')
+            The robot's own name of the parameter.
         """
         if own in self.names or not robot:
             return own
@@ -162,14 +191,6 @@ class Parameters(Tabled):
         ----------
         robot
             Its name; ``""`` for the only one.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
-        >>> len(both), len(both.places_of("right"))
-        (222, 114)
         """
         if not robot:
             return np.arange(len(self))
@@ -183,23 +204,12 @@ class Parameters(Tabled):
 
     @property
     def placed(self) -> np.ndarray:
-        """(P,) which of these may be anywhere: all but the shifts of sessions, which are as small as their sizes.
-
-        >>> import rpim_opt as ro
-        >>> parameters = ro.load("position").problem.parameters
-        >>> bool((parameters.placed == parameters.of_frames).all())  # nobody named a session
-        True
-        """
+        """(P,) which of these may be anywhere: all but the session offsets, which are as small as their scales."""
         return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The P groups whose scales they have: ``base``, ``tool``, ``session``, or their dimension.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("position").problem.parameters.identify(["d2", "ecc_sin2", "tool_x"]).free.groups
-        ('length', 'angle', 'tool')
-        """
+        """The P groups whose scales they have: ``base``, ``tool``, ``session``, or their dimension."""
         return tuple(
             dimension if name in self.terms else group_of(name, dimension)
             for name, dimension in zip(self.names, self.dimensions, strict=True)
@@ -211,11 +221,6 @@ class Parameters(Tabled):
 
         Those are alpha, theta and beta of the joints, and roll, pitch and yaw of frames. Ratios, compliances and
         eccentricities are none, and of a measurement's own parameters only those of its frames.
-
-        >>> import rpim_opt as ro
-        >>> parameters = ro.load("position").problem.parameters.identify(["d2", "theta2", "ecc_sin2", "tool_rx"])
-        >>> parameters.free.periodic
-        array([ True, False, False,  True])
         """
         frames = "|".join(map(re.escape, ("base_", *self.own_frames)))
         turning = re.compile(rf"(alpha|theta|beta)\d+|({frames}|tool_(.*_)?)r[xyz]")
@@ -267,7 +272,7 @@ class Parameters(Tabled):
             if not any(hits):
                 raise InputError("key identify", f"pattern '{pattern}'", known_patterns(self.names, pattern))
             chosen |= hits
-        return self._with(identified=chosen)
+        return replace(self, identified=chosen)
 
     def values(self, x: Array) -> Array:
         """Return the parameters' values (n,) [SI] at deviations x (n,) [SI], one for every entry of the table.
@@ -316,7 +321,7 @@ class Parameters(Tabled):
         >>> parameters.identify(["a[23]"]).free.scale  # [m]
         array([0.0002, 0.002 ])
         """
-        return self._with(scale=self._overlaid(self.scale, table, "scale", file))
+        return replace(self, scale=overlay(self, self.scale, table, "table scale", file=file))
 
     def toleranced(self, table: Mapping[str, float], file: object = None) -> Parameters:
         """Return the same table with other tolerances, given as in a problem file's ``[tolerance]``.
@@ -328,13 +333,192 @@ class Parameters(Tabled):
         >>> parameters.identify(["alpha2", "a2"]).free.tolerance  # [rad], [m]
         array([   inf, 0.0005])
         """
-        return self._with(tolerance=self._overlaid(self.tolerance, table, "tolerance", file))
+        return replace(self, tolerance=overlay(self, self.tolerance, table, "table tolerance", file=file))
 
-    def _with(self, **changes: np.ndarray) -> Parameters:
-        return replace(self, **changes)
 
-    def _overlaid(self, values: Array, table: Mapping[str, float], where: str, file: object) -> Array:
-        try:
-            return Overlay(self.names, self.dimensions, self.groups).on(values, table, f"table {where}")
-        except InputError as error:
-            raise error.within(file) from None
+def overlay(
+    parameters: Parameters,
+    values: Array,
+    table: Mapping[str, float],
+    where: str,
+    signed: bool = False,
+    file: object = None,
+) -> Array:
+    """Return values (P,) [SI] with those of a table in their places; what names fewer parameters goes before.
+
+    Parameters
+    ----------
+    parameters
+        The table's keys speak of: names, patterns, groups, ``joint_offset`` for every theta.
+    values
+        (P,) [SI] where the table has none.
+    table
+        Values by name, pattern or group, with units.
+    where
+        The table's name in an error.
+    signed
+        Whether zero and negative values are accepted.
+    file
+        What an error names besides.
+    """
+    members = _members(parameters, table)
+    dimensions = np.array(parameters.dimensions)
+    accepted = {stem: tuple(sorted(set(dimensions[index].tolist()))) for stem, index in members.items()}
+    result = values.copy()
+    try:
+        stated = quantities(table, accepted, where)
+        for (stem, dimension), value in sorted(stated.items(), key=lambda item: _rank(item[0][0], parameters)):
+            if not (value >= SMALLEST or signed):
+                found = f"a number greater than zero, from {SMALLEST:g} on"
+                raise InputError(f"{where}, key {stem}", f"{value:g}", found)
+            index = np.array(members[stem])
+            result[index[dimensions[index] == dimension]] = value
+    except InputError as error:
+        raise error.within(file) from None
+    return result
+
+
+def _members(parameters: Parameters, table: Mapping[str, float]) -> dict[str, list[int]]:
+    """Return the parameters that keys may mean: of groups, names, joint offsets, and of the table's own patterns."""
+    members: dict[str, list[int]] = {}
+    for i, (name, group) in enumerate(zip(parameters.names, parameters.groups, strict=True)):
+        members.setdefault(group, []).append(i)
+        members[name] = [i]
+        if is_joint_offset(name):
+            members.setdefault(JOINT_OFFSET, []).append(i)
+    for key in filter(_PATTERN.search, table):
+        stem, _ = split_unit(key)
+        members[stem] = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
+    return members
+
+
+def _rank(stem: str, parameters: Parameters) -> int:
+    """Return the order in which keys are carried out: groups, joint offsets, patterns, names."""
+    if stem in parameters.names:
+        return 3
+    if _PATTERN.search(stem):
+        return 2
+    return int(stem == JOINT_OFFSET)
+
+
+# Parameters of a model
+
+
+def model_parameters(
+    robot: Robot,
+    base: Sequence[float] | Array = (0.0,) * 6,
+    tools: Mapping[str, Sequence[float] | Array] | None = None,
+    own: Mapping[str, tuple[str, float]] | None = None,
+    own_frames: tuple[str, ...] = (),
+    sessions: Iterable[str] = (),
+    temperature: float | None = None,
+) -> Parameters:
+    """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
+
+    Parameters
+    ----------
+    robot
+        Gives the MDH parameters' nominal values.
+    base
+        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
+    tools
+        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
+    own
+        Further parameters, those of the measurement: name to (dimension, nominal value [SI]).
+    own_frames
+        Prefixes of those that are frames, ``plane_``.
+    sessions
+        Names of sessions, by which the robot's base is shifted and turned besides.
+    temperature
+        At which the robot's lengths are as on the drawing [K], where temperatures are known: they grow by
+        ``expansion`` a kelvin.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parameters = ro.robot.model_parameters(robot, tools={"A": (0, 0, 0.06, 0, 0, 0)})
+    >>> parameters.identify(["d1", "tool_A_z"]).free.nominal
+    array([0.099927, 0.06    ])
+    """
+    entries = list(_of_joints(robot))
+    entries += _of_frame("base_", base)
+    if not tools:
+        tools = {"": (0.0,) * 6}
+    for marker, tool in tools.items():
+        entries += _of_frame(tool_prefix(marker), tool)
+    for prefix in dict.fromkeys(map(session_prefix, sessions)):
+        entries += _of_frame(prefix, (0.0,) * 6)
+    if temperature is not None:
+        entries.append((EXPANSION, "ratio per temperature", 0.0, STEEL))
+        entries.append((REFERENCE, "temperature", temperature, 1.0))
+    if own is not None:
+        entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
+    names, dimensions, nominal, scale = zip(*entries, strict=True)
+    parameters = Parameters(
+        names,
+        dimensions,
+        np.array(nominal, dtype=float),
+        np.array(scale),
+        np.full(len(names), np.inf),
+        np.zeros(len(names), dtype=bool),
+        own_frames,
+    )
+    return with_terms(parameters, robot.model, robot.joint_types)
+
+
+def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
+    """Return a table with the parameters of a model's terms behind its own, none of them identified yet.
+
+    Raises
+    ------
+    InputError
+        For a name that the table has.
+    """
+    entries = dict(entries_of(model, joint_types))
+    for name in entries:
+        if name in parameters.names:
+            raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")
+    if not entries:
+        return parameters
+    count = len(entries)
+    return replace(
+        parameters,
+        names=(*parameters.names, *entries),
+        dimensions=(*parameters.dimensions, *(entry.dimension for entry in entries.values())),
+        nominal=np.append(parameters.nominal, [entry.nominal for entry in entries.values()]),
+        scale=np.append(parameters.scale, [entry.scale for entry in entries.values()]),
+        tolerance=np.append(parameters.tolerance, np.full(count, np.inf)),
+        identified=np.append(parameters.identified, np.zeros(count, dtype=bool)),
+        terms=(*parameters.terms, *entries),
+    )
+
+
+def _usual(name: str, dimension: str) -> float:
+    # own dimensions of a measurement have no usual size: their unit's
+    group = group_of(name, dimension)
+    if name.startswith(("camera_", "board_")):
+        group = "camera"
+    return DEFAULT_SCALE.get((group, dimension), 1.0)
+
+
+def _of_joints(robot: Robot) -> Iterator[Entry]:
+    """Yield the table's parameters row by row, then what the joints have besides, zero on the drawing."""
+    for i, row in enumerate(robot.mdh, start=1):
+        for column, value in zip(MDH, row, strict=True):
+            name = f"{column}{i}"
+            dimension = MDH_DIMENSION[column]
+            yield name, dimension, value, _usual(name, dimension)
+    for i in range(1, robot.dof + 1):
+        for term in JOINT_TERMS:
+            if i in term.places(robot.joint_types):
+                for name, entry in zip(term.names(i), term.entries, strict=True):
+                    yield name, entry.dimension, entry.nominal, entry.scale
+    for name in bend_names(robot):
+        yield name, "angle", 0.0, BEND_SCALE
+
+
+def _of_frame(prefix: str, place: Sequence[float] | Array) -> Iterator[Entry]:
+    for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
+        name = prefix + axis
+        yield name, dimension, value, _usual(name, dimension)

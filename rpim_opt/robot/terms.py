@@ -1,19 +1,24 @@
-"""What moves an arm besides its joint values: terms, functions of what they see and of parameters with names."""
+"""Terms: what moves an arm besides its joint values, as functions of what they see and of named parameters.
+
+`Posture` and `Joint` are what a term sees, `Term` is one of them, `Model` collects a user's own; `JOINT_TERMS` and the
+first moments of links are those of every arm.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Literal, NamedTuple
+from functools import cached_property, lru_cache, partial
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import DISPLAY, SMALLEST, UNITS, number, split_unit
-from rpim_opt.robot.posture import Joint, Symbol
+from rpim_opt.robot.evaluation import SYMBOLS
 
+Symbol = Any  # ca.SX or a number: CasADi ships no types
 Place = Literal["joint", "link", "base", "tool"]
 _STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
 _FRAME = re.compile(r"\w*_r[xyz]")
@@ -21,10 +26,163 @@ SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}
 """How many numbers a term returns."""
 ENDS = ("base", "tool")
 """Places that an arm has once: parameters there have no number."""
+BEND_SCALE = 1e-4
+"""Prior standard deviation of a joint's deflection by one component of one link's first moment [rad]."""
+
+
+# What a term sees
+
+
+class Weight:
+    """Gravity on an arm of nominal geometry; this one is zero, `gravity.Statics` is an arm's."""
+
+    payload: Symbol = 0.0
+    """Mass at the flange [kg]."""
+
+    def torque(self, i: int) -> Symbol:
+        """Return the torque of gravity about joint i [Nm]."""
+        return 0.0
+
+    def moment(self, i: int, k: int, axis: str) -> Symbol:
+        """Return what a unit of first moment of link k along its x, y or z means to joint i, without unit."""
+        return 0.0
+
+    def down(self, k: int) -> Symbol:
+        """Return where gravity points in the frame after joint k, a unit vector (3, 1)."""
+        return ca.DM.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """An arm in one configuration, as the joints of the model see it.
+
+    Parameters
+    ----------
+    q
+        Joint values of the model [rad or m].
+    torque
+        Measured joint torques [Nm]; None where those of gravity stand for them.
+    approach
+        Directions of the joints' last movement, -1, 0 or +1; None where they are not known.
+    weight
+        Gravity; None for none.
+    columns
+        Further columns of the data by name [SI].
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.robot.Posture(q=[0.1, 0.5], columns={"temperature": 3.0}).torque is None
+    True
+    """
+
+    q: Sequence[Symbol]
+    torque: Sequence[Symbol] | None = None
+    approach: Sequence[Symbol] | None = None
+    weight: Weight | None = None
+    columns: Mapping[str, Symbol] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """What a term sees of joint ``number`` (from 1), and of the link that it moves.
+
+    A term of the base sees the first joint, one of the tool the last.
+
+    Parameters
+    ----------
+    number
+        Of the joint, from 1.
+    posture
+        Of the arm.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> posture = ro.robot.Posture(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
+    >>> elbow = ro.robot.Joint(2, posture)
+    >>> elbow.q, elbow.every_q, elbow.torque, elbow.approach, elbow.column("hours")
+    (0.5, [0.1, 0.5], 7.0, 1, 8.0)
+    >>> elbow.gravity, elbow.payload, elbow.moment(2, "x"), elbow.down.shape  # of a posture without gravity
+    (0.0, 0.0, 0.0, (3, 1))
+    """
+
+    number: int
+    posture: Posture
+
+    @property
+    def q(self) -> Symbol:
+        """Joint value of the model [rad or m]."""
+        return self.posture.q[self.number - 1]
+
+    @property
+    def every_q(self) -> Sequence[Symbol]:
+        """Joint values of all joints [rad or m]."""
+        return self.posture.q
+
+    @property
+    def torque(self) -> Symbol:
+        """Measured torque [Nm] where the data have torques, that of gravity elsewhere."""
+        if self.posture.torque is None:
+            return self.gravity
+        return self.posture.torque[self.number - 1]
+
+    @property
+    def _weight(self) -> Weight:
+        return self.posture.weight or Weight()
+
+    @property
+    def gravity(self) -> Symbol:
+        """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint."""
+        return self._weight.torque(self.number)
+
+    @property
+    def down(self) -> Symbol:
+        """Where gravity points in the frame after the joint, of the nominal arm: a unit vector (3, 1)."""
+        return self._weight.down(self.number)
+
+    @property
+    def payload(self) -> Symbol:
+        """Mass at the flange [kg]."""
+        return self._weight.payload
+
+    @property
+    def approach(self) -> Symbol:
+        """Direction of the joint's last movement, -1, 0 or +1; 0 where it is not known."""
+        if self.posture.approach is None:
+            return 0.0
+        return self.posture.approach[self.number - 1]
+
+    def moment(self, k: int, axis: str) -> Symbol:
+        """Return z_i . (R_k e_a x g_hat): what link k's first moment along its ``axis`` a means to this joint i.
+
+        Parameters
+        ----------
+        k
+            The link, from 1.
+        axis
+            ``"x"``, ``"y"`` or ``"z"`` of its frame.
+        """
+        return self._weight.moment(self.number, k, axis)
+
+    def column(self, name: str) -> Symbol:
+        """Return a column of the data [SI] by its name; the term has to name it in its ``columns``.
+
+        Raises
+        ------
+        InputError
+            For a column that the term does not name.
+        """
+        if name not in self.posture.columns:
+            raise InputError("term", f"column '{name}'", f"columns={{'{name}': ...}} of the term, with its dimension")
+        return self.posture.columns[name]
+
+
+# Terms
 
 
 class Entry(NamedTuple):
-    """A parameter of a term: its name without a joint's number, its dimension, its expected size and nominal [SI]."""
+    """A parameter of a term: its name without a joint's number, its dimension, its scale and nominal value [SI]."""
 
     stem: str
     dimension: str
@@ -69,8 +227,8 @@ class Term:
     >>> import casadi as ca
     >>> import rpim_opt as ro
     >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1})
-    >>> third.names(2), third.entries[0].dimension, third.entries[0].scale  # [rad]
-    (('third2',), 'angle', 0.0001)
+    >>> third.name, third.names(2), third.entries[0].dimension, third.entries[0].scale  # [rad]
+    ('third', ('third2',), 'angle', 0.0001)
     >>> float(third.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, ca.pi / 3])), 2e-4))
     -0.0002
     >>> warm = ro.robot.Term(
@@ -112,12 +270,7 @@ class Term:
 
     @property
     def name(self) -> str:
-        """The parameters' names without the joint's number.
-
-        >>> import rpim_opt as ro
-        >>> ro.robot.Term(lambda joint, a, b: a + b * joint.q, {"zero_mrad": 0.1, "slope_ppm": 10}).name
-        'zero, slope'
-        """
+        """The parameters' names without the joint's number."""
         return ", ".join(entry.stem.partition("{}")[0] for entry in self.entries) or "without parameters"
 
     def names(self, i: int) -> tuple[str, ...]:
@@ -185,14 +338,14 @@ def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | N
     # an effect may take a whole chain to write down: not for a parameter that is not there
     if sizes and all(map(is_zero, sizes)):
         return None
-    found = term.moves(joint, *sizes)
-    if isinstance(found, list | tuple):
-        found = ca.vertcat(*found)
-    found = ca.SX(found)
-    if found.numel() != SIZES[term.at]:
+    moves = term.moves(joint, *sizes)
+    if isinstance(moves, list | tuple):
+        moves = ca.vertcat(*moves)
+    moves = ca.SX(moves)
+    if moves.numel() != SIZES[term.at]:
         accepted = f"{SIZES[term.at]}, as a term of a {term.at} returns"
-        raise InputError(f"term '{term.name}'", f"{found.numel()} numbers", accepted)
-    return ca.vec(found)
+        raise InputError(f"term '{term.name}'", f"{moves.numel()} numbers", accepted)
+    return ca.vec(moves)
 
 
 def is_zero(value: Symbol) -> bool:
@@ -200,3 +353,222 @@ def is_zero(value: Symbol) -> bool:
     if isinstance(value, ca.SX):
         return bool(value.is_zero())
     return value == 0
+
+
+# Models
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The kinematics of an arm, opened: the product of its links, with terms of a user's own.
+
+    Parameters
+    ----------
+    terms
+        What moves joints, links, the base or the tool besides the terms that every arm has (``ratio``, ``ecc_cos``,
+        ..., ``compliance``, ``backlash``, ``bend``).
+
+    Raises
+    ------
+    InputError
+        For two parameters of one name, and one column in two dimensions.
+
+    Examples
+    --------
+    A third harmonic, identified beside the parameters that the problem identifies already:
+
+    >>> import casadi as ca
+    >>> import rpim_opt as ro
+    >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1}, joints=(2, 3))
+    >>> problem = ro.load("position").problem.with_model(ro.Model(terms=[third]))
+    >>> problem.parameters.free.names[-2:], problem.robot.model.terms == (third,)
+    (('third2', 'third3'), True)
+    >>> result = ro.calibrate(problem, ro.tikhonov, weight=1.0)
+    >>> bool(abs(result.x[-2:]).max() < 1e-4)  # [rad]; this arm has none
+    True
+
+    A tool that drifts with the hours of a column of the data:
+
+    >>> drift = lambda tool, rate: [0, 0, rate * tool.column("hours"), 0, 0, 0]
+    >>> model = ro.Model([ro.robot.Term(drift, {"drift_mm": 0.1}, at="tool", columns={"hours": ""})])
+    >>> model.columns, model.names(("revolute", "revolute"))
+    ({'hours': ''}, ('drift',))
+    """
+
+    terms: Sequence[Term] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "terms", tuple(self.terms))
+        stems = [entry.stem for term in self.terms for entry in term.entries]
+        for stem in stems:
+            if stems.count(stem) > 1:
+                raise InputError("model, terms", f"parameter '{stem}' twice", "a name of its own for every parameter")
+        for term in self.terms:
+            for name, dimension in term.columns.items():
+                if self.columns[name] != dimension:
+                    raise InputError("model, terms", f"column '{name}' in two dimensions", "one of them")
+
+    @cached_property
+    def columns(self) -> Mapping[str, str]:
+        """Further columns of the data that its terms see, name to dimension."""
+        return {name: dimension for term in self.terms for name, dimension in term.columns.items()}
+
+    def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
+        """Return the names of all its parameters.
+
+        Parameters
+        ----------
+        joint_types
+            Of the arm.
+        """
+        return tuple(name for name, _ in entries_of(self, joint_types))
+
+
+def entries_of(model: Model, joint_types: Sequence[str]) -> Iterator[tuple[str, Entry]]:
+    """Yield the parameters of a model's terms by name."""
+    for term in model.terms:
+        for i in term.places(joint_types):
+            yield from zip(term.names(i), term.entries, strict=True)
+
+
+class Dependencies(NamedTuple):
+    """What terms depend on in a row: torques, gravity, directions of approach, columns."""
+
+    torques: bool = False
+    gravity: bool = False
+    approach: bool = False
+    columns: frozenset[str] = frozenset()
+
+
+def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str], bool]) -> Dependencies:
+    """Return what the terms depend on that have no parameters, or one of which ``used(name)`` says so."""
+    dof = len(joint_types)
+    with SYMBOLS:
+        q, torque, approach = (ca.SX.sym(name, dof) for name in ("q", "torque", "approach"))
+        gravity = _Symbolic(ca.SX.sym("gravity"))
+        columns = {name: ca.SX.sym(name) for name in model.columns}
+        moves = ca.SX(0, 1)
+        for term in model.terms:
+            seen = {name: columns[name] for name in term.columns}
+            posture = Posture(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)
+            for i in term.places(joint_types):
+                names = term.names(i)
+                if not names or any(map(used, names)):
+                    moves = ca.vertcat(moves, moved(term, Joint(i, posture), ca.SX.sym))
+        return Dependencies(
+            torques=ca.depends_on(moves, torque),
+            gravity=ca.depends_on(moves, gravity.payload),
+            approach=ca.depends_on(moves, approach),
+            columns=frozenset(name for name, symbol in columns.items() if ca.depends_on(moves, symbol)),
+        )
+
+
+class _Symbolic(Weight):
+    """Gravity of which nothing is known but whether a term depends on it."""
+
+    def __init__(self, gravity: ca.SX) -> None:
+        self.payload = gravity
+
+    def torque(self, i: int) -> Symbol:
+        return self.payload
+
+    def moment(self, i: int, k: int, axis: str) -> Symbol:
+        return self.payload
+
+    def down(self, k: int) -> Symbol:
+        return ca.vertcat(self.payload, self.payload, self.payload)
+
+
+# Terms of every arm
+
+JOINT_TERMS = (
+    Term(lambda joint, ratio: ratio * joint.q, {"ratio_ppm": 1000}, joints=("revolute", "prismatic")),
+    Term(lambda joint, size: size * ca.cos(joint.q), {"ecc_cos_rad": 1e-3}),
+    Term(lambda joint, size: size * ca.sin(joint.q), {"ecc_sin_rad": 1e-3}),
+    Term(lambda joint, size: size * ca.cos(2 * joint.q), {"ecc2_cos_rad": 1e-4}),
+    Term(lambda joint, size: size * ca.sin(2 * joint.q), {"ecc2_sin_rad": 1e-4}),
+    Term(lambda joint, compliance: compliance * joint.torque, {"compliance_rad_per_Nm": 1e-5}),
+    Term(lambda joint, half: half * joint.approach, {"backlash_rad": 1e-4}),
+)
+"""Terms of every joint; all parameters are zero in a nominal robot."""
+
+
+def _bend(k: int, axis: str, joint: Joint, size: Symbol) -> Symbol:
+    return size * joint.moment(k, axis)
+
+
+@lru_cache
+def terms_of(dof: int) -> tuple[Term, ...]:
+    """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``bend{i}_{k}{axis}``.
+
+    Joint i has those of the links k that it carries, k >= i; a robot's table leaves out what moves nothing.
+    """
+    bends = [
+        Term(partial(_bend, k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
+        for k in range(1, dof + 1)
+        for axis in "xyz"
+    ]
+    return (*JOINT_TERMS, *bends)
+
+
+@lru_cache(2**14)
+def term_of(name: str, dof: int) -> tuple[Term, int]:
+    """Return the term of a parameter, and the joint (from 1) whose parameter it is.
+
+    Raises
+    ------
+    InputError
+        For a parameter that no term of an arm with so many joints has.
+    """
+    for i in range(1, dof + 1):
+        for term in terms_of(dof):
+            if name in term.names(i):
+                return term, i
+    raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
+
+
+def motion(
+    joint_types: Sequence[str], i: int, posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+) -> Symbol:
+    """Return the joint value of joint i with all its terms [rad or m].
+
+    ``value("ratio2")`` gives the parameters; ``terms`` are added besides those of every arm::
+
+        q + ratio q + ecc_cos cos q + ecc_sin sin q + compliance torque + ...        revolute
+        q + ratio q                                                                  prismatic
+    """
+    total = posture.q[i - 1]
+    for more in _moves("joint", joint_types, i, posture, value, (*terms_of(len(posture.q)), *terms)):
+        total = total + more
+    return total
+
+
+def displacement(
+    at: Place,
+    joint_types: Sequence[str],
+    i: int,
+    posture: Posture,
+    value: Callable[[str], Symbol],
+    terms: Sequence[Term],
+) -> ca.SX | None:
+    """Return the displacement (6, 1) [m, rad] of link i's frame, the robot's or the flange's; None for none at all."""
+    total = None
+    for more in _moves(at, joint_types, i, posture, value, terms):
+        total = more if total is None else total + more
+    return total
+
+
+def _moves(
+    at: Place,
+    joint_types: Sequence[str],
+    i: int,
+    posture: Posture,
+    value: Callable[[str], Symbol],
+    terms: Sequence[Term],
+) -> Iterator[ca.SX]:
+    """Yield what the terms of a place move that are not zero."""
+    for term in terms:
+        if term.at == at and i in term.places(joint_types):
+            more = moved(term, Joint(i, posture), value)
+            if more is not None:
+                yield more

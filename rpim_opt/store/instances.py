@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import sha256_of
-from rpim_opt.basics.inputs import inside
-from rpim_opt.basics.shown import Tabled, shortened
+from rpim_opt.basics.files import inside, sha256_of
+from rpim_opt.basics.text import Tabled, shortened
 from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import asking
@@ -30,8 +29,8 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.observations import Tables, read_tables
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (

@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.inputs import read_text
+from rpim_opt.basics.files import make_folder, read_text, scratch_folder, undoing, write_text
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.units import UNITS
-from rpim_opt.basics.writing import make_folder, scratch_folder, undoing, write_text
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
@@ -25,9 +24,9 @@ from rpim_opt.data.tables.units import parse_units
 from rpim_opt.problem.registration.camera import posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras
 from rpim_opt.robot.chain import Described
+from rpim_opt.robot.formats.tables import toml, write_robot
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 from rpim_opt.robot.library import RobotSource, find_source, read_arm
-from rpim_opt.robot.plain import toml, write_robot
 from rpim_opt.store.raw import Understanding, understand_of
 from rpim_opt.store.template import problem_text
 
@@ -146,7 +145,7 @@ def new_problem(
     said = {
         "target": board.stated,
         "robot": toml(source.stated),
-        "drawing": source.drawing,
+        "drawing": source.origin,
         "columns": how,
         "data": Path(found.file).name,
         "count": str(len(parts.rows)),

@@ -10,15 +10,14 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import Table, read_json, write_json
-from rpim_opt.basics.inputs import inside
-from rpim_opt.basics.patterns import fits
-from rpim_opt.basics.units import split_unit
+from rpim_opt.basics.files import inside, read_json, write_json
+from rpim_opt.basics.schema import Table
+from rpim_opt.basics.units import fits, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.robot.overlay import JOINT_OFFSET, is_joint_offset
+from rpim_opt.robot.parameter_names import JOINT_OFFSET, is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
 FORMAT = "rpim-opt prior"

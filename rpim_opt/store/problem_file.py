@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from rpim_opt.basics.exceptions import InputError, choices, pick
-from rpim_opt.basics.files import Angle, Length, Name, Table, read_toml, validate
-from rpim_opt.basics.inputs import inside
+from rpim_opt.basics.files import inside, read_toml
+from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
 from rpim_opt.basics.units import accepted_units, split_unit
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.named import LEARNED
@@ -23,12 +23,12 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
+from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.mounting import Mounting, PayloadTable, stated_gravity
-from rpim_opt.robot.open_model import Model as KinematicModel
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.prior_file import PriorTable
 from rpim_opt.store.statements import Constraints
 
@@ -322,7 +322,7 @@ def _arm(table: ProblemTable, path: Path) -> Described:
         raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
     arm = read_arm(file, table.urdf_base, table.urdf_tip)
     turned = numeric_frame(arm.base)[:3, :3]
-    gravity = stated_gravity(arm.robot.gravity, table.mounting, table.payload, path, turned)
+    gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
     return replace(arm, robot=replace(arm.robot, gravity=gravity))
 
 

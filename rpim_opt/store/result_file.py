@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
-from rpim_opt.basics.statistics import statistics
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import believed
 from rpim_opt.calibration.asking import calibrate
@@ -41,8 +40,8 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.open_model import Model
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Model
 from rpim_opt.store.serialize import digest, plain, structured
 
 FORMAT = "rpim-opt result"

@@ -12,11 +12,10 @@ from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import Length, Table, validate
-from rpim_opt.basics.inputs import inside
+from rpim_opt.basics.files import inside, write_files
+from rpim_opt.basics.schema import Length, Table, validate
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import display, joint_columns, quantities
-from rpim_opt.basics.writing import write_files
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import touches
@@ -25,8 +24,7 @@ from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import Target, postures_at, postures_in_sight
-from rpim_opt.robot.model import model_parameters
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, model_parameters
 from rpim_opt.store.problem_file import Observation, Stated, read_problem
 from rpim_opt.store.statements import place_fixtures
 

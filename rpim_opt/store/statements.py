@@ -12,7 +12,7 @@ from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import Name, Table
+from rpim_opt.basics.schema import Name, Table
 from rpim_opt.basics.units import number, quantities
 from rpim_opt.convex.constraints import Constraint, at_nominal, equal, parse, signed
 from rpim_opt.convex.drawn import BOX, WORKSPACE

@@ -16,9 +16,9 @@ from rpim_opt.problem.observability import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import Described, placed, same_place
+from rpim_opt.robot.formats.tables import exact, toml
 from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.robot.plain import exact, toml
 
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 

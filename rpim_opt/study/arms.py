@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.mdh import Robot, read_robot
-from rpim_opt.robot.model import model_parameters
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import model_parameters
 
 KINDS = {"ur10e": ["beta[23]"], "irb120": ["beta2"], "iiwa7": []}
 """Ready robots that arms are made of, with Hayati's parameter where neighbouring axes are parallel."""
@@ -119,7 +120,7 @@ def _frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
     frames = []
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
-        turn[:, :3, :3] = transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+        turn[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
         frames.append(T)
@@ -171,6 +172,6 @@ def _errors(dof: int, rng: np.random.Generator) -> Array:
 def _small(numbers: Array) -> Array:
     """Return the transform (4, 4) of a translation and a rotation vector."""
     T = np.eye(4)
-    T[:3, :3] = transform.Rotation.from_rotvec(numbers[3:]).as_matrix()
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(numbers[3:]).as_matrix()
     T[:3, 3] = numbers[:3]
     return T

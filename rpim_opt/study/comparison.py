@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.progress import shown
+from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import frame_of
-from rpim_opt.basics.writing import refused
+from rpim_opt.basics.text import progress_bar
 from rpim_opt.study.methods import USUAL, Method, measure, methods_of, metrics_of
 from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
 from rpim_opt.study.provenance import package_code, provenance
@@ -133,7 +133,7 @@ def compare(
         code = grid.code()
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-    with open_journal(path, grid.cases(), code, resume) as kept, shown("comparing", progress) as say:
+    with open_journal(path, grid.cases(), code, resume) as kept, progress_bar("comparing", progress) as say:
         kept.fill([(key, grid.task(case)) for key, case in kept.waiting], workers, scheduler, say)
         rows = tuple(kept.rows)
     drawn = frozenset(source.label for source in grid.sources if source.drawn)

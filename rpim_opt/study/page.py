@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.basics.writing import refused, write_files
 from rpim_opt.report.page import Table, render
 from rpim_opt.study.figures import comparison_figure, picture
 from rpim_opt.study.ranking import Rows, Summary, number, without_figures

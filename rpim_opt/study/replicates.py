@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError
-from rpim_opt.basics.files import parse_json
-from rpim_opt.basics.inputs import LARGEST_DATA, require_file
-from rpim_opt.basics.writing import refused
+from rpim_opt.basics.files import LARGEST_DATA, parse_json, refused, require_file
 
 Row = dict[str, Any]
 """A case with its figures."""

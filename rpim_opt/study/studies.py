@@ -18,9 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.files import json_text, read_json
-from rpim_opt.basics.inputs import LARGEST_DATA, require_file
-from rpim_opt.basics.writing import refused, write_files
+from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, write_files
 from rpim_opt.study.provenance import SHORT, commit, file_state, package_code, package_state, versions
 from rpim_opt.study.replicates import Progress, Row, open_journal, require_package
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.late import spatial
 from rpim_opt.calibration.intervals import position_noise, scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
@@ -20,9 +20,8 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import Loads, bearing, loads_on, require_same_torques
-from rpim_opt.robot.gravity import Gravity
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
@@ -245,7 +244,7 @@ class Cell(NamedTuple):
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
         reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
-        distance = spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
+        distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
         if poses.shape[1] == 7:
             distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
         closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]

@@ -14,8 +14,7 @@ from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.structure import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
-from rpim_opt.robot.overlay import is_joint_offset
-from rpim_opt.robot.parameter_names import of_session
+from rpim_opt.robot.parameter_names import is_joint_offset, of_session
 from rpim_opt.robot.parameters import Parameters
 
 FALSE_ALARM = 0.01

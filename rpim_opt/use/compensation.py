@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.statistics import statistics
+from rpim_opt.basics.files import write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
-from rpim_opt.basics.writing import write_text
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset

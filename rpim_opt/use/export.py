@@ -11,15 +11,15 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.text import joined, listed
-from rpim_opt.basics.writing import refused, write_files
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
+from rpim_opt.robot.formats.universal_robots import write_ur_calibration
+from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
-from rpim_opt.robot.ur_calibration import write_ur_calibration
-from rpim_opt.robot.urdf import read_urdf, write_urdf
 
 
 def identified(result: Calibration, marker: str = "") -> Described:

@@ -13,9 +13,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.problem.row_functions import Loads
 from rpim_opt.robot.evaluation import call_rows
-from rpim_opt.robot.joint_terms import motion
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, transforms
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.terms import motion
 
 NULL_SPACE_WEIGHT = 1e-10
 """Weight of a correction that moves nothing, relative to the largest squared singular value."""

@@ -11,9 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.shown import Tabled, counted
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
-from rpim_opt.basics.text import listed, table
+from rpim_opt.basics.text import Tabled, counted, listed, table
 from rpim_opt.basics.units import UNITS
 from rpim_opt.data.tables.layout import read_raw
 from rpim_opt.data.tables.names import recognize

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
-from rpim_opt.basics.statistics import statistics
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.units import UNITS, accepted_units

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from rpim_opt.basics.scalar import least
+from rpim_opt.basics.minimization import least
 
 FUNCTIONS: list[tuple[Callable[[float], float], float, float]] = [
     (lambda x: (x - 2) ** 2 + 1, 0.0, 5.0),

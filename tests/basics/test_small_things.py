@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.inputs import read_bytes
-from rpim_opt.basics.late import Late
-from rpim_opt.basics.scalar import least
-from rpim_opt.basics.shown import LONGEST, as_html, shortened
-from rpim_opt.robot.plain import write_robot
+from rpim_opt.basics.files import read_bytes
+from rpim_opt.basics.minimization import least
+from rpim_opt.basics.text import LONGEST, as_html, shortened
+from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 
 
@@ -41,14 +40,6 @@ def test_a_file_that_states_no_size_is_read_no_further_than_it_may_be() -> None:
     with pytest.raises(ro.InputError, match="more than 10 bytes"):
         read_bytes(endless, 10)
     assert read_bytes(endless)
-
-
-def test_a_module_that_waits_has_no_private_names() -> None:
-    """What inspect and doctest ask every module for does not import it."""
-    late = Late("a_module_that_is_nowhere")
-    assert not hasattr(late, "__wrapped__")
-    with pytest.raises(ModuleNotFoundError):
-        late.anything  # noqa: B018
 
 
 def test_a_minimum_that_is_never_near_enough_ends() -> None:

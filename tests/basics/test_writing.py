@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rpim_opt.basics import writing
-from rpim_opt.basics.writing import scratch_folder, write_bytes, write_files, write_text
+from rpim_opt.basics import files
+from rpim_opt.basics.files import scratch_folder, write_bytes, write_files, write_text
 
 OLD = b"old content"
 NEW = b"new content, and more of it"
@@ -95,7 +95,7 @@ def break_at(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
         raise KeyboardInterrupt
 
     places = {
-        "mkdtemp": (writing.tempfile, "mkdtemp"),
+        "mkdtemp": (files.tempfile, "mkdtemp"),
         "open": (Path, "open"),
         "fchmod": (os, "fchmod"),
         "fsync": (os, "fsync"),
@@ -154,7 +154,7 @@ def test_the_bytes_are_on_the_disk_before_the_name_is_theirs(tmp_path: Path, mon
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rpim_opt.basics.writing import write_bytes
+from rpim_opt.basics.files import write_bytes
 
 def kill(*_, **__):
     os.kill(os.getpid(), signal.SIGKILL)
@@ -200,7 +200,7 @@ def test_what_somebody_still_writes_is_left_alone(tmp_path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from rpim_opt.basics.writing import write_bytes
+from rpim_opt.basics.files import write_bytes
 
 for _ in range(150):
     write_bytes(Path(sys.argv[1]), sys.argv[2].encode() * 5000)

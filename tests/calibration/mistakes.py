@@ -13,8 +13,8 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
+from rpim_opt.robot.formats.tables import read_mdh
 from rpim_opt.robot.library import READY
-from rpim_opt.robot.plain import read_mdh
 
 TABLE = Path(__file__).with_name("mistakes.md")
 NOISE = 5e-5

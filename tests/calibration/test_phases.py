@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import rpim_opt as ro
-from rpim_opt.basics.phases import clock
+from rpim_opt.basics.threads import clock
 
 
 def test_phases_add_up() -> None:

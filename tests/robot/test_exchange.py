@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.basics.inputs import LARGEST_TEXT
+from rpim_opt.basics.files import LARGEST_TEXT
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot
 from tests.simulate import ARM, simulated

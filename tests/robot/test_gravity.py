@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.deflection import STANDARD, moment_slopes
-from rpim_opt.robot.family import _draws
-from rpim_opt.robot.gravity import MOUNTINGS
+from rpim_opt.robot.extensions import _draws, moment_slopes
 from rpim_opt.robot.kinematics import numeric_frame
+from rpim_opt.robot.mdh import MOUNTINGS, STANDARD
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.chain import Chain, corrected, describe, link_of, require_same_arm, same_place
-from rpim_opt.robot.family import EXPECTED, family_scales
-from rpim_opt.robot.kinematics import forward_kinematics
-from rpim_opt.robot.plain import write_robot
+from rpim_opt.robot.chain import Chain, corrected, describe, require_same_arm, same_place
+from rpim_opt.robot.extensions import EXPECTED, family_scales
+from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot.kinematics import forward_kinematics, numeric_link
 from tests.simulate import ARM
 
 MDH = ARM.mdh
@@ -76,9 +76,9 @@ def test_tolerances_are_shown_where_there_are_some() -> None:
 def chain(seed: int) -> Chain:
     """Any serial chain, with axes in all directions."""
     rng = np.random.default_rng(seed)
-    origins = [link_of(*rng.uniform(-1, 1, 5)) for _ in range(4)]
+    origins = [numeric_link(*rng.uniform(-1, 1, 5)) for _ in range(4)]
     axes = rng.normal(size=(4, 3))
-    return Chain(np.array(origins), axes / np.linalg.norm(axes, axis=1)[:, None], link_of(*rng.uniform(-1, 1, 5)))
+    return Chain(np.array(origins), axes / np.linalg.norm(axes, axis=1)[:, None], numeric_link(*rng.uniform(-1, 1, 5)))
 
 
 def tip(of: Chain, q: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ def test_any_chain_is_a_table_and_the_table_with_other_numbers_is_the_chain_move
 def test_a_table_near_another_one_has_its_turns(seed: int) -> None:
     """Angles of whichever turn, and offsets of parallel axes, are those of the table that is wanted."""
     robot = ro.robot.Robot("six", MDH)
-    origins = [link_of(*row[:4]) for row in MDH]
+    origins = [numeric_link(*row[:4]) for row in MDH]
     near = MDH.copy()
     near[:, 2] += TURNS * seed
     table, base, tool, _ = describe(Chain.about_z(origins, np.eye(4)), near)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.joint_terms import JOINT_TERMS, motion, terms_of
-from rpim_opt.robot.parameter_names import known_patterns, of_joint, of_term, term_of
-from rpim_opt.robot.posture import Joint, Posture
+from rpim_opt.robot.parameter_names import known_patterns, of_joint, of_term
+from rpim_opt.robot.terms import JOINT_TERMS, Joint, Posture, motion, term_of, terms_of
 from tests.simulate import ARM
 
 Q = np.random.default_rng(0).uniform(-2, 2, (7, 6))

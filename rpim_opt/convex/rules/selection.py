@@ -11,8 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.scalar import least
-from rpim_opt.basics.shown import Tabled, counted
+from rpim_opt.basics.minimization import least
+from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel

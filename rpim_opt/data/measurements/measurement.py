@@ -15,8 +15,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.shown import Brief
 from rpim_opt.basics.tables import Columns
+from rpim_opt.basics.text import Brief
 from rpim_opt.robot.terms import require_columns
 
 XYZ = {"x": "length", "y": "length", "z": "length"}

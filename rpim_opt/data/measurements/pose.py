@@ -6,10 +6,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RowError
-from rpim_opt.basics.late import transform
 from rpim_opt.data.measurements.measurement import XYZ, Measurement, origin
 
 
@@ -59,11 +59,13 @@ def rotation_between(p: Any, q: Any) -> Any:
 
 def turned(y: Array, e: Array) -> Array:
     """Move poses (N, 7) by e (N, 6), the positions and then the rotations about the instrument's axes."""
-    rotation = transform.Rotation.from_rotvec(e[:, 3:]) * transform.Rotation.from_quat(y[:, [4, 5, 6, 3]])
+    rotation = scipy.spatial.transform.Rotation.from_rotvec(e[:, 3:]) * scipy.spatial.transform.Rotation.from_quat(
+        y[:, [4, 5, 6, 3]]
+    )
     return np.hstack([y[:, :3] + e[:, :3], _w_first(rotation)])
 
 
-def _w_first(rotation: transform.Rotation) -> Array:
+def _w_first(rotation: scipy.spatial.transform.Rotation) -> Array:
     return rotation.as_quat()[:, [3, 0, 1, 2]]
 
 
@@ -79,7 +81,7 @@ def unit_quaternions(y: Array) -> Array:
 
 def from_angles(y: Array) -> Array:
     """Return poses (N, 7) from roll, pitch, yaw (N, 6), R = Rz Ry Rx."""
-    return np.hstack([y[:, :3], _w_first(transform.Rotation.from_euler("xyz", y[:, 3:]))])
+    return np.hstack([y[:, :3], _w_first(scipy.spatial.transform.Rotation.from_euler("xyz", y[:, 3:]))])
 
 
 def from_matrices(y: Array) -> Array:
@@ -91,7 +93,7 @@ def from_matrices(y: Array) -> Array:
         row = int(wrong[0])
         found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
-    return np.hstack([y[:, :3], _w_first(transform.Rotation.from_matrix(R))])
+    return np.hstack([y[:, :3], _w_first(scipy.spatial.transform.Rotation.from_matrix(R))])
 
 
 _TURN = {"rx": "angle", "ry": "angle", "rz": "angle"}

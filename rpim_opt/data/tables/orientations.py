@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import transform
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.data.tables.names import Reading
 
@@ -114,5 +114,5 @@ def _numbers(table: Columns, name: str) -> np.ndarray:
 def from_vectors(table: Columns, names: Sequence[str], si: float) -> dict[str, list[str]]:
     """Return the quaternions ``qw, qx, qy, qz`` of rotation vectors in three columns, whose unit is si [rad]."""
     vectors = np.column_stack([_numbers(table, name) for name in names])
-    xyzw = transform.Rotation.from_rotvec(si * vectors).as_quat()
+    xyzw = scipy.spatial.transform.Rotation.from_rotvec(si * vectors).as_quat()
     return {f"q{letter}": [repr(float(v)) for v in xyzw[:, "xyzw".index(letter)]] for letter in "wxyz"}

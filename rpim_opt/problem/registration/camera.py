@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import transform
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, TARGET, eye_in_hand
 from rpim_opt.data.measurements.measurement import of_fixture
@@ -157,7 +157,7 @@ def _mirrored(T: Array) -> Array:
     """Return the pose whose normal leans to the other side of the line of sight: it looks much alike from far away."""
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
     turn = np.diag([-1.0, -1.0, 1.0])
-    to = transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
+    to = scipy.spatial.transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
     half = to.T @ turn @ to  # half a turn about the line of sight
     found = T.copy()
     found[:3, :3] = half @ T[:3, :3] @ turn  # and half a turn about the board's normal
@@ -181,7 +181,7 @@ def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
         H = J.T @ J
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + TINY * np.eye(6), J.T @ r)
         tried = np.eye(4)
-        tried[:3, :3] = transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
+        tried[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
         tried[:3, 3] = T[:3, 3] + step[3:]
         now = _linearized(tried, points, xy)
         damping *= 10
@@ -340,7 +340,7 @@ def _posed(data: Dataset, block: Block, camera: Mapping[str, float]) -> tuple[Bl
     variance[:, :3] = deviation[:, None] ** 2
     variance[:, 3:] = (deviation[:, None] / size) ** 2
     index = np.array(entries)
-    quaternion = transform.Rotation.from_matrix(whole[:, :3, :3]).as_quat()
+    quaternion = scipy.spatial.transform.Rotation.from_matrix(whole[:, :3, :3]).as_quat()
     y = np.hstack([whole[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
     taken = block.take(index, index)
     seen = replace(

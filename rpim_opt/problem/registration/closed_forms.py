@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.late import optimize, transform
 
 Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
@@ -201,7 +201,7 @@ def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), 
         p = flange[:, :3, :3] @ o + flange[:, :3, 3]
         return np.append(np.linalg.norm(p[j] - p[i], axis=1) - measured, ridge * (o - first))
 
-    return optimize.least_squares(residual, first, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    return scipy.optimize.least_squares(residual, first, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
 
 
 def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[Array, Array]:
@@ -267,6 +267,6 @@ def proper(M: Array) -> Array:
 def transforms(y: Array) -> Array:
     """Return the transforms (N, 4, 4) of measured poses (N, 7): x, y, z [m] and unit quaternion, w first."""
     T = np.tile(np.eye(4), (len(y), 1, 1))
-    T[:, :3, :3] = transform.Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
+    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
     T[:, :3, 3] = y[:, :3]
     return T

@@ -31,9 +31,8 @@ from rpim_opt.problem.registration.closed_forms import (
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.model import model_parameters
 from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, model_parameters
 
 if TYPE_CHECKING:
     from rpim_opt.problem.registration.certified import CertifiedStart

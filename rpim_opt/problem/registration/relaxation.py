@@ -8,16 +8,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.late import Late, sparse, transform
-from rpim_opt.basics.phases import phase
+from rpim_opt.basics.threads import phase
 from rpim_opt.problem.registration.closed_forms import proper
 
 if TYPE_CHECKING:
     import cvxpy as cp
-else:
-    cp = Late("cvxpy")
 
 
 @lru_cache
@@ -120,6 +118,8 @@ def shares(Q: Array, places: Sequence[np.ndarray]) -> list[Array]:
 
 def relaxation(count: int, shared: int) -> Relaxation:
     """Return the definition for so many rotations, of which the first are shared by all others."""
+    import cvxpy as cp
+
     places = _places(count, shared)
     bound = cp.Variable()
     multipliers = cp.Variable(20 * count)
@@ -150,9 +150,6 @@ def _own_constraints(place: np.ndarray, count: int, shared: int, last: bool) -> 
     return (20 * np.array(rotations)[:, None] + np.arange(20)).ravel()
 
 
-conif: Any = Late("cvxpy.reductions.solvers.conic_solvers.clarabel_conif")
-
-clarabel: Any = Late("clarabel")  # a compiled module, without types
 SOUGHT = 1e-8
 """Tolerance of gap and feasibility, the form being of size one: what follows refines rotations and multipliers."""
 
@@ -230,12 +227,15 @@ def _square(triangle: Array) -> Array:
 
 @lru_cache
 def _cone(count: int, shared: int) -> _Cone:
+    import cvxpy as cp
+    from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
+
     stated = relaxation(count, shared)
     stated.state(np.eye(1 + 9 * count))
     data = stated.problem.get_problem_data(cp.CLARABEL, solver_opts={})[0]
     start = data["param_prob"].var_id_to_col[stated.multipliers.id]
     own = slice(start, start + stated.multipliers.size)
-    return _Cone(sparse.csc_matrix(data["A"]), data["c"], conif.dims_to_solver_cones(data["dims"]), own, stated.places)
+    return _Cone(scipy.sparse.csc_matrix(data["A"]), data["c"], dims_to_solver_cones(data["dims"]), own, stated.places)
 
 
 def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moments:
@@ -251,10 +251,12 @@ def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moment
     sought
         Tolerance of gap and feasibility.
     """
+    import clarabel
+
     count = (len(Q) - 1) // 9
     cone = _cone(count, count if shared is None else shared)
     size = float(np.abs(Q).max()) or 1.0
-    P = sparse.csc_matrix((len(cone.q), len(cone.q)))
+    P = scipy.sparse.csc_matrix((len(cone.q), len(cone.q)))
     with phase("solve"):
         b = cone.triangles(Q / size)
         found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings(sought)).solve()
@@ -263,6 +265,8 @@ def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moment
 
 @lru_cache
 def _settings(sought: float) -> Any:
+    import clarabel
+
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
@@ -445,7 +449,7 @@ def _moved(L: Array, rotations: Array, step: Array, value: float) -> tuple[Array
     """Return the rotations after the step, or the first of its halves that lowers the value."""
     part = step
     for _ in range(12):
-        turn = transform.Rotation.from_rotvec(part.reshape(-1, 3)).as_matrix()
+        turn = scipy.spatial.transform.Rotation.from_rotvec(part.reshape(-1, 3)).as_matrix()
         moved = proper(rotations @ turn)
         lower = _value(L, moved)
         if lower < value:

@@ -1,4 +1,4 @@
-"""The minimum of a function of one number between two others, without SciPy's optimizers being imported for it."""
+"""Minimization along a line without SciPy's optimizers, which take longer to import than a calibration takes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def least(function: Callable[[float], float], low: float, high: float, accuracy:
     Each step goes to the vertex of the parabola through the three best points where steps shrink that way, and else
     divides the larger side by the golden section. A minimum at an end is found next to it, within ``accuracy``.
 
-    >>> from rpim_opt.basics.scalar import least
+    >>> from rpim_opt.basics.minimization import least
     >>> x, value = least(lambda x: (x - 2) ** 2 + 1, 0.0, 5.0, 1e-6)
     >>> round(x, 6), round(value, 6)
     (2.0, 1.0)

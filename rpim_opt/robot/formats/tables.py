@@ -1,22 +1,22 @@
-"""MDH tables for other tools: TOML, JSON, CSV, and RoboDK's four columns."""
+"""Robots as tables: ``robot.toml`` and the same keys in JSON, a row a joint in CSV, and RoboDK's four columns."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import read_json, write_json
+from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
+from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text, read_columns
-from rpim_opt.basics.units import UNITS, display
-from rpim_opt.basics.writing import write_text
+from rpim_opt.basics.units import UNITS, accepted_units, display
 from rpim_opt.robot.chain import without_beta
-from rpim_opt.robot.mdh import MDH, Robot, read_robot, robot_of
-from rpim_opt.robot.mounting import centre_keys, mounting_keys, payload_keys
-from rpim_opt.robot.parameter_names import MDH_DIMENSION
+from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 LIMITS = ("lower", "upper")
 WITHOUT_COLUMN = {
@@ -25,6 +25,145 @@ WITHOUT_COLUMN = {
     "payload": "a payload",
 }
 """What a table with a row a joint has no place for."""
+Mounting = str | list[Annotated[float, Field(strict=False)]]
+"""``"floor"``, ``"ceiling"``, ``"wall"``, or where gravity points in the robot's base."""
+
+
+# Schema
+
+
+class PayloadTable(Table):
+    """What the flange carries: ``[payload]``."""
+
+    mass: Mass
+    x: Length = 0.0
+    y: Length = 0.0
+    z: Length = 0.0
+
+
+class _JointTable(Table):
+    alpha: Angle = 0.0
+    a: Length = 0.0
+    theta: Angle = 0.0
+    d: Length = 0.0
+    beta: Angle = 0.0
+    type: Literal["revolute", "prismatic"] = "revolute"
+    sign: Literal[1, -1] = 1
+    limits: Annotated[list[float] | None, "angle", "length"] = None
+    mass: Annotated[float | None, "mass"] = None
+    centre_x: Length = 0.0
+    centre_y: Length = 0.0
+    centre_z: Length = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits_fit_the_type(cls, table: Any) -> Any:
+        if isinstance(table, dict):
+            moves = "length" if table.get("type") == "prismatic" else "angle"
+            wrong = [u for u, unit in UNITS.items() if f"limits_{u}" in table and unit.dimension != moves]
+            if wrong:
+                accepted = ", ".join(f"limits_{u}" for u in accepted_units(moves))
+                raise Misfit(f"limits_{wrong[0]}", "a unit that does not fit the joint's type", accepted)
+        return table
+
+
+class _RobotTable(Table):
+    name: str
+    source: str = ""
+    joint: list[_JointTable] = Field(min_length=1)
+    coupling: list[list[Annotated[float, Field(strict=False)]]] | None = None
+    mounting: Mounting | None = None
+    payload: PayloadTable | None = None
+
+
+def gravity_with(
+    gravity: Gravity,
+    mounting: Mounting | None,
+    payload: PayloadTable | None,
+    file: object,
+    base: Array | None = None,
+) -> Gravity:
+    """Return a robot's gravity with the mounting and the payload that a file states.
+
+    Parameters
+    ----------
+    gravity
+        What holds where the file states nothing.
+    mounting, payload
+        Of the file.
+    file
+        What an error names.
+    base
+        (3, 3) rotation of frame 0 of the table in the base that the mounting speaks of.
+    """
+    try:
+        if mounting is not None:
+            gravity = gravity.mounted(mounting, base)
+        if payload is not None:
+            gravity = gravity.carrying(payload.mass, (payload.x, payload.y, payload.z))
+    except InputError as error:
+        raise InputError(f"key {error.where}", error.found, error.accepted, file) from None
+    return gravity
+
+
+def _robot(content: dict[str, Any], path: Path) -> Robot:
+    """Return the robot that the keys of a ``robot.toml`` describe, whatever file they come from."""
+    table = validate(_RobotTable, content, path)
+    dof = len(table.joint)
+    coupling = table.coupling
+    if coupling is None:
+        coupling = np.eye(dof).tolist()
+    if len(coupling) != dof or any(len(row) != dof for row in coupling):
+        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers", path)
+    limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
+    for number, pair in enumerate(limits, start=1):
+        if len(pair) != 2 or not pair[0] < pair[1]:
+            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]", path)
+    return Robot(
+        name=table.name,
+        mdh=np.array([[getattr(joint, column) for column in MDH] for joint in table.joint]),
+        joint_types=tuple(joint.type for joint in table.joint),
+        joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ np.array(coupling),
+        limits=np.array(limits, dtype=float),
+        source=table.source,
+        gravity=_gravity(table, path),
+    )
+
+
+def _gravity(table: _RobotTable, path: Path) -> Gravity:
+    """Return gravity with the masses of the links that state one; others weigh nothing. Without any, the guess."""
+    masses: tuple[float, ...] = ()
+    centres: tuple[tuple[float, float, float], ...] = ()
+    if any(joint.mass is not None for joint in table.joint):
+        masses = tuple(joint.mass or 0.0 for joint in table.joint)
+        centres = tuple((joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint)
+    try:
+        gravity = Gravity(masses=masses, centres=centres)
+    except InputError as error:
+        raise error.within(path) from None
+    return gravity_with(gravity, table.mounting, table.payload, path)
+
+
+# Reading
+
+
+def read_robot(path: str | Path) -> Robot:
+    """Return the robot of a ``robot.toml`` file (its format: the guide "Your own robot").
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
+    >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
+    [1.5708, 0.0, 0.0, 0.107, 0.0]
+    """
+    path = Path(path)
+    return _robot(read_toml(path), path)
 
 
 def read_mdh(path: str | Path) -> Robot:
@@ -50,6 +189,51 @@ def read_mdh(path: str | Path) -> Robot:
     path = Path(path)
     readers = {".toml": read_robot, ".json": _read_json, ".csv": _read_csv}
     return _by_ending(readers, path)(path)
+
+
+def _by_ending(known: dict[str, Any], path: Path) -> Any:
+    if path.suffix.lower() not in known:
+        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(known), path)
+    return known[path.suffix.lower()]
+
+
+def _read_json(path: Path) -> Robot:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
+    return _robot(content, path)
+
+
+def _read_csv(path: Path) -> Robot:
+    try:
+        columns = read_columns(path)
+    except InputError as error:
+        raise error.within(path) from None
+    rows = range(len(next(iter(columns.values()))))
+    joints = [_joint({name: cells[i] for name, cells in columns.items()}) for i in rows]
+    return _robot({"name": path.stem, "joint": joints}, path)
+
+
+def _joint(cells: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
+    joint = {name: _cell(text) for name, text in cells.items() if text and name != "joint"}
+    for unit in UNITS:
+        pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
+        if any(value is not None for value in pair):
+            joint[f"limits_{unit}"] = pair
+    return joint
+
+
+def _cell(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
+
+
+# Writing
 
 
 def write_robot(robot: Robot, path: str | Path) -> None:
@@ -126,48 +310,6 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     write_text(Path(path), csv_text(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())], rows))
 
 
-def _by_ending(known: dict[str, Any], path: Path) -> Any:
-    if path.suffix.lower() not in known:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(known), path)
-    return known[path.suffix.lower()]
-
-
-def _read_json(path: Path) -> Robot:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
-    return robot_of(content, path)
-
-
-def _read_csv(path: Path) -> Robot:
-    try:
-        columns = read_columns(path)
-    except InputError as error:
-        raise error.within(path) from None
-    rows = range(len(next(iter(columns.values()))))
-    joints = [_joint({name: cells[i] for name, cells in columns.items()}) for i in rows]
-    return robot_of({"name": path.stem, "joint": joints}, path)
-
-
-def _joint(cells: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
-    joint = {name: _cell(text) for name, text in cells.items() if text and name != "joint"}
-    for unit in UNITS:
-        pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
-        if any(value is not None for value in pair):
-            joint[f"limits_{unit}"] = pair
-    return joint
-
-
-def _cell(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
-
-
 def _content(robot: Robot) -> dict[str, Any]:
     """Return the keys of ``robot.toml`` with which it reads back the same, zeros left out."""
     signs = np.diag(robot.joint_map)
@@ -177,15 +319,11 @@ def _content(robot: Robot) -> dict[str, Any]:
         content["source"] = robot.source
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
-    content |= mounting_keys(robot.gravity)
     joints = [_keys(robot, i) for i in range(robot.dof)]
     for joint, sign in zip(joints, signs, strict=True):
         if plain and sign < 0:
             joint["sign"] = -1
-    carried = payload_keys(robot.gravity)
-    if carried:
-        content["payload"] = carried
-    return content | {"joint": joints}
+    return content | _gravity_keys(robot.gravity) | {"joint": joints}
 
 
 def _keys(robot: Robot, i: int) -> dict[str, Any]:
@@ -202,8 +340,28 @@ def _keys(robot: Robot, i: int) -> dict[str, Any]:
         joint[f"limits_{unit}"] = pair
     if robot.gravity.masses:
         joint["mass_kg"] = robot.gravity.masses[i]
-        joint |= centre_keys(robot.gravity.centres[i], "centre_")
+        joint |= _centre_keys(robot.gravity.centres[i], "centre_")
     return joint
+
+
+def _gravity_keys(gravity: Gravity) -> dict[str, Any]:
+    """Return the keys that state where gravity points and what the flange carries; none for what is usual."""
+    words = {direction: word for word, direction in MOUNTINGS.items()}
+    keys: dict[str, Any] = {}
+    if gravity.direction != MOUNTINGS["floor"]:
+        keys["mounting"] = words.get(gravity.direction, list(gravity.direction))
+    if gravity.payload or any(gravity.payload_centre):
+        keys["payload"] = {"mass_kg": gravity.payload} | _centre_keys(gravity.payload_centre, "")
+    return keys
+
+
+def _centre_keys(centre: tuple[float, ...], prefix: str) -> dict[str, float]:
+    keys = {}
+    for axis, value in zip("xyz", centre, strict=True):
+        if value:
+            unit, (number,) = exact("length", [value])
+            keys[f"{prefix}{axis}_{unit}"] = number
+    return keys
 
 
 def exact(dimension: str, values: Any) -> tuple[str, list[float]]:

@@ -1,0 +1,111 @@
+"""Tables of files checked against a model: keys, types, and quantities that carry their unit."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import UNITS, number, quantities
+
+Length = Annotated[float, "length"]
+Angle = Annotated[float, "angle"]
+Mass = Annotated[float, "mass"]
+Name = Annotated[str, Field(max_length=200)]
+"""A name or a pattern of names: long ones would take for ever to be matched."""
+
+
+class Misfit(ValueError):
+    """A key that a table cannot have: pydantic adds where it stands."""
+
+    def __init__(self, key: str, found: str, accepted: str):
+        super().__init__(found)
+        self.key = key
+        self.found = found
+        self.accepted = accepted
+
+
+class Table(BaseModel):
+    """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
+
+    A field annotated ``Length``, ``Angle`` or ``Mass`` (or listing several) is given under its name plus a unit.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    @cache
+    def _dimensions(cls) -> dict[str, tuple[str, ...]]:
+        known = {unit.dimension for unit in UNITS.values()}
+        return {
+            name: tuple(m for m in field.metadata if m in known)
+            for name, field in cls.model_fields.items()
+            if any(m in known for m in field.metadata)
+        }
+
+    @model_validator(mode="before")
+    @classmethod
+    def _to_si(cls, table: Any) -> Any:
+        if not isinstance(table, dict):
+            return table
+        dimensions = cls._dimensions()
+        plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
+        others = {key: value for key, value in table.items() if key not in plain}
+        si = _quantities(others, dimensions, plain)
+        kept = {key: value for key, value in table.items() if key not in others}
+        return kept | si
+
+
+def _quantities(table: dict[str, Any], dimensions: dict[str, tuple[str, ...]], plain: list[str]) -> dict[str, Any]:
+    """Return the quantities of a table [SI]; a stem may stand there once, whatever its unit."""
+    try:
+        values = quantities(table, dimensions, convert=_scaled, also=plain)
+    except InputError as error:
+        key = ""
+        if error.where.startswith("key "):
+            key = error.where.removeprefix("key ")
+        raise Misfit(key, error.found, error.accepted) from None
+    si: dict[str, Any] = {}
+    for (stem, _), value in values.items():
+        if stem in si:
+            raise Misfit(stem, "the same quantity twice", "one of them")
+        si[stem] = value
+    return si
+
+
+def _scaled(value: Any, where: str, si: float) -> Any:
+    if isinstance(value, list):
+        return [_scaled(v, where, si) for v in value]
+    return number(value, where) * si
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
+    """Return ``content`` as ``model``, or raise an InputError for the first thing that does not fit."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        misfit = (first.get("ctx") or {}).get("error")
+        where = _where(first["loc"])
+        if isinstance(misfit, Misfit):
+            where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
+            raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
+        if first["type"] == "missing":
+            raise InputError(f"key {where}", "nothing", "this key is required", file) from None
+        wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
+
+
+def _where(loc: tuple[int | str, ...]) -> str:
+    """Format pydantic's location the way a person counts: ``joint 3.a``."""
+    text = ""
+    for part in loc:
+        if isinstance(part, str) and part.startswith("list["):  # which of several types, and no key
+            continue
+        text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
+    return text

@@ -1,0 +1,1 @@
+"""Files that describe robots, one module a format."""

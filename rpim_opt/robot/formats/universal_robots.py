@@ -1,0 +1,283 @@
+"""Universal Robots' files: the controller's calibration.conf (deltas) and the ROS driver's kinematics.yaml (origins).
+
+Both describe six revolute joints; identified parameters replace the numbers in a file and leave all else as it is.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import read_bytes, write_bytes
+from rpim_opt.basics.units import LARGEST, numeral
+from rpim_opt.robot.chain import (
+    Chain,
+    Described,
+    corrected,
+    describe,
+    origin_numbers,
+    reach,
+    require_same_arm,
+    spliced,
+    without_beta,
+)
+from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.mdh import Robot
+
+JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+REVOLUTE = ("revolute",) * 6
+DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
+SIX = ("x", "y", "z", "roll", "pitch", "yaw")
+LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
+
+
+def _number(text: bytes, where: str, path: Path) -> float:
+    value = numeral(text.decode(errors="replace"))
+    if not abs(value) <= LARGEST:
+        found = text.decode(errors="replace")[:40]
+        raise InputError(where, f"'{found}'", f"a finite number, at most {LARGEST:g}", path)
+    return value
+
+
+# calibration.conf
+
+
+def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
+    """Return the robot that a controller's ``calibration.conf`` describes, in the controller's Base.
+
+    Its section ``[mounting]`` lists ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, from the base
+    joint to wrist 3, in rad and m. They are added to the model's standard DH parameters, all of them::
+
+        T = prod_i Rot(z, q_i + theta_i) Trans(z, d_i) Trans(x, a_i) Rot(x, alpha_i)
+
+    Order, sign and units: UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration (which adds such deltas in its
+    tests), and forum.universal-robots.com, thread 1638, "UR10 Calibration.conf DH model generation". Along
+    the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
+    beta3 take the tilt and every number is near nominal.
+
+    Parameters
+    ----------
+    path
+        The file.
+    nominal
+        The model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the key, what was found and what is accepted; for a nominal robot without six revolute joints.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.robot.library import find_robot
+    >>> nominal = ro.read_robot(find_robot("ur10"))
+    >>> arm = ro.read_ur_calibration("calibration.conf", nominal)
+    >>> (1e3 * (arm.robot.mdh - nominal.mdh)[:, 3]).round(2)  # deviations of d [mm]
+    array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])
+    """
+    path = Path(path)
+    deltas, _ = _deltas(read_bytes(path), path)
+    require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
+    table = nominal.mdh.copy()
+    table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
+    table[1:, :2] += np.column_stack([deltas["alpha"], deltas["a"]])[:-1]
+    tail = numeric_link(alpha=deltas["alpha"][-1], a=deltas["a"][-1])
+    plain, base, tool, _ = describe(Chain.about_z([numeric_link(*row) for row in table], tail), nominal.mdh)
+    robot = Robot(nominal.name, plain, nominal.joint_types, nominal.joint_map, nominal.limits, path.name)
+    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+
+
+def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
+    """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
+
+    The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
+    what else it checks (the file has checksums of the joints) is not documented. Keep the original.
+
+    Parameters
+    ----------
+    source
+        The robot's own file.
+    robot
+        The identified robot, in the controller's Base.
+    nominal
+        The model, as for `read_ur_calibration`.
+    target
+        Where to write; may be ``source``.
+
+    Raises
+    ------
+    InputError
+        For alpha1 or a1 that deviate (the base has to hold them), beta6, or axes too nearly parallel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> from rpim_opt.robot.library import find_robot
+    >>> nominal = ro.read_robot(find_robot("ur10"))
+    >>> robot = ro.read_ur_calibration("calibration.conf", nominal).robot  # or an identified one
+    >>> ro.robot.write_ur_calibration("calibration.conf", robot, nominal, "identified.conf")
+    >>> again = ro.read_ur_calibration("identified.conf", nominal).robot
+    >>> bool(np.allclose(again.mdh, robot.mdh, atol=1e-9))
+    True
+    """
+    path = Path(source)
+    data = read_bytes(path)
+    old, places = _deltas(data, path)
+    require_same_arm(robot, nominal.mdh, REVOLUTE, path)
+    if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
+        raise InputError("robot", "alpha1 or a1 that deviate", "a base that holds where axis 1 is", path)
+    change = without_beta(robot).mdh - nominal.mdh
+    shifted = {"theta": change[:, 2], "d": change[:, 3], "a": np.append(change[1:, 1], 0.0)}
+    shifted["alpha"] = np.append(change[1:, 0], 0.0)
+    edits = {
+        places[name]: ", ".join(repr(float(v)) for v in values)
+        for name, values in shifted.items()
+        if not np.array_equal(values, old[name])
+    }
+    write_bytes(Path(target), spliced(data, edits))
+
+
+def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
+    """Return the four lists (6,), and by name where in the file their numbers stand."""
+    section = re.search(rb"^\s*\[mounting\](.*?)(?=^\s*\[\w+\]|\Z)", data, re.MULTILINE | re.DOTALL)
+    if section is None:
+        raise InputError("section [mounting]", "nothing", "a controller's calibration.conf", path)
+    values = {}
+    places = {}
+    for name, key in DELTAS.items():
+        line = rb"^[ \t]*" + key.encode() + rb"[ \t]*=[ \t]*\[([^\]\n]*)\]"
+        lists = list(re.finditer(line, section[1], re.MULTILINE))
+        if len(lists) != 1:
+            raise InputError(f"key {key}", f"{len(lists)} lists", "one list of six numbers", path)
+        parts = lists[0][1].split(b",")
+        if len(parts) != 6:
+            raise InputError(f"key {key}", f"{len(parts)} numbers", "one list of six numbers", path)
+        values[name] = np.array([_number(part.strip(), f"key {key}", path) for part in parts])
+        places[name] = (section.start(1) + lists[0].start(1), section.start(1) + lists[0].end(1))
+    return values, places
+
+
+# kinematics.yaml
+
+
+def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Described:
+    """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
+
+    Under ``kinematics`` stand shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its
+    joint in the frame of the one before, x y z [m] and roll pitch yaw [rad], and ``hash``, which names the robot
+    (UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration; read by ros-industrial/universal_robot,
+    ur_description). ur_description puts the angles into a URDF, so that they mean R = Rz Ry Rx, as here.
+    ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
+    the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
+
+    Parameters
+    ----------
+    path
+        The file: plain keys, two spaces or more a level, one a line.
+    limits
+        (6, 2) joint limits [rad], which the file does not hold.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the line or key, what was found and what is accepted.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.read_ur_kinematics("kinematics.yaml")
+    >>> arm.names[:2], arm.robot.mdh[2:4, 1].round(3)  # a3 and a4 [m]
+    (('shoulder', 'upper_arm'), array([-0.425, -0.392]))
+    """
+    path = Path(path)
+    chain, _ = _yaml_chain(read_bytes(path), path)
+    table, base, tool, _ = describe(chain)
+    robot = Robot("Universal Robots", table, limits=np.empty((0, 0)) if limits is None else limits, source=path.name)
+    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+
+
+def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> None:
+    """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
+
+    The driver compares the hash with the controller's own calibration; it is that of the robot, not of the numbers.
+
+    Parameters
+    ----------
+    source
+        The original, or ur_description's default_kinematics.yaml of the model. Its `read_ur_kinematics` has to be
+        the robot whose parameters were identified.
+    robot
+        The identified robot.
+    target
+        Where to write; may be ``source``.
+
+    Raises
+    ------
+    InputError
+        As `read_ur_kinematics`, and for another robot or a beta after the last joint.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> robot = ro.read_ur_kinematics("kinematics.yaml").robot
+    >>> mdh = robot.mdh.copy()
+    >>> mdh[2, 1] -= 0.0005  # as if identified: the upper arm is half a millimetre longer
+    >>> ro.robot.write_ur_kinematics("kinematics.yaml", replace(robot, mdh=mdh), "identified.yaml")
+    >>> (1e3 * (ro.read_ur_kinematics("identified.yaml").robot.mdh - robot.mdh)[2:4, 1]).round(6) + 0.0  # [mm]
+    array([-0.5,  0. ])
+    """
+    path = Path(source)
+    data = read_bytes(path)
+    chain, places = _yaml_chain(data, path)
+    table, base, tool, G = describe(chain)
+    require_same_arm(robot, table, REVOLUTE, path)
+    origins, _ = corrected(G, robot.mdh, base, tool)
+    if robot.mdh[-1, 4]:
+        raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0", path)
+    size = reach(robot.mdh, base, tool)
+    edits = {}
+    for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
+        texts = origin_numbers(T, old, size)
+        numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
+        edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
+    write_bytes(Path(target), spliced(data, edits))
+
+
+def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:
+    """Return the six joints, and by joint and key where its number stands."""
+    values: dict[tuple[str, str], float] = {}
+    places: dict[tuple[str, str], tuple[int, int]] = {}
+    joint = ""
+    start = 0
+    for number, line in enumerate(data.split(b"\n"), start=1):
+        begin = start
+        start += len(line) + 1
+        if not line.strip() or line.lstrip().startswith((b"#", b"---")):
+            continue
+        match = LINE.match(line)
+        if match is None:
+            found = repr(line.decode(errors="replace").strip()[:40])
+            raise InputError(f"line {number}", found, "one 'key: value' a line", path)
+        key = match[2].decode()
+        if not match[3]:
+            joint = key
+            if key not in ("kinematics", *JOINTS):
+                raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS), path)
+        elif key in SIX:
+            if joint not in JOINTS or (joint, key) in values:
+                raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once", path)
+            values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}", path)
+            places[joint, key] = (begin + match.start(3), begin + match.end(3))
+    for joint in JOINTS:
+        for key in SIX:
+            if (joint, key) not in values:
+                raise InputError(f"key {joint}.{key}", "nothing", "a number [m or rad]", path)
+    origins = [numeric_frame([values[joint, key] for key in SIX]) for joint in JOINTS]
+    return Chain.about_z(origins, np.eye(4)), places

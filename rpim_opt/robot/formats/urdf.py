@@ -1,0 +1,562 @@
+"""URDF: a serial chain in, identified origins back into the same file, of which every other byte stays.
+
+A URDF is untrusted input. It goes through expat, which reports where in the file an element stands; document types, and
+with them entities and other files, are refused. A xacro file is expanded by the package that ROS has for it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.files import read_bytes, write_bytes
+from rpim_opt.basics.units import LARGEST, numeral
+from rpim_opt.robot.chain import (
+    ROUNDING,
+    XACRO,
+    Chain,
+    Described,
+    corrected,
+    describe,
+    origin_numbers,
+    reach,
+    require_same_arm,
+    spliced,
+)
+from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.mdh import Gravity, Robot, Vector
+
+DEEPEST = 100
+"""How deep elements may be nested."""
+LARGEST_NUMBER = 1e6
+"""Size [m or rad] that no number of an origin or axis reaches."""
+KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
+ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
+"""A tag: quoted values may hold a '>'."""
+
+
+def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None) -> Described:
+    """Return a serial chain of a URDF file as a robot in modified DH with Hayati's beta.
+
+    ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
+    `chain.describe` states the conventions. Fixed joints are part of base, links and tool; limits are carried over
+    (continuous joints, and limits that are left out or equal, have none). Angles are roll, pitch, yaw, R = Rz Ry Rx,
+    and an axis that is left out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of link ``base``, wherever
+    the first axis points, and pulls at the masses that the file states.
+
+    Parameters
+    ----------
+    path
+        A URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults (``rpim-opt[xacro]``).
+    base, tip
+        Names of links; the root, and the only leaf below the base.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the element, what was found and what is accepted: no URDF, document types and entities, links
+        or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
+        or mimic joints between base and tip, no or several candidates for base or tip.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
+    >>> arm.robot.dof, arm.names, arm.tool[:3]
+    (1, ('j1',), array([0.4, 0. , 0. ]))
+    """
+    urdf = _read(Path(path))
+    every, joints, chain = _chain(urdf, base, tip)
+    table, T_base, T_tool, G = describe(chain)
+    masses, centres = _carried_masses(urdf, every)
+    robot = Robot(
+        name=urdf.name,
+        mdh=table,
+        joint_types=tuple(joint.kind for joint in joints),
+        limits=np.array([joint.limits for joint in joints]),
+        source=f"{urdf.path.name}, {every[0].parent} to {every[-1].child}",
+        gravity=Gravity(masses=masses, centres=_on_frames(centres, table, G)).mounted("floor", T_base[:3, :3]),
+    )
+    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
+
+
+def write_urdf(
+    source: str | Path,
+    robot: Robot,
+    target: str | Path,
+    base: str | None = None,
+    tip: str | None = None,
+    base_frame: Array | None = None,
+    tool_frame: Array | None = None,
+) -> None:
+    """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
+
+    An origin that does not change stays as it is written. Numbers are written so that they read back exactly.
+
+    Parameters
+    ----------
+    source
+        The original, or a file ``.xacro``: then what it expands to is. Its `read_urdf` with the same base and tip has
+        to be the robot whose parameters were identified.
+    robot
+        The robot with identified parameters, `Calibration.robot` or `use.identified`, which refuses what
+        a URDF cannot express.
+    target
+        Where to write; may be ``source``, unless that is a xacro file.
+    base, tip
+        Names of links, as for `read_urdf`.
+    base_frame, tool_frame
+        (6,) identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; those of the original where not given.
+
+    Raises
+    ------
+    InputError
+        As `read_urdf`, and for another robot, couplings, or a tool or last beta for which the chain has no fixed
+        joint after its last moving one.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import rpim_opt as ro
+    >>> robot = ro.read_urdf("arm.urdf").robot
+    >>> longer = replace(robot, mdh=robot.mdh + [0, 0, 0, 0.001, 0])  # as if identified: d1 is 1 mm longer
+    >>> ro.robot.write_urdf("arm.urdf", longer, "identified.urdf")
+    >>> robot.mdh[:, 3], ro.read_urdf("identified.urdf").robot.mdh[:, 3]  # [m]
+    (array([0.3]), array([0.301]))
+    """
+    if Path(target).suffix.lower() == XACRO:
+        raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
+    urdf = _read(Path(source))
+    every, joints, chain = _chain(urdf, base, tip)
+    table, T_base, T_tool, G = describe(chain)
+    require_same_arm(robot, table, tuple(joint.kind for joint in joints), urdf.path)
+    T_base = T_base if base_frame is None else numeric_frame(base_frame)
+    T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
+    origins, tail = corrected(G, robot.mdh, T_base, T_tool)
+    size = reach(robot.mdh, T_base, T_tool)
+    edits: dict[tuple[int, int], str] = {}
+    before = np.eye(4)
+    place = 0
+    for joint in every:
+        if joint.kind:  # the fixed joints before it stay, this one takes the whole correction
+            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ origins[place], size)
+            before = np.eye(4)
+            place = place + 1
+        else:
+            before = before @ joint.origin
+    if np.abs(tail - chain.tail).max() > 10 * ROUNDING * size:
+        if every[-1].kind:
+            what = f"a tool or beta{len(joints)} that moves the tip '{every[-1].child}'"
+            accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it, or no tool"
+            raise InputError("robot", what, accepted, urdf.path)
+        rest = np.linalg.inv(before @ np.linalg.inv(every[-1].origin))
+        edits |= every[-1].origin_edits(urdf.data, rest @ tail, size)
+    write_bytes(Path(target), spliced(urdf.data, edits))
+
+
+def _chain(urdf: _Urdf, base: str | None, tip: str | None) -> tuple[list[_Joint], list[_Joint], Chain]:
+    """Return all joints between two links, those of them that move, and their geometry."""
+    every = urdf.path_between(base, tip)
+    joints: list[_Joint] = []
+    origins: list[Array] = []
+    T = np.eye(4)
+    for joint in every:
+        T = T @ joint.origin
+        if joint.kind:
+            mimic = [e.attributes.get("joint", "") for e in joint.element.every("mimic")]
+            if mimic:
+                raise joint.error("mimic", f"motion that follows joint '{mimic[0]}'", "joints that move on their own")
+            joints.append(joint)
+            origins.append(T)
+            T = np.eye(4)
+    if not joints:
+        raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint", urdf.path)
+    return every, joints, Chain(np.array(origins), np.array([joint.axis for joint in joints]), T)
+
+
+# Elements
+
+
+@dataclass(eq=False)
+class _Element:
+    """An element: where it starts in the file [byte], and what is in it."""
+
+    tag: str
+    attributes: dict[str, str]
+    start: int
+    children: list[_Element] = field(default_factory=list)
+
+    def every(self, tag: str) -> list[_Element]:
+        """Return the elements of a tag in it."""
+        return [child for child in self.children if child.tag == tag]
+
+
+class _Joint:
+    """A joint element whose attributes are checked when they are needed: off the chain nothing has to be right."""
+
+    def __init__(self, element: _Element, name: str, path: Path):
+        self.element = element
+        self.name = name
+        self.path = path
+        self.parent = self._link("parent")
+        self.child = self._link("child")
+
+    def _link(self, which: str) -> str:
+        element = self._only(which)
+        link = element.attributes.get("link") if element else None
+        if not link:
+            raise self.error(which, "nothing", f'one <{which} link="...">')
+        return link
+
+    def error(self, what: str, found: str, accepted: str) -> InputError:
+        """Return the error that names the joint."""
+        return InputError(f"joint '{self.name}', {what}", found, accepted, self.path)
+
+    def _only(self, tag: str) -> _Element | None:
+        elements = self.element.every(tag)
+        if len(elements) > 1:
+            raise self.error(tag, f"{len(elements)} of them", "one")
+        return elements[0] if elements else None
+
+    def _numbers(self, tag: str, attribute: str, default: str, count: int) -> Array:
+        """Return the numbers of an attribute, its default where it or its element is absent."""
+        element = self._only(tag)
+        text = default
+        if element is not None:
+            text = element.attributes.get(attribute, default)
+        numbers = _numbers(text, count, LARGEST_NUMBER if count > 1 else math.inf)  # limits may be any number
+        if numbers is None:
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+            if "$" in text:
+                wanted += "; a file with xacro's expressions ends in .xacro"
+            raise self.error(f"{tag} {attribute}", repr(text[:40]), wanted)
+        return numbers
+
+    @property
+    def kind(self) -> str:
+        """``"revolute"``, ``"prismatic"``, or nothing for a fixed joint."""
+        kind = self.element.attributes.get("type", "")
+        if kind not in KINDS:
+            raise self.error("type", f"'{kind}'", f"{', '.join(KINDS)} between base and tip")
+        return KINDS[kind]
+
+    @cached_property
+    def origin(self) -> Array:
+        """Transform (4, 4) from the parent's frame to the joint's."""
+        return numeric_frame([*self._numbers("origin", "xyz", "0 0 0", 3), *self._numbers("origin", "rpy", "0 0 0", 3)])
+
+    @property
+    def axis(self) -> Array:
+        """Unit vector (3,) in the joint's frame."""
+        axis = self._numbers("axis", "xyz", "1 0 0", 3)
+        length = float(np.linalg.norm(axis))
+        if not length > 1e-6:
+            raise self.error("axis xyz", f"a vector of length {length:g}", "a unit vector")
+        return axis / length
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lower and upper joint value [rad or m]; infinite where the file leaves them out or makes them equal."""
+        lower, upper = (float(self._numbers("limit", which, "0", 1)[0]) for which in ("lower", "upper"))
+        if lower > upper:
+            raise self.error("limit", f"{lower:g} to {upper:g}", "lower < upper")
+        far = max(abs(lower), abs(upper)) > LARGEST  # 1e16 is how some files say that there is none
+        unlimited = far or lower == upper or self.element.attributes.get("type") == "continuous"
+        return (-math.inf, math.inf) if unlimited else (lower, upper)
+
+    def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
+        """Return what to replace in the file so that the origin becomes T, by first and last byte.
+
+        ``size`` is the arm's `reach` [m].
+        """
+        texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin, size), strict=True)
+        new = {name: text for name, text in texts if text is not None}
+        if not new:
+            return {}
+        element = self._only("origin")
+        if element is None:
+            end = _tag_end(data, self.element.start)
+            return {(end, end): f"<origin{_attributes(new)}/>"}
+        edits = {}
+        for match in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start)):
+            text = new.pop(match[1].decode(errors="replace"), None)
+            if text is not None:
+                edits[match.start(2) + 1, match.end(2) - 1] = text
+        if new:
+            after_name = element.start + len("<origin")
+            edits[after_name, after_name] = _attributes(new)
+        return edits
+
+
+def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | None:
+    """Return the finite numbers of an attribute; None for other texts, or more or fewer of them."""
+    numbers = np.array([numeral(part) for part in text.split()])
+    if len(numbers) != count or not (np.abs(numbers) < largest).all():
+        return None
+    return numbers
+
+
+def _attributes(values: Mapping[str, str]) -> str:
+    return "".join(f' {name}="{value}"' for name, value in values.items())
+
+
+def _tag_end(data: bytes, start: int) -> int:
+    """Return where the tag that begins at ``start`` is over."""
+    match = TAG.match(data, start)
+    return match.end() if match else start
+
+
+@dataclass(frozen=True, eq=False)
+class _Urdf:
+    """A file's robot: its links, its joints, and the joint above every link that has one."""
+
+    path: Path
+    data: bytes
+    name: str
+    links: Mapping[str, _Element]
+    above: Mapping[str, _Joint]
+
+    def path_between(self, base: str | None, tip: str | None) -> list[_Joint]:
+        """Return the joints from link ``base`` to link ``tip``; by default from the root to the only leaf."""
+        for given in (base, tip):
+            if given is not None and given not in self.links:
+                raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
+        base = base or self._root()
+        tip = tip or self._leaf(base)
+        chain = self._up(tip, base)
+        if chain is None:
+            raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "a link below the base", self.path)
+        return chain
+
+    def _root(self) -> str:
+        roots = [link for link in self.links if link not in self.above]
+        if len(roots) > 1:
+            accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
+            raise InputError("links without a parent", ", ".join(roots), accepted, self.path)
+        return roots[0]
+
+    def _leaf(self, base: str) -> str:
+        parents = {joint.parent for joint in self.above.values()}
+        leaves = [link for link in self.links if link not in parents and self._up(link, base) is not None]
+        if len(leaves) != 1:
+            accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
+            raise InputError(f"links at the end of chains from '{base}'", ", ".join(leaves), accepted, self.path)
+        return leaves[0]
+
+    def _up(self, tip: str, base: str) -> list[_Joint] | None:
+        chain: list[_Joint] = []
+        while tip != base:
+            if tip not in self.above:
+                return None
+            chain.append(self.above[tip])
+            tip = chain[-1].parent
+        return chain[::-1]
+
+
+def _read(path: Path) -> _Urdf:
+    """Return the tree of links and joints of a file."""
+    data = _urdf_text(path)
+    root = _root_element(data, path)
+    if root.tag != "robot":
+        raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
+    for element in root.children:
+        if element.tag.startswith("xacro:"):
+            raise InputError(f"element <{element.tag}>", "xacro in a file .urdf", "URDF, or a file .xacro", path)
+    links = _named(root.every("link"), path)
+    if not links:
+        raise InputError("the robot", "no links", "elements <link> and <joint>", path)
+    above: dict[str, _Joint] = {}
+    for name, element in _named(root.every("joint"), path).items():
+        joint = _Joint(element, name, path)
+        for which, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in links:
+                raise joint.error(which, f"no link '{link}'", choices(link, links))
+        if joint.child in above:
+            found = f"two parents, by joints '{above[joint.child].name}' and '{joint.name}'"
+            raise InputError(f"link '{joint.child}'", found, "one", path)
+        above[joint.child] = joint
+    _require_tree(links, above, path)
+    return _Urdf(path, data, root.attributes.get("name") or path.stem, links, above)
+
+
+def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
+    """Return elements by their names."""
+    known: dict[str, _Element] = {}
+    for element in elements:
+        name = element.attributes.get("name", "")
+        if not name or name in known:
+            found = f"'{name}' twice" if name else "one without a name"
+            raise InputError(f"element <{element.tag}>", found, "every one with a name of its own", path)
+        known[name] = element
+    return known
+
+
+def _require_tree(links: Mapping[str, _Element], above: Mapping[str, _Joint], path: Path) -> None:
+    grounded: set[str] = set()
+    for link in links:
+        trail: list[str] = []
+        at = link
+        while at in above and at not in grounded:
+            if at in trail:
+                raise InputError(f"link '{at}'", "a cycle of joints", "a tree", path)
+            trail.append(at)
+            at = above[at].parent
+        grounded.update(trail)
+
+
+def _root_element(data: bytes, path: Path) -> _Element:
+    """Return the root element."""
+    top = _Element("", {}, 0)
+    stack = [top]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if len(stack) > DEEPEST:
+            raise InputError(f"element <{tag}>", f"more than {DEEPEST} levels", "a URDF", path)
+        element = _Element(tag, attributes, parser.CurrentByteIndex)
+        stack[-1].children.append(element)
+        stack.append(element)
+
+    def doctype(*_: Any) -> None:
+        raise InputError("the document type", "<!DOCTYPE ...>", "a URDF without one, and without entities", path)
+
+    if b"\0" in data:
+        raise InputError("the file", "zero bytes, as in UTF-16", "UTF-8 text", path)
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda _: stack.pop()
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        where = f"line {error.lineno}, column {error.offset + 1}"
+        raise InputError(where, expat.errors.messages[error.code], "well-formed XML", path) from None
+    except (LookupError, ValueError) as error:
+        raise InputError("the XML declaration", str(error), "UTF-8 text", path) from None
+    return top.children[0]
+
+
+def _urdf_text(path: Path) -> bytes:
+    """Return the content of a URDF file, or what a xacro file says with its own defaults.
+
+    Expressions are carried out and other files included: problem folders, which may be somebody else's, name no xacro.
+
+    Raises
+    ------
+    InputError
+        Where the package xacro is missing, or the file does not say all by itself.
+    """
+    content = read_bytes(path)
+    if path.suffix.lower() != XACRO:
+        return content
+    try:
+        import xacro
+    except ImportError:
+        accepted = "URDF, or the package that expands it: pip install 'rpim-opt[xacro]'"
+        raise InputError("the robot", "a xacro file", accepted, path) from None
+    try:
+        document: Any = xacro.process_file(str(path))
+    except Exception as error:  # of expressions, XML, missing files and packages: xacro has no type of error for all
+        found = " ".join(str(error).split())
+        accepted = "a file that expands without arguments, or what the command xacro makes of it with them"
+        raise InputError("the robot", found, accepted, path) from None
+    return bytes(document.documentElement.toxml("utf-8"))
+
+
+# Masses
+
+
+def _carried_masses(urdf: _Urdf, chain: Sequence[_Joint]) -> tuple[tuple[float, ...], tuple[Array, ...]]:
+    """Return the mass [kg] that each moving joint of a chain carries up to the next, and its centre [m].
+
+    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
+    cannot be read beside the chain is left out, as it is elsewhere.
+
+    Returns
+    -------
+    n masses, and n centres (3,) in the frames of the file's joints; none of both where nothing that moves has a mass.
+    """
+    frames = _frames(chain)
+    count = max(i for i, _ in frames.values())
+    masses = np.zeros(count)
+    moments = np.zeros((count, 3))
+    for name, body in urdf.links.items():
+        held = _held(urdf, name, frames)
+        mass, centre = _inertial(urdf, name, body, name in frames)
+        if held is None or not mass:
+            continue
+        i, T = held
+        if i:
+            masses[i - 1] += mass
+            moments[i - 1] += mass * (T[:3, :3] @ centre + T[:3, 3])
+    if not masses.any():
+        return (), ()
+    weighty = np.where(masses > 0, masses, 1.0)
+    return tuple(masses.tolist()), tuple(moments / weighty[:, None])
+
+
+def _on_frames(centres: Sequence[Array], table: Array, G: Array) -> tuple[Vector, ...]:
+    """Return centres in the frames after the table's links, with what ties the file's to them (`chain.describe`)."""
+    if not centres:
+        return ()
+    found = []
+    for centre, row, g in zip(centres, table, G, strict=True):
+        T = numeric_link(beta=-row[4]) @ g
+        x, y, z = (T[:3, :3] @ centre + T[:3, 3]).tolist()
+        found.append((x, y, z))
+    return tuple(found)
+
+
+def _frames(chain: Sequence[_Joint]) -> dict[str, tuple[int, Array]]:
+    """Return for the links of a chain which moving joint (from 1; 0: none) carries them, and where they are on it."""
+    frames = {chain[0].parent: (0, np.eye(4))}
+    for joint in chain:
+        i, T = frames[joint.parent]
+        if joint.kind:
+            frames[joint.child] = (i + 1, np.eye(4))
+        else:
+            frames[joint.child] = (i, T @ joint.origin)
+    return frames
+
+
+def _held(urdf: _Urdf, name: str, frames: dict[str, tuple[int, Array]]) -> tuple[int, Array] | None:
+    """Return by which joint a link of the file is carried, and where it is on it; None for what is above the base."""
+    T = np.eye(4)
+    while name not in frames:
+        joint = urdf.above.get(name)
+        if joint is None:
+            return None
+        try:
+            T = joint.origin @ T
+        except InputError:
+            return None
+        name = joint.parent
+    i, start = frames[name]
+    return i, start @ T
+
+
+def _inertial(urdf: _Urdf, name: str, body: _Element, required: bool) -> tuple[float, Array]:
+    """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
+    inertial = body.every("inertial")
+    if not inertial:
+        return 0.0, np.zeros(3)
+    attributes = {e.tag: e.attributes for e in inertial[0].children}
+    mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
+    centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
+    if mass is not None and centre is not None and mass[0] >= 0:
+        return float(mass[0]), centre
+    if not required:
+        return 0.0, np.zeros(3)
+    found = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
+    accepted = "a mass that is not negative, and three finite numbers"
+    raise InputError(f"link '{name}', inertial", found[:80], accepted, urdf.path)
