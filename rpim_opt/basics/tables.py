@@ -313,6 +313,7 @@ def _excel(path: Path, sheet: str = "") -> Grid:
                 raise InputError("the file", f"{size} bytes unpacked", accepted)
             book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
             names = [each.title for each in book.worksheets]
+            chosen = ""
             for chosen in [_sheet(names, sheet)] if sheet else names:
                 rows = list(_filled(book[chosen]))
                 if rows:
