@@ -167,7 +167,7 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     """Return digests of the files that a study's replicates follow from, by their names in its folder.
 
     That is whatever lies in its folder. Where the study says ``DEPENDS = ["data/*.csv"]``, it is that and Python files;
-    hidden files and results of studies never count.
+    hidden files never count, results of studies where they are named.
     """
     folder = path.parent
     stated = getattr(study, "DEPENDS", None)
@@ -179,17 +179,17 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
             if not matches and not glob.has_magic(str(pattern)):
                 raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
             for match in matches:
-                files += _beside(match) if match.is_dir() else [match]
+                files += _beside(match, results=True) if match.is_dir() else [match]
     return {os.path.relpath(file, folder): _digest(file) for file in sorted(set(files))}
 
 
-def _beside(folder: Path) -> Iterator[Path]:
-    """Yield the files in a folder and below it."""
+def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
+    """Yield the files in a folder and below it, with or without results of studies."""
     count = 0
     size = 0
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
-        if any(name.startswith(f"{REPLICATES}.") for name in names):  # results of a study
+        if not results and any(name.startswith(f"{REPLICATES}.") for name in names):
             folders.clear()
             continue
         for file in (Path(place, name) for name in names if not name.startswith(".")):

@@ -144,9 +144,17 @@ def test_a_study_says_which_files_it_depends_on(place: Path) -> None:
     (elsewhere / "deep" / "data.csv").write_text("100")
     for name in ("notes.txt", "table.csv"):
         (place / name).write_text("1")
-    stopped(place, f"DEPENDS = ['table.csv', '{elsewhere}', '*.none']")
+    results = place / "results" / "another"
+    results.mkdir(parents=True)
+    (results / "replicates.json").write_text("1")
+    stopped(place, f"DEPENDS = ['table.csv', '{elsewhere}', 'results/another', '*.none']")
     (place / "notes.txt").write_text("2")
-    for file in (place / "table.csv", elsewhere / "deep" / "data.csv", place / "beside.py"):
+    for file in (
+        place / "table.csv",
+        elsewhere / "deep" / "data.csv",
+        place / "beside.py",
+        results / "replicates.json",
+    ):
         kept = file.read_text()
         file.write_text(kept + "\n")
         with pytest.raises(ro.InputError, match=f"another file .*{file.name}"):
@@ -154,7 +162,7 @@ def test_a_study_says_which_files_it_depends_on(place: Path) -> None:
         file.write_text(kept)
     _, folder = run_study("mine.py", resume=True)
     made = (folder / "README.md").read_text()
-    assert "10 files in its folder or named by it have SHA-256" in made
+    assert "11 files in its folder or named by it have SHA-256" in made
     assert "others that it reads are not known" in made
 
 
