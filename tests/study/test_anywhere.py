@@ -180,6 +180,7 @@ def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monke
     for package in ("matplotlib", "joblib", "distributed"):
         monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "rpim_opt.study.figures", raising=False)
+    monkeypatch.delitem(vars(ro.study), "distributions", raising=False)  # where it was loaded before
     ran = place.parent / "ran"
     text = (
         (place / "mine.py")
