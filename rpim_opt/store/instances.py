@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec
+from typing import Any, Concatenate, NamedTuple, ParamSpec
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import inside, sha256_of
+from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.basics.text import Tabled, shortened
 from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
@@ -21,9 +23,13 @@ from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.rules.selection import Selector
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.measurements.camera import Board, on_board
+from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record, Requirement
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.robodk import robodk_columns
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
@@ -31,17 +37,26 @@ from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel
-from rpim_opt.store.observations import Tables, read_tables
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (
+    AngleTable,
+    DistanceTable,
+    Observation,
+    ProblemFile,
     ProblemTable,
-    Stated,
     named_formulation,
     named_weight,
     read_problem,
     stated_scatter,
 )
 from rpim_opt.store.statements import place_fixtures, stated_details, stated_requirement
+
+ROLES = ("identification", "validation")
+Tools = Mapping[str, tuple[float, ...]]
+UNSTATED = 1e-5
+"""Standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool."""
+RIGHT = (0.0, 90.0)
+"""Angles [deg] that two planes may be known to have."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,7 +199,7 @@ def load(
     stated = read_problem(name, variant, measurements, model)
     table = stated.table
     path = stated.path
-    tables = read_tables(stated)
+    tables = _read_tables(stated)
     try:
         problem = _problem(stated, tables)
         formulation = _formulation(stated, problem)
@@ -247,7 +262,7 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 """
 
 
-def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
+def _problem(stated: ProblemFile, tables: _Tables) -> CalibrationProblem:
     """Return the problem, whose robot and reflectors the validation data must have, too."""
     data = tables.identification
     fixtures = place_fixtures(stated.placed, data)
@@ -261,7 +276,7 @@ def _problem(stated: Stated, tables: Tables) -> CalibrationProblem:
     return problem.scattered(stated_scatter(stated.table, stated.path))
 
 
-def _formulation(stated: Stated, problem: CalibrationProblem) -> Formulation:
+def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
     table, path = stated.table, stated.path
     formulation = named_formulation(table.formulation, path)
@@ -287,7 +302,7 @@ def _require_fit(constraint: Constraint, parameters: Parameters) -> None:
     constraint(z, given(z, parameters))
 
 
-def _published(table: ProblemTable, tables: Tables, path: Path) -> dict[str, Mapping[str, float]]:
+def _published(table: ProblemTable, tables: _Tables, path: Path) -> dict[str, Mapping[str, float]]:
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
@@ -301,7 +316,7 @@ def _reference(table: ProblemTable, path: Path) -> dict[str, tuple[float, float]
     return {key: (value, spread) for key, (value, spread) in table.reference.items()}
 
 
-def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
+def _hashes(stated: ProblemFile, tables: _Tables) -> dict[str, str]:
     folder = stated.path.parent
     drawing = find_robot(stated.table.robot, folder)
     used = {stated.path.name: stated.path, drawing.name: drawing}
@@ -311,3 +326,144 @@ def _hashes(stated: Stated, tables: Tables) -> dict[str, str]:
         used |= {file: folder / file for file in files}
     used |= stated.table.prior.files(stated.path)
     return {name: sha256_of(file) for name, file in used.items()}
+
+
+# --- the tables of a folder, without the excluded rows -----------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """What the tables of a folder hold: both sets of data, the files of each role, and where the reflectors start."""
+
+    identification: Dataset
+    validation: Dataset | None
+    files: Mapping[str, Sequence[str]]
+    tools: Tools
+
+
+class _Part(NamedTuple):
+    """One table of the folder."""
+
+    role: str
+    file: str
+    data: Dataset
+
+
+def _read_tables(stated: ProblemFile) -> _Tables:
+    """Return the measurements that a problem file names."""
+    # RoboDK's export states the tools [mm] itself; the file's own go before them
+    tcps = {marker: [1e3 * v for v in frame[:3]] for marker, frame in stated.tools.items() if stated.table.tool}
+    parts = list(_parts(stated, tcps))
+    files = {role: [part.file for part in parts if part.role == role] for role in ROLES}
+    sets = {}
+    for role in ROLES:
+        if files[role]:
+            own = [part.data for part in parts if part.role == role]
+            sets[role] = Dataset.together(own, [Path(file).stem for file in files[role]])
+    labels = {label for data in sets.values() for label in data.label}
+    for label in stated.table.exclude:
+        if label not in labels:
+            raise InputError("key exclude", f"label '{label}'", "a label of the data", stated.path)
+    for role, data in sets.items():
+        rest = data.without(stated.table.exclude)
+        if not len(rest):
+            file = stated.path.parent / files[role][0]
+            raise InputError("the table", "no row that is not excluded", "at least one", file)
+        sets[role] = _with_known(rest, stated.table, role, stated.path)
+    return _Tables(sets["identification"], sets.get("validation"), files, _tools(stated, tcps))
+
+
+def _parts(stated: ProblemFile, tcps: dict[str, list[float]]) -> Iterator[_Part]:
+    """Read the tables in the file's order, in which RoboDK's reflectors get their names."""
+    for each in stated.observations:
+        for role in ROLES:
+            file = getattr(each, role)
+            if file:
+                yield _Part(role, file, _read(stated, each, file, tcps))
+
+
+def _read(stated: ProblemFile, each: Observation, file: str, tcps: dict[str, list[float]]) -> Dataset:
+    path = stated.path.parent / file
+    robodk = each.layout == "robodk"
+    try:
+        source: Any = robodk_columns(path, stated.robot.joint_dimensions, tcps) if robodk else path
+        if stated.board is not None and stated.kinds[each.measurement].by_camera:
+            source = _seen(path, stated.board)
+        return read_data(source, stated.robot, each.noise or stated.table.noise, stated.kinds[each.measurement])
+    except InputError as error:
+        at_fault = path if robodk and error.where.startswith("row") else stated.path
+        raise error.within(at_fault) from None
+
+
+def _seen(path: Path, board: Board) -> Columns:
+    """Return the columns of a table of corners, with where their points are on the board."""
+    try:
+        return on_board(read_columns(path), board)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _tools(stated: ProblemFile, tcps: Mapping[str, list[float]]) -> Tools:
+    if all(each.layout != "robodk" for each in stated.observations):
+        return stated.tools
+    exported = {marker: (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0) for marker, tcp in tcps.items()}
+    return {marker: stated.tools.get(marker, place) for marker, place in exported.items()}
+
+
+# --- [[known_distance]] and [[known_angle]] between touched points and planes ------------------------------------
+
+
+def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:
+    """Return the measurements of a role with what a file knows of the points and planes that they touch."""
+    known: list[Known] = []
+    for number, distance in enumerate(table.known_distance, start=1):
+        where = f"key known_distance {number}"
+        pair, sigma = _pair(distance, where, path), _sigma(distance, f"{where}.sigma_mm", path)
+        if distance.validation == (role == "validation"):
+            known.append(KnownDistance(pair, distance.distance, sigma))
+    for number, angle in enumerate(table.known_angle, start=1):
+        where = f"key known_angle {number}"
+        if angle.deg not in RIGHT:
+            raise InputError(f"{where}.deg", f"{angle.deg:g}", "0 (parallel) or 90 (square)", path)
+        pair, sigma = _pair(angle, where, path), _sigma(angle, f"{where}.sigma_mrad", path)
+        if angle.validation == (role == "validation"):
+            known.append(KnownAngle(pair, angle.deg == 0, sigma))
+    try:
+        whole = with_known(data, known)
+        _require_enough(whole)
+    except InputError as error:
+        raise error.within(path) from None
+    return whole
+
+
+def _pair(table: DistanceTable | AngleTable, where: str, path: Path) -> tuple[str, str]:
+    if len(table.between) != 2:
+        raise InputError(f"{where}.between", f"{len(table.between)} names", "two", path)
+    first, second = table.between
+    return first, second
+
+
+def _sigma(table: DistanceTable | AngleTable, where: str, path: Path) -> float:
+    if table.sigma is not None:
+        return table.sigma
+    if not table.validation:
+        raise InputError(where, "nothing", "the standard deviation of what the drawing states", path)
+    return UNSTATED
+
+
+def _require_enough(data: Dataset) -> None:
+    """Refuse what was touched so few times that its touches say nothing."""
+    blocks = [block for block in data.blocks if block.touched is not None]
+    joined = {name for block in blocks if not block.measurement.touching for names in block.touched for name in names}
+    count: Counter[str] = Counter()
+    last: dict[str, tuple[Block, str]] = {}
+    for block in blocks:
+        if block.measurement.touching:
+            count.update(names[0] for names in block.touched)
+            last |= {names[0]: (block, data.label[i]) for i, names in zip(block.row, block.touched, strict=True)}
+    for name, touches in count.items():
+        block, label = last[name]
+        least, column = (4, "plane") if block.measurement.planar else (2, "point")
+        if touches < least - (name in joined):
+            accepted = f"{least} or more, one less where a [[known_distance]] or [[known_angle]] joins it to another"
+            raise InputError(f"row {label}, column {column}", f"'{name}' touched {touches} times", accepted)

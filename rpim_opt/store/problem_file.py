@@ -184,7 +184,7 @@ class ProblemTable(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Stated:
+class ProblemFile:
     """What a problem file states, checked, before any table is read.
 
     ``placed`` are the tables that place a measurement's anchor, plane or sphere; ``base`` is None for registration.
@@ -217,7 +217,7 @@ def read_problem(
     variant: str | None = None,
     measurements: Sequence[Measurement] = (),
     model: KinematicModel | None = None,
-) -> Stated:
+) -> ProblemFile:
     """Return what a problem file states; arguments and errors as for `load`."""
     folder = find_problem(name)
     path = inside(folder, "problem.toml", "the problem", folder)
@@ -235,7 +235,7 @@ def read_problem(
         raise InputError("model", f"{model!r}"[:80], accepted)
     if model is not None:
         arm = replace(arm, robot=replace(arm.robot, model=model))
-    return Stated(
+    return ProblemFile(
         path=path,
         table=table,
         placed=placed,

@@ -25,7 +25,7 @@ from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import Target, postures_at, postures_in_sight
 from rpim_opt.robot.parameters import Parameters, model_parameters
-from rpim_opt.store.problem_file import Observation, Stated, read_problem
+from rpim_opt.store.problem_file import Observation, ProblemFile, read_problem
 from rpim_opt.store.statements import place_fixtures
 
 Columns = dict[str, list[str]]
@@ -138,7 +138,7 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     return list(places)
 
 
-def _require_tables(stated: Stated) -> None:
+def _require_tables(stated: ProblemFile) -> None:
     """Refuse names that something else has: another table, or a file that is no table."""
     taken: set[Path] = set()
     for each in stated.observations:
@@ -169,7 +169,7 @@ class Shape(NamedTuple):
 class World(NamedTuple):
     """What is simulated: a problem file, its plan, the parameters and their true deviations (n,) [SI]."""
 
-    stated: Stated
+    stated: ProblemFile
     plan: Simulation
     parameters: Parameters
     x: Array
@@ -181,7 +181,7 @@ class World(NamedTuple):
         return self.plan.torques == "measured" and any(name.startswith("compliance") for name in names)
 
 
-def _shape(stated: Stated, plan: Simulation, each: Observation) -> Shape:
+def _shape(stated: ProblemFile, plan: Simulation, each: Observation) -> Shape:
     kind = stated.kinds[each.measurement]
     markers = tuple(plan.markers.get(each.identification, stated.tools))
     for marker in markers:
@@ -192,7 +192,7 @@ def _shape(stated: Stated, plan: Simulation, each: Observation) -> Shape:
     return Shape(each, kind, markers, tuple(dict.fromkeys(nested)) or ("",))
 
 
-def _parameters(stated: Stated, shapes: Sequence[Shape]) -> Parameters:
+def _parameters(stated: ProblemFile, shapes: Sequence[Shape]) -> Parameters:
     places = [(shape.kind, fixture) for shape in shapes for fixture in shape.fixtures]
     none = np.empty(0, dtype=int)
     blocks = []
