@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,19 +35,10 @@ FEW = 1024
 
 @one_blas_thread
 def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
-    """Return the model of ``problem.linearize(x)`` as its triangle: n + 1 equations, the same |A z - b| for every z.
+    """Return the model of ``problem.linearize(x)`` as its QR factor: n + 1 equations, the same |A z - b| for every z.
 
-    Rows are evaluated, whitened and rotated into the triangle `FEW` at a time, so that memory does not grow with
-    their number.
-
-    Parameters
-    ----------
-    problem
-        Measurements in memory.
-    x
-        (n,) deviations [SI].
-    reweigh
-        What weighs the equations of `ROWS` rows, whole configurations, by their residuals at x; or None.
+    Rows are evaluated, whitened and reduced `FEW` at a time, so that memory does not grow with their number; where a
+    loss weighs them by their residuals at x (n,) [SI], `ROWS` at a time, whole configurations.
     """
     if reweigh is None:
         return problem.triangle(x, FEW)
@@ -116,6 +108,11 @@ class PartitionedProblem:
     (20, 'c0')
     >>> problem.scatter, problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position
     (None, 0.0001)
+    >>> len(problem.without({"1:c3", "2:c33", "2:c34"}).labels), list(problem.arms)
+    (37, [''])
+    >>> bow = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1}, joints=(2,))
+    >>> problem.with_model(ro.Model([bow])).parameters.free.names[-1]
+    'bow2'
     """
 
     def __init__(
@@ -144,14 +141,7 @@ class PartitionedProblem:
 
     @property
     def arms(self) -> Mapping[str, Robot]:
-        """The nominal robots by name; ``""`` for the only one.
-
-        >>> import rpim_opt as ro
-        >>> whole = ro.load("position").problem
-        >>> parts = ro.problem.PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: whole.data])
-        >>> list(parts.arms)
-        ['']
-        """
+        """The nominal robots by name; ``""`` for the only one."""
         return self._first.arms
 
     @property
@@ -184,23 +174,9 @@ class PartitionedProblem:
         return self._with(self._first.with_parameters(parameters))
 
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> PartitionedProblem:
-        """Return the same problem on an arm that moves by the terms of a model, too; as `CalibrationProblem` has it.
+        """Return the same problem with terms of a model; arguments as for `CalibrationProblem.with_model`.
 
         What reads the parts has to read the columns that the terms see.
-
-        Parameters
-        ----------
-        model, identify
-            As there.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> whole = ro.load("position").problem
-        >>> parts = ro.problem.PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: whole.data])
-        >>> bow = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1}, joints=(2,))
-        >>> ro.calibrate(parts.with_model(ro.Model([bow])), ro.tikhonov, weight=1.0).converged
-        True
         """
         return self._with(self._first.with_model(model, identify))
 
@@ -236,18 +212,12 @@ class PartitionedProblem:
                 configurations += int(data.configuration.max()) + 1
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
-        """Return the linear model of all parts around the deviations x (n,) [SI], as a triangle.
+        """Return the linear model of all parts around the deviations x (n,) [SI], as a QR factor.
 
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI].
-        reweigh
-            What weighs the equations of some thousand rows, whole configurations, by their residuals at x; it is
-            called where a part is read.
+        Arguments as for `CalibrationProblem.linearize`; ``reweigh`` gets some thousand rows at a time, whole
+        configurations, where a part is read.
         """
-        models = self._everywhere(partial(_reduced, x, reweigh))
-        return joined(models)
+        return joined(self._everywhere(partial(reduced, x=x, reweigh=reweigh)))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -255,26 +225,18 @@ class PartitionedProblem:
         return tuple(label for part in self.rows() for label in part.labels)
 
     def without(self, labels: Collection[str]) -> PartitionedProblem:
-        """Return the same problem without the rows of these labels, wherever they stand.
-
-        >>> import rpim_opt as ro
-        >>> whole = ro.load("position").problem
-        >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
-        >>> problem = ro.problem.PartitionedProblem(whole.robot, whole.parameters, halves[0](), halves)
-        >>> len(problem.without({"1:c3", "2:c33", "2:c34"}).labels)
-        37
-        """
+        """Return the same problem without the rows of these labels, wherever they stand."""
         copy = self._with(self._first)
         copy._dropped = self._dropped | frozenset(labels)
         return copy
 
     def errors(self, x: Array, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m]; arguments as for `CalibrationProblem.errors`."""
-        return np.concatenate(self._everywhere(partial(_errors, x, dimension)))
+        return np.concatenate(self._everywhere(methodcaller("errors", x, dimension)))
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,)."""
-        norms, equations = zip(*self._everywhere(partial(_whitened_errors, x)), strict=True)
+        norms, equations = zip(*self._everywhere(methodcaller("whitened_errors", x)), strict=True)
         return np.concatenate(norms), np.concatenate(equations)
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
@@ -282,7 +244,7 @@ class PartitionedProblem:
 
         A configuration's rows stand in one part.
         """
-        norms, equations = zip(*self._everywhere(partial(_configuration_errors, x)), strict=True)
+        norms, equations = zip(*self._everywhere(methodcaller("configuration_errors", x)), strict=True)
         return np.concatenate(norms), np.concatenate(equations)
 
     def _everywhere(self, what: Callable[[CalibrationProblem], Any]) -> list[Any]:
@@ -317,56 +279,34 @@ def sketch(problem: CalibrationProblem) -> CalibrationProblem:
     return problem.on(problem.data.take([0]))
 
 
-# What a worker does with a part: functions of the module, so that they travel by name.
-
-
 def _on_part(
     what: Callable[[CalibrationProblem], Any],
     known: CalibrationProblem,
     dropped: frozenset[str],
     part: tuple[int, Part],
 ) -> Any:
+    """Return what a function makes of a part, where a worker reads it; None for one without rows."""
     data = _read(known.parameters, dropped, part)
     return what(known.on(data)) if len(data) else None
 
 
-def _require_sessions(parameters: Parameters, number: int, data: Dataset) -> None:
-    """Raise for a session that the parameters lack while they have others: its rows would be taken for unshifted."""
-    known = {frame_of(name) for name in parameters.names if of_session(name)}
-    if not known:
-        return
-    strange = [name for name in data.sessions if session_prefix(name) not in known]
-    if strange:
-        accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
-        raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
-
-
 def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
-    """Return the measurements of a part, without what was dropped of it, or refuse their sessions."""
+    """Return the measurements of a part, without what was dropped of it.
+
+    Refuse a session that the parameters lack while they have others: its rows would be taken for unshifted.
+    """
     number, read = part
     mine = f"{number}:"
     out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}
     data = read()
     if out:
         data = data.without(out)
-    _require_sessions(parameters, number, data)
+    known = {frame_of(name) for name in parameters.names if of_session(name)}
+    strange = [name for name in data.sessions if session_prefix(name) not in known]
+    if known and strange:
+        accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
+        raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
     return data
-
-
-def _reduced(x: Array, reweigh: Reweigh | None, problem: CalibrationProblem) -> LinearModel:
-    return reduced(problem, x, reweigh)
-
-
-def _errors(x: Array, dimension: str, problem: CalibrationProblem) -> Array:
-    return problem.errors(x, dimension)
-
-
-def _whitened_errors(x: Array, problem: CalibrationProblem) -> tuple[Array, np.ndarray]:
-    return problem.whitened_errors(x)
-
-
-def _configuration_errors(x: Array, problem: CalibrationProblem) -> tuple[Array, np.ndarray]:
-    return problem.configuration_errors(x)
 
 
 def partitions(

@@ -115,16 +115,10 @@ class Stack:
 
 
 def stacked(data: Dataset, slopes: Array | None = None, shifts: Array | None = None) -> list[Stack]:
-    """Return the equations of a dataset by configuration, those with equally many together.
+    """Return the equations of a dataset by configuration, those with equally many together, in the order of its blocks.
 
-    Parameters
-    ----------
-    data
-        The measurements; equations stand in the order of its blocks.
-    slopes
-        (m, dof) by the joints' angles, or None for none.
-    shifts
-        (m, 3) of what cameras see by where the robot is, zero for other equations; None where there are none.
+    ``slopes`` (m, dof) are by the joints' angles, ``shifts`` (m, 3) those of what cameras see by where the robot is,
+    zero for other equations; None for none.
     """
     rows = _Rows(data)
     order = np.argsort(data.configuration, kind="stable")

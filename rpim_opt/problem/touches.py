@@ -40,14 +40,7 @@ class Point:
 
     They are orthonormal: independent touches of one accuracy have independent contrasts of that accuracy.
 
-    Parameters
-    ----------
-    centre
-        (3,) the mean [m].
-    count
-        K.
-    normal, across
-        Zero: a point has none.
+    ``centre`` (3,) is the mean [m], ``count`` K; ``normal`` and ``across`` are zero: a point has none.
     """
 
     centre: Array
@@ -101,21 +94,10 @@ class Plane:
     zero. Without the plane K touches say K - 3 things of the robot alone: s in an orthonormal basis of what is
     perpendicular to 1, u, v, the coordinates in the plane.
 
-    Parameters
-    ----------
-    centre, normal
-        (3,) each.
-    axis
-        The number of the coordinate axis whose projection into the plane is its first direction; None for a plane that
-        is parallel to those that should be.
-    across
-        (2, 3) two directions in the plane.
-    height
-        (K,) s of every touch [m].
-    places
-        (K, 3): 1 and the coordinates u, v [m] of every touch in the plane.
-    aside
-        (K, K - 3) the orthonormal basis.
+    ``centre`` and ``normal`` are (3,) each, ``across`` (2, 3) two directions in the plane: the projection of the
+    coordinate axis number ``axis`` (None for a plane that is parallel to those that should be), and what is
+    perpendicular to that. ``height`` (K,) is s of every touch [m], ``places`` (K, 3) 1 and its coordinates u, v [m] in
+    the plane, ``aside`` (K, K - 3) the orthonormal basis.
     """
 
     centre: Array
@@ -203,6 +185,7 @@ CLOSE = 0.05
 ROUNDING = 1e-12
 """Relative size of a covariance that is none."""
 Things = Sequence[Point | Plane]
+PER_CONFIGURATION = ("index", "instrument", "length", "angle", "joint", "unit")
 
 
 class Tie(NamedTuple):
@@ -224,16 +207,8 @@ class Touches:
     of them is an equation of these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin
     n_1'n_2 for square ones, n_2 along two directions in the first for parallel ones.
 
-    Parameters
-    ----------
-    rows
-        (K, 3) numbers of the equations of the touches of every thing.
-    planar
-        Which of them are planes.
-    ties
-        What is known of two of them.
-    equations
-        How many equations there are before points and planes are eliminated.
+    ``rows`` are the numbers (K, 3) of the equations of the touches of every thing, ``planar`` which of these are
+    planes, ``ties`` what is known of two of them, ``equations`` how many there are before the elimination.
     """
 
     rows: tuple[np.ndarray, ...]
@@ -287,15 +262,7 @@ class Touches:
 
         A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
         units of how far they spread, times the nominal robot's: how large the robot is they do not say.
-
-        Parameters
-        ----------
-        residual
-            (m,) with -p_i for touches.
-        jacobian
-            (m, n) of the modelled values, or None.
-        size
-            How far the nominal robot's touches spread; those that spread by less than `CLOSE` count as they are.
+        ``size`` is that of the nominal robot; touches that spread by less than `CLOSE` count as they are.
         """
         where = self.located(residual)
         spread = self.size(residual)
@@ -343,12 +310,8 @@ class Touches:
     def contrasts(self, values: Array, where: Things) -> Array:
         """Return what m equations' values (m, c) say without points and planes, (k, c).
 
-        Parameters
-        ----------
-        values
-            As `centred` returns them.
-        where
-            Any places near enough: what is perpendicular to a plane hardly depends on them.
+        Values are as `centred` returns them; any places near enough serve: what is perpendicular to a plane hardly
+        depends on them.
         """
         found = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
@@ -420,18 +383,10 @@ def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
-    """Return what divides the contrasts' noise, of what divides that of the equations.
+    """Return what divides the contrasts' noise, of what divides that of the equations, by configuration.
 
-    Parameters
-    ----------
-    touches
-        Which equations touch what.
-    stacks
-        Of the equations; everything that ties join in one configuration.
-    where
-        Where points and planes are.
-    stop
-        (m,) number of the joint values at which every equation was measured: joints stop anew at every touch.
+    ``stop`` (m,) is the number of the joint values at which every equation was measured: joints stop anew at every
+    touch.
     """
     place = np.cumsum(touches.kept(where)) - 1
     group = np.full(touches.equations, -1)
@@ -486,14 +441,8 @@ def _stack(touches: Touches, one: Stack, where: Things, stop: np.ndarray) -> Sta
 def _singly(stack: Stack) -> Iterator[Stack]:
     """Yield a stack's configurations one by one."""
     for i in range(len(stack.index)):
-        yield replace(
-            stack,
-            index=stack.index[i : i + 1],
-            instrument=stack.instrument[i : i + 1],
-            length=stack.length[i : i + 1],
-            angle=stack.angle[i : i + 1],
-            joint=stack.joint[i : i + 1],
-        )
+        one = {name: getattr(stack, name)[i : i + 1] for name in PER_CONFIGURATION[:-1]}
+        yield replace(stack, **one)
 
 
 def _apart(stack: Stack) -> Iterator[Stack]:
@@ -519,23 +468,13 @@ def _apart(stack: Stack) -> Iterator[Stack]:
 
 def _together(stacks: Sequence[Stack]) -> Stack:
     """Return configurations of one size as one stack."""
-    names = ("index", "instrument", "length", "angle", "joint", "unit")
-    return Stack(**{name: np.concatenate([getattr(each, name) for each in stacks]) for name in names})
+    return Stack(**{name: np.concatenate([getattr(each, name) for each in stacks]) for name in PER_CONFIGURATION})
 
 
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
-    """Return the covariance of every row's residual, of those of the rows by themselves, block by block.
+    """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of the rows by themselves.
 
-    Parameters
-    ----------
-    touches, data
-        Which equations touch what, and the measurements.
-    each
-        (N, k, k) or (1, k, k) of the rows of every block [SI].
-    where
-        Where points and planes are.
-    reading
-        Whether they have the instrument's part: what a drawing states counts as that.
+    What a drawing states counts as the instrument's part of a reading.
     """
     found = []
     first = []
