@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -14,8 +14,18 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import phase
 from rpim_opt.problem.registration.closed_forms import proper
 
-if TYPE_CHECKING:
-    import cvxpy as cp
+TOLERANCE, FINE = 1e-8, 1e-12
+"""Of gap and feasibility, the form being of size one: what follows refines rotations and multipliers; the finer one
+where moments are those of several rotations."""
+STEPS = 50
+"""Newton steps after which rotations are as good as they get."""
+SHORT = 1e-13
+"""Rotations are found when a step is shorter [rad]."""
+SPREAD = 1e-3
+"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
+DRAWN = 20
+CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))
+"""The matrices of the cross products e_a x."""
 
 
 @lru_cache
@@ -57,8 +67,21 @@ def _quadratic(count: int, terms: list[tuple[int, int, float]]) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Relaxation:
-    """The relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), in the form that has k 20 + 1 unknowns.
+class Moments:
+    """The moment matrix (n, n), of rank one where it is x x' of rotations, and the multipliers (20 k,) of `relax`."""
+
+    matrix: Array
+    multipliers: Array
+
+    @property
+    def rank_ratio(self) -> float:
+        """Second eigenvalue of the moment matrix over its first: zero where it is of rank one."""
+        eigenvalues = np.linalg.eigvalsh(self.matrix)
+        return float(abs(eigenvalues[-2]) / eigenvalues[-1])
+
+
+def relax(Q: Array, shared: int | None = None, tolerance: float = TOLERANCE) -> Moments:
+    """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns.
 
     ::
 
@@ -70,176 +93,8 @@ class Relaxation:
     M_00 = 1 and <C_j, M> = 0.
 
     Where Q has no products of some rotations (tools seen by the same cameras), the left side is the sum of positive
-    semidefinite parts, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler et
-    al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
-
-    Parameters
-    ----------
-    problem
-        As above.
-    places
-        Of each part among the n.
-    forms
-        Each part's share of Q; products of what is shared stand in the last.
-    bound, multipliers
-        The unknowns.
-    constraints
-        One for each part.
-    """
-
-    problem: cp.Problem
-    places: tuple[np.ndarray, ...]
-    forms: tuple[cp.Parameter, ...]
-    bound: cp.Variable
-    multipliers: cp.Variable
-    constraints: tuple[Any, ...]
-
-    def state(self, Q: Array) -> None:
-        """Give the parameters the values of a form."""
-        for form, share in zip(self.forms, shares(Q, self.places), strict=True):
-            form.value = share
-
-
-def _places(count: int, shared: int) -> tuple[np.ndarray, ...]:
-    """Return the places of every part: of 1, the shared rotations and one of the others."""
-    common = np.arange(1 + 9 * shared)
-    own = [np.arange(1 + 9 * k, 10 + 9 * k) for k in range(shared, count)]
-    return tuple(np.concatenate([common, each]) for each in own) or (common,)
-
-
-def shares(Q: Array, places: Sequence[np.ndarray]) -> list[Array]:
-    """Return each part's share of a form."""
-    common = np.intersect1d(places[0], places[-1])
-    parts = [Q[np.ix_(place, place)] for place in places]
-    for part in parts[:-1]:
-        part[: len(common), : len(common)] = 0.0
-    return parts
-
-
-def relaxation(count: int, shared: int) -> Relaxation:
-    """Return the definition for so many rotations, of which the first are shared by all others."""
-    import cvxpy as cp
-
-    places = _places(count, shared)
-    bound = cp.Variable()
-    multipliers = cp.Variable(20 * count)
-    common = 1 + 9 * shared
-    moved = [cp.Variable((common, common), symmetric=True) for _ in places[1:]]
-    first = np.zeros((common, common))
-    first[0, 0] = 1.0
-    last = -bound * first  # of what is shared, the last part has what the others leave
-    for each in moved:
-        last = last - each
-    forms = tuple(cp.Parameter((len(place), len(place)), symmetric=True) for place in places)
-    constraints = []
-    for place, form, corner in zip(places, forms, [*moved, last], strict=True):
-        border = np.eye(len(place))[:, :common]
-        own = _own_constraints(place, count, shared, corner is last)
-        C = rotation_constraints(count)[np.ix_(own, place, place)].reshape(len(own), -1)
-        combined = cp.reshape(C.T @ multipliers[own], form.shape, order="C")
-        constraints.append(form + border @ corner @ border.T - combined >> 0)
-    problem = cp.Problem(cp.Maximize(bound), constraints)
-    return Relaxation(problem, places, forms, bound, multipliers, tuple(constraints))
-
-
-def _own_constraints(place: np.ndarray, count: int, shared: int, last: bool) -> np.ndarray:
-    """Return which constraints are a part's: of its own rotation, and in the last of those that are shared."""
-    rotations = [*range(shared)] if last else []
-    if len(place) > 1 + 9 * shared:
-        rotations.append(int(place[-1]) // 9 - 1)
-    return (20 * np.array(rotations)[:, None] + np.arange(20)).ravel()
-
-
-SOUGHT = 1e-8
-"""Tolerance of gap and feasibility, the form being of size one: what follows refines rotations and multipliers."""
-
-
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """What the relaxation says.
-
-    Parameters
-    ----------
-    matrix
-        (n, n) moment matrix; of rank one where it is x x' of rotations.
-    multipliers
-        (c,) of the constraints of `moments.rotation_constraints`.
-    status
-        Clarabel's word.
-    """
-
-    matrix: Array
-    multipliers: Array
-    status: str
-
-    @property
-    def rank_ratio(self) -> float:
-        """Second eigenvalue of the moment matrix over its first: zero where it is of rank one."""
-        eigenvalues = np.linalg.eigvalsh(self.matrix)
-        return float(abs(eigenvalues[-2]) / eigenvalues[-1])
-
-
-@dataclass(frozen=True, eq=False)
-class _Cone:
-    """The relaxation in Clarabel's form, which CVXPY made once: of Q is b alone, its parts' triangles."""
-
-    A: Any
-    q: Array
-    cones: Any
-    columns: slice
-    places: tuple[np.ndarray, ...]
-
-    def triangles(self, Q: Array) -> Array:
-        """Return the parts' upper triangles column by column, what is off the diagonal times the root of two."""
-        return np.concatenate([_triangle(share) for share in shares(Q, self.places)])
-
-    def matrix(self, triangles: Array) -> Array:
-        """Return the moment matrix (n, n) of which the parts know theirs, completed so that it stays semidefinite."""
-        sizes = [len(place) * (len(place) + 1) // 2 for place in self.places]
-        parts = [_square(each) for each in np.split(triangles, np.cumsum(sizes)[:-1])]
-        n = int(self.places[-1][-1]) + 1
-        M = np.zeros((n, n))
-        for place, part in zip(self.places, parts, strict=True):
-            M[np.ix_(place, place)] = part
-        if len(parts) > 1:
-            common = len(np.intersect1d(self.places[0], self.places[-1]))
-            known = M[:, :common]
-            completed = known @ np.linalg.pinv(M[:common, :common], rcond=1e-9, hermitian=True) @ known.T
-            unknown = np.ones((n, n), dtype=bool)
-            for place in self.places:
-                unknown[np.ix_(place, place)] = False
-            M[unknown] = completed[unknown]
-        return M
-
-
-def _triangle(M: Array) -> Array:
-    columns, rows = np.tril_indices(len(M))
-    return np.where(rows == columns, 1.0, np.sqrt(2)) * M[rows, columns]
-
-
-def _square(triangle: Array) -> Array:
-    n = int(np.sqrt(2 * len(triangle)))
-    columns, rows = np.tril_indices(n)
-    M = np.zeros((n, n))
-    M[rows, columns] = triangle / np.where(rows == columns, 1.0, np.sqrt(2))
-    return M + np.triu(M, 1).T
-
-
-@lru_cache
-def _cone(count: int, shared: int) -> _Cone:
-    import cvxpy as cp
-    from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
-
-    stated = relaxation(count, shared)
-    stated.state(np.eye(1 + 9 * count))
-    data = stated.problem.get_problem_data(cp.CLARABEL, solver_opts={})[0]
-    start = data["param_prob"].var_id_to_col[stated.multipliers.id]
-    own = slice(start, start + stated.multipliers.size)
-    return _Cone(scipy.sparse.csc_matrix(data["A"]), data["c"], dims_to_solver_cones(data["dims"]), own, stated.places)
-
-
-def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moments:
-    """Return the moment matrix and the multipliers of `moments.Relaxation`.
+    semidefinite blocks, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler
+    et al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
 
     Parameters
     ----------
@@ -248,70 +103,109 @@ def relax(Q: Array, shared: int | None = None, sought: float = SOUGHT) -> Moment
     shared
         The first so many rotations are those that the others have products with, and they have none among themselves;
         all by default.
-    sought
-        Tolerance of gap and feasibility.
+    tolerance
+        Of gap and feasibility.
     """
     import clarabel
 
     count = (len(Q) - 1) // 9
-    cone = _cone(count, count if shared is None else shared)
+    shared = count if shared is None else shared
+    blocks = _blocks(count, shared)
+    A, q = _cone(count, shared)
     size = float(np.abs(Q).max()) or 1.0
-    P = scipy.sparse.csc_matrix((len(cone.q), len(cone.q)))
+    shares = [Q[np.ix_(block, block)] / size for block in blocks]
+    for share in shares[:-1]:  # products of what is shared stand in the last
+        share[: 1 + 9 * shared, : 1 + 9 * shared] = 0.0
+    cones = [clarabel.PSDTriangleConeT(len(block)) for block in blocks]
+    b = np.concatenate([_triangles(share) for share in shares])
+    P = scipy.sparse.csc_matrix((len(q), len(q)))
     with phase("solve"):
-        b = cone.triangles(Q / size)
-        found = clarabel.DefaultSolver(P, cone.q, cone.A, b, cone.cones, _settings(sought)).solve()
-    return Moments(cone.matrix(np.array(found.z)), size * np.array(found.x)[cone.columns], str(found.status))
+        found = clarabel.DefaultSolver(P, q, A, b, cones, _settings(tolerance)).solve()
+    return Moments(_completed(np.array(found.z), blocks, 1 + 9 * shared), size * np.array(found.x)[1 : 1 + 20 * count])
+
+
+def _blocks(count: int, shared: int) -> list[np.ndarray]:
+    """Return the places of every semidefinite block: of 1, the shared rotations and one of the others."""
+    common = np.arange(1 + 9 * shared)
+    return [np.append(common, np.arange(1 + 9 * k, 10 + 9 * k)) for k in range(shared, count)] or [common]
 
 
 @lru_cache
-def _settings(sought: float) -> Any:
+def _cone(count: int, shared: int) -> tuple[Any, Array]:
+    """Return A and q of Clarabel's form, minimize q'v subject to b - A v in the cone; b has the blocks of Q.
+
+    Unknowns v are the bound, the multipliers, and what each block but the last takes of the corner that all share.
+    """
+    blocks = _blocks(count, shared)
+    common = 1 + 9 * shared
+    corner = np.eye(common)[:, None, :, None] * np.eye(common)[None, :, None, :]
+    i, j = np.tril_indices(common)
+    corners = (corner + corner.swapaxes(0, 1))[i, j] / (1 + (i == j))[:, None, None]
+    first = np.zeros((1, common, common))
+    first[0, 0, 0] = 1.0
+    C = rotation_constraints(count)
+    columns = []
+    for number, block in enumerate(blocks):
+        last = number == len(blocks) - 1
+        own = np.repeat([last] * shared + [len(block) > common and k == number for k in range(count - shared)], 20)
+        moved = [np.zeros_like(corners)] * (len(blocks) - 1)
+        if last:
+            moved = [corners] * len(moved)
+        else:
+            moved[number] = -corners
+        shared_columns = np.zeros((1 + sum(map(len, moved)), len(block), len(block)))
+        shared_columns[:, :common, :common] = np.concatenate([first * last, *moved])
+        of_rotations = C[:, block[:, None], block] * own[:, None, None]
+        columns.append(_triangles(np.concatenate([shared_columns[:1], of_rotations, shared_columns[1:]])).T)
+    A = scipy.sparse.csc_matrix(np.concatenate(columns))
+    q = np.zeros(A.shape[1])
+    q[0] = -1.0
+    return A, q
+
+
+def _triangles(M: Array) -> Array:
+    """Return upper triangles of M (..., n, n), column by column, what is off the diagonal times the root of two."""
+    columns, rows = np.tril_indices(M.shape[-1])
+    return np.where(rows == columns, 1.0, np.sqrt(2)) * M[..., rows, columns]
+
+
+def _completed(triangles: Array, blocks: Sequence[np.ndarray], common: int) -> Array:
+    """Return the moment matrix (n, n) of which the blocks know theirs, completed so that it stays semidefinite."""
+    n = int(blocks[-1][-1]) + 1
+    M = np.zeros((n, n))
+    unknown = np.ones((n, n), dtype=bool)
+    start = 0
+    for block in blocks:
+        columns, rows = np.tril_indices(len(block))
+        values = triangles[start : start + len(rows)] / np.where(rows == columns, 1.0, np.sqrt(2))
+        start += len(rows)
+        M[block[rows], block[columns]] = M[block[columns], block[rows]] = values
+        unknown[np.ix_(block, block)] = False
+    known = M[:, :common]
+    completed = known @ np.linalg.pinv(M[:common, :common], rcond=1e-9, hermitian=True) @ known.T
+    return np.where(unknown, completed, M)
+
+
+@lru_cache
+def _settings(tolerance: float) -> Any:
     import clarabel
 
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
     settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = sought
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     return settings
-
-
-STEPS = 50
-"""Newton steps after which rotations are as good as they get."""
-SHORT = 1e-13
-"""Rotations are found when a step is shorter [rad]."""
-SPREAD = 1e-3
-"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
-FINE = 1e-12
-"""Tolerance with which the relaxation is solved again where its moments are those of several rotations."""
-DRAWN = 20
-CROSS = np.array(
-    [
-        [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
-        [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]],
-        [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
-    ]
-)
-"""The matrices of the cross products e_a x."""
 
 
 @dataclass(frozen=True, eq=False)
 class Smallest:
     """The rotations (k, 3, 3) that minimize |L x|^2 over x = (1, vec R_1, ..., vec R_k), and what is known of that.
 
-    Parameters
-    ----------
-    rotations
-        (k, 3, 3).
-    value
-        |L x|^2.
-    bound
-        No rotations have a smaller value than this, up to rounding.
-    rank_ratio
-        Second eigenvalue of the relaxation's moment matrix over its first.
-    information
-        (3k, 3k) half the second derivative of the value by rotation vectors [1/rad^2].
-    steepness
-        c >= 0: every x has a value of at least bound + c |x_other|^2, x_other being what of x is not along the best.
+    Beside them ``value`` |L x|^2; ``bound``, below which no rotations are, up to rounding; ``rank_ratio`` of the moment
+    matrix; ``information`` (3k, 3k), half the second derivative of the value by rotation vectors [1/rad^2]; and
+    ``steepness`` c >= 0: every x has a value of at least bound + c |x_other|^2, x_other being what of x is not along
+    the best.
     """
 
     rotations: Array
@@ -355,15 +249,6 @@ def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = No
 
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
-
-    Parameters
-    ----------
-    L
-        (m, n), n = 1 + 9 k.
-    candidates
-        Further rotations to start from.
-    shared
-        As `relax` has it.
     """
     Q = L.T @ L
     moments = relax(Q, shared)
