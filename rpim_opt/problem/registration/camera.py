@@ -24,9 +24,12 @@ LEAST_VIEWS = 3
 """Views that show focal lengths and centre."""
 UNDISTORTING = 30
 """Rounds by which distortion is taken back; each leaves a small part of the last one's error."""
-MOST_STEPS = 50
-SETTLED, TINY = 1e-10, 1e-30
-"""A pose is found when a step gains no more than this part; added to information that may be singular."""
+BEFORE = 1e-6
+"""Least distance of a point before the camera [m]; what lies behind is seen there."""
+TIGHT = 1e-15
+"""Tolerance of a pose that is refined: to rounding."""
+ALIKE = 1e-9
+"""Fourth singular value of the equations of a focal length over the first, below which views are one."""
 UNCERTAIN = 3.0
 """By how much a view's pose is less certain than its points would be alone."""
 
@@ -89,7 +92,7 @@ def view_pose(points: Array, xy: Array) -> Array:
     """
     middle, axes, planar = _plane(points)
     if planar:
-        H = _homography((points - middle) @ axes[:2].T, xy)
+        H = _linear((points - middle) @ axes[:2].T, xy)
         first = _of_homography(H)
         starts = [first, _mirrored(first)]
     else:
@@ -139,10 +142,6 @@ def _linear(points: Array, xy: Array) -> Array:
     return np.asarray(np.linalg.solve(V, P @ U), dtype=float)
 
 
-def _homography(plane: Array, xy: Array) -> Array:
-    return _linear(plane, xy)
-
-
 def _of_homography(H: Array) -> Array:
     """Return the pose (4, 4) whose first two axes and origin a homography shows, before the camera."""
     scale = np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
@@ -174,43 +173,23 @@ def _of_space(points: Array, xy: Array) -> Array:
 
 
 def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
-    """Return the pose that fits best near a first one, by Marquardt's steps, and its sum of squares."""
-    cost, J, r = _linearized(T, points, xy)
-    damping = 1e-3
-    for _ in range(MOST_STEPS):
-        H = J.T @ J
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + TINY * np.eye(6), J.T @ r)
-        tried = np.eye(4)
-        tried[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
-        tried[:3, 3] = T[:3, 3] + step[3:]
-        now = _linearized(tried, points, xy)
-        damping *= 10
-        if now[0] < cost:
-            gain = cost - now[0]
-            T, (cost, J, r) = tried, now
-            damping /= 100
-            if gain < SETTLED * cost:
-                break
-        if damping > 1e6:
-            break
-    return T, cost
+    """Return the pose that fits best near a first one, and its sum of squares."""
 
+    def pose_at(step: Array) -> Array:
+        found = np.eye(4)
+        found[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
+        found[:3, 3] = T[:3, 3] + step[3:]
+        return found
 
-def _linearized(T: Array, points: Array, xy: Array) -> tuple[float, Array, Array]:
-    """Return the sum of squares, infinite behind the camera, slopes (2 P, 6) by turn and place, and what is left."""
-    turned = points @ T[:3, :3].T
-    there = turned + T[:3, 3]
-    if not (there[:, 2] > 0).all():
-        return np.inf, np.zeros((2 * len(points), 6)), np.zeros(2 * len(points))
-    seen = there[:, :2] / there[:, 2:]
-    G = np.zeros((len(points), 2, 3))
-    G[:, 0, 0] = 1.0
-    G[:, 1, 1] = 1.0
-    G[:, :, 2] = -seen
-    G /= there[:, 2, None, None]
-    J = np.concatenate([np.cross(turned[:, None, :], G), G], axis=2).reshape(-1, 6)
-    r = (xy - seen).ravel()
-    return float(r @ r), J, r
+    def residual(step: Array) -> Array:
+        M = pose_at(step)
+        there = points @ M[:3, :3].T + M[:3, 3]
+        return (there[:, :2] / np.maximum(there[:, 2:], BEFORE) - xy).ravel()
+
+    found = scipy.optimize.least_squares(
+        residual, np.zeros(6), method="lm", x_scale="jac", xtol=TIGHT, ftol=TIGHT, gtol=TIGHT
+    )
+    return pose_at(found.x), float(2 * found.cost)
 
 
 def views(data: Dataset, block: Block) -> Iterator[np.ndarray]:
@@ -245,7 +224,7 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     for view in views(data, block):
         if planar and len(view) >= FEWEST[True]:
             seen = np.hstack([block.y[view], np.ones((len(view), 1))]) @ unit.T
-            H = _homography((points[view] - middle) @ axes[:2].T, seen[:, :2])
+            H = _linear((points[view] - middle) @ axes[:2].T, seen[:, :2])
             H = H / np.linalg.norm(H[:, 0])
             rows += [_product(H, 0, 1), _product(H, 0, 0) - _product(H, 1, 1)]
     accepted = (
@@ -253,11 +232,12 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     )
     if len(rows) < 2 * LEAST_VIEWS:
         raise InputError("the camera", f"{len(rows) // 2} views of a flat board", accepted)
-    b11, b22, b13, b23, b33 = np.linalg.svd(np.array(rows))[2][-1]
+    _, s, axes = np.linalg.svd(np.array(rows))
+    b11, b22, b13, b23, b33 = axes[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         size = b33 - b13**2 / b11 - b23**2 / b22
         squares = np.array([size / b11, size / b22])
-    if not (np.isfinite(squares).all() and (squares > 0).all()):
+    if s[3] <= ALIKE * s[0] or not (np.isfinite(squares).all() and (squares > 0).all()):
         raise InputError("the camera", "views that tell no focal length", accepted)
     scale = unit[0, 0]
     fx, fy = np.sqrt(squares) / scale

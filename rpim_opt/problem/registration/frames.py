@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
+from rpim_opt.problem.registration.certified import CertifiedStart, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import (
     NOMINAL_ERROR,
     TOOL_ERROR,
@@ -33,10 +34,6 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, 
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters, model_parameters
-
-if TYPE_CHECKING:
-    from rpim_opt.problem.registration.certified import CertifiedStart
-
 
 ENOUGH, FEW = 2000, 300
 """Rows of a measurement that register frames, where there are more; of all together, where they are only compared."""
@@ -151,8 +148,6 @@ def _started(
     seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
 ) -> CertifiedStart:
     """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
-    from rpim_opt.problem.registration.certified import certified_hand_eye  # CVXPY waits until a base is located
-
     asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
     sigma = np.concatenate([_deviations(block) for block, _ in asked])
     start = certified_hand_eye(
@@ -273,7 +268,7 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
 def _standing(problem: CalibrationProblem, robot: str, places: Places, known: Places) -> tuple[Array, bool]:
     """Return where a base (4, 4) is, and whether known places say so; refuse touches that are elsewhere."""
     p = problem.parameters.of_robot(robot)
-    stated = numeric_frame(_frame(p, "base_"))
+    stated = numeric_frame(p.nominal[_frame_of(p, "base_")])
     common = {name: place for name, place in places.items() if name in known}
     if not _placed_by_touches(problem, robot, p):
         _require_near(robot, stated, common, known)
@@ -298,7 +293,9 @@ def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, Places]]:
         for block in problem.data.blocks:
             names = _points(block)
             if block.robot == robot and len(names):
-                T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(_frame(p, tool_prefix(block.markers[0])))
+                T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(
+                    p.nominal[_frame_of(p, tool_prefix(block.markers[0]))]
+                )
                 for name, position in zip(names, T[:, :3, 3], strict=True):
                     all_of.setdefault(name, []).append(position)
         if all_of:
@@ -312,13 +309,9 @@ def _points(block: Block) -> list[str]:
     return [str(name) for name in block.touched[:, 0]]
 
 
-def _frame(p: Parameters, prefix: str) -> Array:
-    return p.nominal[[p.names.index(prefix + component) for component in FRAME]]
-
-
 def _placed_by_touches(problem: CalibrationProblem, robot: str, p: Parameters) -> bool:
     """Whether a robot's base is sought, and nothing but touches tells where it is."""
-    sought = p.identified[[p.names.index(f"base_{component}") for component in FRAME]].all()
+    sought = p.identified[_frame_of(p, "base_")].all()
     return bool(sought) and all(block.touched is not None for block in problem.data.blocks if block.robot == robot)
 
 
@@ -561,14 +554,23 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
 
 def settled(alone: Source) -> Array:
-    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated."""
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated.
+
+    Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number; SciPy's, which takes residuals,
+    would load 0.2 s of library for every calibration.
+    """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
     z = np.zeros(len(scale))
     model = source.linearize(scale * z)
     damping = 0.0
     for _ in range(MOST_STEPS):
-        step = _damped_step(model, z, damping)
+        R = model.triangle[:, :-1]
+        b = model.triangle[:, -1] - R @ z
+        A = np.vstack([R, np.eye(len(z))])
+        size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
+        right = np.concatenate([b, -z, np.zeros(len(z))])
+        step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), right, rcond=None)[0]
         candidate = source.linearize(scale * (z + step))
         if _objective(candidate, z + step) > _objective(model, z) * (1 + ROUNDING):
             damping = max(4 * damping, 1e-3)
@@ -579,17 +581,6 @@ def settled(alone: Source) -> Array:
             break
         damping = damping / 8 if damping > 1e-6 else 0.0
     return scale * z
-
-
-def _damped_step(model: LinearModel, z: Array, damping: float) -> Array:
-    """Return s that minimizes |A (z + s) - b|^2 + |z + s|^2 + damping |D s|^2, D the sizes of the columns."""
-    R = model.triangle
-    n = len(z)
-    A = np.vstack([R[:, :n], np.eye(n)])
-    b = np.concatenate([R[:, n] - R[:, :n] @ z, -z])
-    size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
-    step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), np.concatenate([b, np.zeros(n)]), rcond=None)[0]
-    return np.asarray(step, dtype=float)
 
 
 def _objective(model: LinearModel, z: Array) -> float:
