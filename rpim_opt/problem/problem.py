@@ -64,6 +64,31 @@ class CalibrationProblem(Tabled):
     27
     >>> [round(float(1e3 * p.errors(nominal).mean()), 3) for p in (problem, problem.on(instance.validation))]  # [mm]
     [2.096, 2.649]
+    >>> problem.labels[:2], problem.without({"T2-1"}).labels[0], problem.keeps_rows, list(problem.arms)
+    (('T2-1', 'T2-2'), 'T2-2', True, [''])
+    >>> [len(part.data) for part in problem.rows()], problem.sample() is problem
+    ([9], True)
+    >>> norms, count = problem.whitened_errors(nominal)  # 2 mm off, and 0.03 mm of noise
+    >>> norms[:3].round(1), count[:3], len(problem.whitened_residual(nominal))
+    (array([72.9, 68.5, 54.5]), array([3, 3, 3]), 27)
+    >>> norms, count = problem.configuration_errors(nominal)
+    >>> norms.shape, count[:2], problem.owners[:4], problem.groups.shape
+    ((9,), array([3, 3]), array([0, 0, 0, 1]), (27,))
+    >>> problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position, problem.joint_values.shape
+    (0.0001, (9, 6))
+    >>> problem.identifying(problem.parameters.of_frames).parameters.free.names[:2]
+    ('base_x', 'base_y')
+    >>> len(problem.with_parameters(problem.parameters.identify(["a?"])).parameters.free)
+    6
+    >>> [stack.index.shape for stack in problem.stacks()], [V.shape for V in problem.covariances()]
+    ([(9, 3)], [(1, 3, 3)])
+    >>> [part.shape for part in problem.slopes(nominal)], problem.contrasts(np.eye(27)).shape, problem.touches
+    ([(27,), (27, 26)], (27, 27), None)
+    >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
+    >>> len(both.data), len(both.alone("left").data), len(ro.load("contact").problem.touched)
+    (18, 9, 10)
+    >>> problem.triangle(nominal, 5).A.shape
+    (27, 26)
     """
 
     robots: Robot | Mapping[str, Robot]
@@ -110,12 +135,7 @@ class CalibrationProblem(Tabled):
 
     @property
     def arms(self) -> Mapping[str, Robot]:
-        """The nominal robots by name; ``""`` for the only one.
-
-        >>> import rpim_opt as ro
-        >>> {name: robot.dof for name, robot in ro.load("paper_arm").problem.arms.items()}
-        {'': 6}
-        """
+        """The nominal robots by name; ``""`` for the only one."""
         if isinstance(self.robots, Robot):
             return {"": self.robots}
         return self.robots
@@ -131,21 +151,7 @@ class CalibrationProblem(Tabled):
         )
 
     def alone(self, robot: str) -> CalibrationProblem:
-        """Return the problem of one of several robots: its parameters, as itself calls them, and its rows.
-
-        Parameters
-        ----------
-        robot
-            Its name.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
-        >>> len(both.data), len(both.alone("left").data), both.alone("left").parameters.free.names[0]
-        (80, 40, 'alpha1')
-        """
+        """Return the problem of one of several robots: its parameters, as itself calls them, and its rows."""
         if robot not in self.arms:
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
         if not robot:
@@ -189,13 +195,7 @@ class CalibrationProblem(Tabled):
         return replace(self, data=data)
 
     def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
-        """Return the same problem with another table of parameters.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> len(problem.with_parameters(problem.parameters.identify(["a?"])).parameters.free)
-        6
-        """
+        """Return the same problem with another table of parameters."""
         return replace(self, parameters=parameters)
 
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> CalibrationProblem:
@@ -231,71 +231,33 @@ class CalibrationProblem(Tabled):
         return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
 
     def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
-        """Return the same problem with other noise of the robot's own, or none.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("position").problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position
-        0.0001
-        """
+        """Return the same problem with other noise of the robot's own, or none."""
         return replace(self, scatter=scatter)
 
     def identifying(self, identified: np.ndarray) -> CalibrationProblem:
-        """Return the same problem with other parameters identified, (P,) true or false.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> problem.identifying(problem.parameters.of_frames).parameters.free.names[:4]
-        ('base_x', 'base_y', 'base_z', 'base_rx')
-        """
+        """Return the same problem with other parameters identified, (P,) true or false."""
         return self.with_parameters(replace(self.parameters, identified=identified))
 
     def sample(self) -> CalibrationProblem:
-        """Return rows enough to place frames by: here all of them, of measurements in parts the first part.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> problem.sample() is problem
-        True
-        """
+        """Return rows enough to place frames by: here all of them, of measurements in parts the first part."""
         return self
 
     def rows(self) -> Iterator[CalibrationProblem]:
-        """Yield problems that together have all the rows: here this one, of measurements in parts one a part.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> [len(part.data) for part in problem.rows()]
-        [9]
-        """
+        """Yield problems that together have all the rows: here this one, of measurements in parts one a part."""
         yield self
 
     @property
     def keeps_rows(self) -> bool:
-        """Whether `linearize` returns the equations themselves, and not their triangle.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.keeps_rows
-        True
-        """
+        """Whether `linearize` returns the equations themselves, and not their triangle."""
         return True
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """N labels of the rows.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.labels[:2]
-        ('T2-1', 'T2-2')
-        """
+        """N labels of the rows."""
         return self.data.label
 
     def without(self, labels: Collection[str]) -> CalibrationProblem:
-        """Return the same problem without the rows of these labels.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.without({"T2-1"}).labels[:2]
-        ('T2-2', 'T2-3')
-        """
+        """Return the same problem without the rows of these labels."""
         return self.on(self.data.without(labels))
 
     def frozen(self) -> CalibrationProblem:
@@ -336,11 +298,7 @@ class CalibrationProblem(Tabled):
 
     @cached_property
     def touches(self) -> Touches | None:
-        """Points and planes that rows touched and nobody measured; None where there are none.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("paper_arm").problem.touches
-        """
+        """Points and planes that rows touched and nobody measured; None where there are none."""
         return Touches.of(self.data)
 
     def _residuals(self, x: Array) -> Iterator[tuple[Block, Array]]:
@@ -395,15 +353,7 @@ class CalibrationProblem(Tabled):
         return errors
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
-        """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,).
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem  # 2 mm off at nominal, and 0.03 mm of noise declared
-        >>> norms, count = problem.whitened_errors(np.zeros(len(problem.parameters.free)))
-        >>> norms[:3].round(1), count[:3]
-        (array([72.9, 68.5, 54.5]), array([3, 3, 3]))
-        """
+        """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,)."""
         norms = np.zeros(len(self.data))
         count = np.zeros(len(self.data), dtype=int)
         for (block, residual), whitening in zip(self._residuals(x), self._whitening, strict=True):
@@ -413,15 +363,7 @@ class CalibrationProblem(Tabled):
         return norms, count
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
-        """Return the whitened norm of every configuration's residual at x (n,), (C,), and its number of equations (C,).
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("markers").problem  # three reflectors
-        >>> norms, count = problem.configuration_errors(np.zeros(len(problem.parameters.free)))
-        >>> norms.shape, count[:2]
-        ((25,), array([9, 9]))
-        """
+        """Return the whitened norms (C,) of the configurations' residuals at x (n,), and how many equations each has."""
         which = np.unique(self.groups, return_inverse=True)[1]
         squares = np.bincount(which, self.whitened_residual(x) ** 2)
         return np.sqrt(squares), np.bincount(which)
@@ -449,43 +391,38 @@ class CalibrationProblem(Tabled):
         reweigh
             What weighs the equations by their residuals there, or None.
         """
-        pieces = list(self.pieces(x, len(self.data)))
-        model = replace(
-            pieces[0],
-            A=np.concatenate([piece.A for piece in pieces]),
-            b=np.concatenate([piece.b for piece in pieces]),
-            group=np.concatenate([piece.group for piece in pieces]),
-        )
+        if self.scatter is not None or self.touches is not None:
+            model = next(self._by_configurations(x, len(self.data)))
+        else:
+            parts = [self._block(x, i) for i in range(len(self.data.blocks))]
+            A, r = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+            model = self._model(A, r + A @ (x / self.parameters.free.scale), self.groups)
         if reweigh is None:
             return model
         weighed, offset = reweigh(model, x / self.parameters.free.scale)
         return replace(weighed, offset=offset)
 
-    def pieces(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model of `linearize` at x (n,) [SI], no more than so many rows at a time, block by block."""
-        if self.scatter is not None or self.touches is not None:
-            yield from self._by_configurations(x, most)
-            return
-        n = len(x)
-        for i, part in self._spans(most):
-            block = self.data.blocks[i]
-            rows, each = block.row[part], len(block.measurement.components)
-            columns = np.empty((n + 1, len(rows), each))
-            self._write(x, i, part, columns.transpose(0, 2, 1))
-            A, r = columns[:-1].reshape(n, -1).T, columns[-1].ravel()
-            yield self._model(
-                A, r + A @ (x / self.parameters.free.scale), np.repeat(self.data.configuration[rows], each)
-            )
+    def _block(self, x: Array, i: int) -> tuple[Array, Array]:
+        """Return whitened, scaled A (m, n) and r (m,) of a block."""
+        block = self.data.blocks[i]
+        columns = np.empty((len(x) + 1, len(block.row), len(block.measurement.components)))
+        self._write(x, i, slice(0, len(block.row)), columns.transpose(0, 2, 1))
+        return columns[:-1].reshape(len(x), -1).T, columns[-1].ravel()
 
     def triangle(self, x: Array, most: int) -> LinearModel:
-        """Return the model of `linearize` at x (n,) [SI] as its QR factor: n + 1 equations, the same |A z - b|.
+        """Return the model of `linearize` as its QR factor: n + 1 rows, the same |A z - b|. Arguments as for `errors`.
 
-        Rows are evaluated where they are reduced, so many together, and memory does not grow with their number.
+        Rows are evaluated where they are reduced, ``most`` together, so that memory does not grow with their number.
         """
         if self.scatter is not None or self.touches is not None:
             return reduced_models(self._by_configurations(x, most))
         R, equations, n = None, 0, len(x) + 1
-        for i, part in self._spans(most):
+        spans = [
+            (i, slice(start, min(start + most, len(block.row))))
+            for i, block in enumerate(self.data.blocks)
+            for start in range(0, len(block.row), most)
+        ]
+        for i, part in spans:
             each = len(self.data.blocks[i].measurement.components)
             stacked, rows = beneath(R, n, each * (part.stop - part.start))
             self._write(x, i, part, rows.T.reshape(n, each, -1))
@@ -496,12 +433,6 @@ class CalibrationProblem(Tabled):
             raise InputError("data", "no row", "at least one")
         R[:, -1] += R[:, :-1] @ (x / self.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
         return from_triangle(self._model(R[:, :-1], R[:, -1], np.zeros(n, dtype=int)), R, equations)
-
-    def _spans(self, most: int) -> Iterator[tuple[int, slice]]:
-        """Yield the number of a block and some of its rows, until all have come, ``most`` at a time."""
-        for i, block in enumerate(self.data.blocks):
-            for start in range(0, len(block.row), most):
-                yield i, slice(start, min(start + most, len(block.row)))
 
     def _model(self, A: Array, b: Array, group: np.ndarray) -> LinearModel:
         kinds = [block.measurement for block in self.data.blocks]
@@ -603,12 +534,7 @@ class CalibrationProblem(Tabled):
 
     @cached_property
     def touched(self) -> Things:
-        """Where the nominal robot puts the points and planes that were touched, in its base frame.
-
-        >>> import rpim_opt as ro
-        >>> len(ro.load("contact").problem.touched)
-        10
-        """
+        """Where the nominal robot puts the points and planes that were touched, in its base frame."""
         if self.touches is None:
             return ()
         return [thing.level for thing in self.touches.located(self._untouched)]

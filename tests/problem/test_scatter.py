@@ -83,10 +83,6 @@ def test_triangles_and_parts_are_the_same_squares(name: str) -> None:
     want = reduced_rows(np.column_stack([model.A, model.b]))
     small = np.column_stack([reduced(problem, x).A, reduced(problem, x).b])
     assert np.allclose(small.T @ small, want.T @ want, rtol=1e-9, atol=1e-7 * np.abs(want).max() ** 2)
-    pieces = list(problem.pieces(x, 7))
-    assert len(pieces) > 3
-    rows = np.vstack([np.column_stack([piece.A, piece.b]) for piece in pieces])
-    assert np.allclose(rows.T @ rows, want.T @ want, rtol=1e-9, atol=1e-7 * np.abs(want).max() ** 2)
     parts = [lambda rows=rows: problem.data.take(rows) for rows in np.array_split(np.arange(len(problem.data)), 1)]
     split = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, parts).scattered(SCATTER)
     joined = np.column_stack([split.linearize(x).A, split.linearize(x).b])

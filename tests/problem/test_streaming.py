@@ -72,15 +72,6 @@ def test_a_triangle_says_all_that_a_squared_loss_sees(whole: CalibrationProblem)
     np.testing.assert_allclose(triangle.A.T @ triangle.A, gram, atol=1e-12 * np.abs(gram).max())
 
 
-def test_pieces_stay_as_they_are_when_the_next_one_comes() -> None:
-    problem = ro.load("mixed").problem
-    x = 0.1 * problem.parameters.free.scale
-    rows, pieces = problem.linearize(x), list(problem.pieces(x, 7))
-    assert len(pieces) > 3
-    assert np.array_equal(rows.A, np.concatenate([piece.A for piece in pieces]))
-    assert rows.b == pytest.approx(np.concatenate([piece.b for piece in pieces]), rel=1e-12)
-
-
 @pytest.mark.parametrize("name", ["position", "mixed", "pose", "tracker", "markers"])
 @pytest.mark.parametrize("few", [3, 7, 1024])
 def test_rows_that_are_written_where_they_are_reduced_say_the_same(name: str, few: int, monkeypatch) -> None:
