@@ -189,16 +189,8 @@ def by_twos(triangles: list[Array]) -> Array:
 def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0.0) -> LinearModel:
     """Return the linear model of a triangle: n + 1 equations with the same |A z - b| as those it was reduced from.
 
-    Parameters
-    ----------
-    like
-        Gives the parameters, and whether measured values are constraints.
-    R
-        (n+1, n+1) of [A b] = QR.
-    equations
-        How many equations A and b had.
-    offset
-        As `LinearModel` has it.
+    ``like``: gives the parameters, and whether measured values are constraints; ``R``: (n+1, n+1) of [A b] = QR;
+    ``equations``: how many equations A and b had; ``offset``: as `LinearModel` has it.
     """
     group = np.zeros(len(R), dtype=int)
     return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)

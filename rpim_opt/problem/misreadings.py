@@ -348,10 +348,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
     right, all orders of up to six joints, and the ready robots.
 
-    Parameters
-    ----------
-    problem
-        Its robot as the drawing says; base and reflectors are fitted anew for every reading.
+    ``problem``: its robot as the drawing says; base and reflectors are fitted anew for every reading.
     """
     points = points_of(problem)
     if points is None:

@@ -363,7 +363,7 @@ class CalibrationProblem(Tabled):
         return norms, count
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
-        """Return the whitened norms (C,) of the configurations' residuals at x (n,), and how many equations each has."""
+        """Return the whitened norms (C,) of configurations' residuals at x (n,), and how many equations each has."""
         which = np.unique(self.groups, return_inverse=True)[1]
         squares = np.bincount(which, self.whitened_residual(x) ** 2)
         return np.sqrt(squares), np.bincount(which)

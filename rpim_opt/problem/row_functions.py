@@ -461,18 +461,9 @@ def bearing(
     Directions of approach are not known, 0, where the data of a problem ``like`` these state them: the joints are in
     the middle of their backlash.
 
-    Parameters
-    ----------
-    data
-        The rows.
-    like
-        Data of the problem whose rows these are to be.
-    torque
-        (N, dof) joint torques [Nm].
-    payload
-        Mass at the flange [kg], one or (N,).
-    columns
-        Further columns by name [SI], one number or (N,).
+    ``data``: the rows; ``like``: data of the problem whose rows these are to be; ``torque``: (N, dof) joint torques
+    [Nm]; ``payload``: mass at the flange [kg], one or (N,); ``columns``: further columns by name [SI], one number or
+    (N,).
     """
     (block,) = data.blocks
     if torque is not None:

@@ -172,10 +172,7 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
     session is identified, or all are. Rows that name no session are of one more.
 
-    Parameters
-    ----------
-    problem
-        With measurements, perhaps of other sessions.
+    ``problem``: with measurements, perhaps of other sessions.
     """
     p = problem.parameters
     like = dict(chain.from_iterable(_new(problem, robot) for robot in problem.arms))
@@ -196,10 +193,7 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
     T diag(size^2) T' with T the slopes by the shift and the turn of a session, and as sizes the scales of those that
     are identified; zero for rows of an identified session, and where no session is identified.
 
-    Parameters
-    ----------
-    problem
-        With the measurements.
+    ``problem``: with the measurements.
     """
     whole = knowing_sessions(problem)
     if whole is problem or problem.touches is not None:

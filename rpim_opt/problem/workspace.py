@@ -40,16 +40,9 @@ class Predicted(NamedTuple):
 def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
     """Return where a reflector is in the instrument's frame, to first order about where the machine is looked at.
 
-    Parameters
-    ----------
-    machine
-        Robot and parameters.
-    q
-        (N, dof) joint values of the controller [rad or m].
-    marker
-        The reflector; the only one, or the first, by default.
-    torque
-        (N, dof) joint torques [Nm], where the compliance of joints is identified from measured ones.
+    ``machine``: robot and parameters. ``q``: (N, dof) joint values of the controller [rad or m]. ``marker``: the
+    reflector; the only one, or the first, by default. ``torque``: (N, dof) joint torques [Nm], where the compliance of
+    joints is identified from measured ones.
     """
     here = _there(machine, q, marker, torque)
     return _about(here, _at(machine))
@@ -107,12 +100,7 @@ def within_ranges(machine: Machine) -> Array:
 def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
     """Return configurations (N, dof) whose nominal reflector is in a box of the robot's base frame, and stand for it.
 
-    Parameters
-    ----------
-    machine
-        Robot and parameters.
-    lower, upper
-        (3,) corners [m].
+    ``machine``: robot and parameters; ``lower``, ``upper``: (3,) corners [m].
     """
     key = (require_robot(machine), machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
     if key not in _FOUND:

@@ -42,12 +42,7 @@ def camera_blocks(data: Dataset) -> list[Block]:
 def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
     """Return the directions x = X / Z, y = Y / Z (N, 2) of pixels (N, 2), without distortion.
 
-    Parameters
-    ----------
-    uv
-        Pixels.
-    camera
-        ``fx, fy, cx, cy``, and distortion where it is known.
+    ``uv``: pixels; ``camera``: ``fx, fy, cx, cy``, and distortion where it is known.
     """
     k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
@@ -207,10 +202,7 @@ def targets(block: Block) -> Array:
 def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     """Return focal lengths and centre [px] from the homographies of three views or more of a plane (Zhang 2000).
 
-    Parameters
-    ----------
-    data, block
-        What a camera has seen.
+    ``data``, ``block``: what a camera has seen.
 
     Raises
     ------
@@ -260,12 +252,7 @@ def camera_of(block: Block, own: Mapping[str, float]) -> dict[str, float]:
 def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     """Return the data with a pose for every view of a camera; other measurements as they are.
 
-    Parameters
-    ----------
-    data
-        The measurements.
-    own
-        Values of the cameras' own parameters by name.
+    ``data``: the measurements; ``own``: values of the cameras' own parameters by name.
 
     Raises
     ------

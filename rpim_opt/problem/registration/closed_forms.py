@@ -97,18 +97,9 @@ def register_arm(flange: Array, y: Array, marker: np.ndarray, stated: Array, rob
     Minimizes sum_i w_i |y_i - R (R_i o + p_i) - t|^2 + (0.005 |o - o_stated| / 0.1)^2 over R, t and the reflectors o
     by Gauss-Newton steps from a registration. SciPy's least_squares takes one set at a time, and hundreds are tried.
 
-    Parameters
-    ----------
-    flange
-        (B, N, 4, 4) of the nominal robot.
-    y
-        (B, N, 3) measured positions [m].
-    marker
-        (B, N) number of the reflector.
-    stated
-        (B, M, 3) where the reflectors are stated [m].
-    robust
-        Whether weights fall as 1 / error beyond three medians; otherwise they are one.
+    ``flange``: (B, N, 4, 4) of the nominal robot. ``y``: (B, N, 3) measured positions [m]. ``marker``: (B, N) number
+    of the reflector. ``stated``: (B, M, 3) where the reflectors are stated [m]. ``robust``: whether weights fall as 1
+    / error beyond three medians; otherwise they are one.
     """
     tools = stated.copy()
     weights = np.ones(y.shape[:2])

@@ -424,14 +424,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     relaxation's again. The truncated loss begins with the largest core of measurements that turn alike, and if not all
     of that agree, with all of them; it is followed from the candidates, too, so that none of them is better.
 
-    Parameters
-    ----------
-    loops
-        The residuals.
-    loss
-        One of `LOSSES`.
-    candidates
-        Rotations (k, 3, 3) to start from, too.
+    ``loops``: the residuals; ``loss``: one of `LOSSES`; ``candidates``: rotations (k, 3, 3) to start from, too.
     """
     if loss == "squares":
         return _weighted(loops, np.ones(len(loops.rows)), loss, candidates)

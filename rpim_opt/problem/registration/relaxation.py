@@ -96,15 +96,9 @@ def relax(Q: Array, shared: int | None = None, tolerance: float = TOLERANCE) -> 
     semidefinite blocks, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler
     et al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
 
-    Parameters
-    ----------
-    Q
-        (n, n) symmetric, n = 1 + 9 k for k rotations.
-    shared
-        The first so many rotations are those that the others have products with, and they have none among themselves;
-        all by default.
-    tolerance
-        Of gap and feasibility.
+    ``Q``: (n, n) symmetric, n = 1 + 9 k for k rotations. ``shared``: the first so many rotations are those that the
+    others have products with, and they have none among themselves; all by default. ``tolerance``: of gap and
+    feasibility.
     """
     import clarabel
 
