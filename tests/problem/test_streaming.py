@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.tables import reading
 from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.data.tables import reading
 from rpim_opt.problem import parts as streaming
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions, reduced
