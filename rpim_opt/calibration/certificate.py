@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +16,12 @@ from rpim_opt.problem.linear import LinearModel
 
 DECREASE = 1e-6
 """What the convex program at a solution may still promise, relative to the objective: an interior point's accuracy."""
+DIRECTIONS = 2
+"""Random directions in which the model's derivative is compared."""
+APART = 1e-4
+"""Half the distance of a difference, in scales."""
+INEXACT = 1e-4
+"""Relative difference from which the model's derivative is not the residual's; rounding and curvature are less."""
 TINY = 1e-300
 """Where numbers end that something may be divided by."""
 
@@ -48,7 +56,13 @@ class Certificate(NamedTuple):
 
 
 def certified(
-    formulation: Formulation, model: LinearModel, slope: float, z: Array, weight: float, floor: float = 0.0
+    formulation: Formulation,
+    model: LinearModel,
+    slope: float,
+    z: Array,
+    weight: float,
+    floor: float = 0.0,
+    residual: Callable[[Array], Array] | None = None,
 ) -> Certificate:
     """Return the evidence that z (n,) minimizes the nonlinear problem.
 
@@ -62,7 +76,12 @@ def certified(
         What is certified.
     floor
         Below what an objective is as good as zero.
+    residual
+        The nonlinear problem's whitened residual b - A z at z (n,), where there is one: the model's derivative is held
+        against its differences, and replaced by them where it is not theirs.
     """
+    if residual is not None:
+        model = _differentiated(model, residual, z)
     program = pose(formulation, model).beginning(z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
@@ -76,6 +95,25 @@ def certified(
     if not np.isfinite(promised):
         return Certificate(gradient, step, violation, None)
     return Certificate(gradient, step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
+
+
+def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: Array) -> LinearModel:
+    """Return the model, or where its derivative is not that of the residual, the one by central differences."""
+
+    def slope(direction: Array) -> Array:
+        return (residual(z - APART * direction) - residual(z + APART * direction)) / (2 * APART)
+
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(DIRECTIONS, len(z)))
+    for direction in directions:
+        exact = model.A @ direction
+        found = slope(direction)
+        if found.shape != exact.shape or not np.isfinite(found).all():
+            return model
+        if np.linalg.norm(found - exact) > INEXACT * np.linalg.norm(exact):
+            A = np.column_stack([slope(unit) for unit in np.eye(len(z))])
+            return replace(model, A=A, b=residual(z) + A @ z)
+    return model
 
 
 def _gradient(program: Program, slope: float, z: Array, weight: float) -> float | None:

@@ -470,9 +470,19 @@ def _certified(loop: Loop, formulation: Formulation, problem: Source, state: Sta
     solved, model = formulation, state.program.model
     if loop.reweigh is not None:
         solved, _ = on_triangles(formulation, lambda: model.equations)
+    residual = None
     if loop.source.keeps_rows:  # of more than fits into memory the last pass has to do
-        model = around(problem.frozen().linearize(loop.source.parameters.free.scale * state.z), *loop.about)
-    return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor)
+        scale = loop.source.parameters.free.scale
+        anew = problem.frozen()
+        model = around(anew.linearize(scale * state.z), *loop.about)
+        if isinstance(anew, CalibrationProblem):
+            residual = partial(_whitened, anew, scale)
+    return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor, residual)
+
+
+def _whitened(problem: CalibrationProblem, scale: Array, z: Array) -> Array:
+    """Return the whitened residual (m,) at z (n,) in units of the scales."""
+    return problem.whitened_residual(scale * z)
 
 
 def _names(source: Source) -> dict[int, str]:

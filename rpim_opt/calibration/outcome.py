@@ -34,7 +34,7 @@ from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, wides
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.quadratic import ridge
+from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.select import Selection
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.data.dataset import Dataset
@@ -526,6 +526,9 @@ class Outcome:
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
         linear = self.linear
         form = ridge(linear, self.program.penalty_form)
+        moves = None if self.kept is not None else self.program.tangent(self.z, self.penalty_weight)
+        if moves is not None:  # conditional on the active constraints
+            form = ridge_within(linear, self.program.penalty_form, moves, self.z)
         if self.learned is None:
             return Spread(linear, form, self.penalty_weight, self.z, self._factor)
         return Spread(linear, form, self.penalty_weight, self.z, self._factor, 1.0, self.learned.drift)

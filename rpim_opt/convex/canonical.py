@@ -19,6 +19,7 @@ ATTEMPTS: tuple[dict[str, Any], ...] = (
     {},
     {"static_regularization_constant": 1e-10},
     {"equilibrate_enable": False},
+    {"static_regularization_constant": 1e-7},
 )
 """Settings that are tried in turn: where one factorization stalls, another does not."""
 CURVED = 1e-14
@@ -61,7 +62,8 @@ class Canonical:
         self.linear = int(dims.zero + dims.nonneg)
         self.offset = float(self._inverse[-1].get("offset", 0.0)) if isinstance(self._inverse[-1], dict) else 0.0
         A = sparse.coo_array(data["A"])
-        self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, dims)
+        self.cone_sizes = _cone_sizes(dims, len(data["b"]))
+        self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
         self.A = sparse.csr_array((A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape)
         self.b = data["b"] * self.row_scale
         self.q = data["c"] * self.column_scale
@@ -98,6 +100,7 @@ class Canonical:
             made.offset = float(penalty.c @ penalty.c) + penalty.constant
             made.root = np.sqrt(2) * L
         made.cones = None
+        made.cone_sizes = []
         return made
 
     @cached_property
@@ -199,7 +202,16 @@ class Canonical:
         return made
 
 
-def _scales(A: Any, m: int, n: int, at: np.ndarray, dims: Any) -> tuple[Array, Array]:
+def _cone_sizes(dims: Any, m: int) -> list[int]:
+    """Return the numbers of rows of the cones behind equations and inequalities."""
+    sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
+    rest = m - int(dims.zero + dims.nonneg) - sum(sizes)
+    if rest % 3 == 0:  # exponential and power cones
+        return sizes + [3] * (rest // 3)
+    return [*sizes, rest]
+
+
+def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int]) -> tuple[Array, Array]:
     """Return factors of the rows (m,), one a cone, and of the columns (n,), one for those of the variable."""
     own = np.isin(A.col, at)
     size = np.zeros(m)
@@ -211,11 +223,7 @@ def _scales(A: Any, m: int, n: int, at: np.ndarray, dims: Any) -> tuple[Array, A
     column[column == 0] = 1.0
     size = np.zeros(m)
     np.maximum.at(size, A.row, np.abs(A.data) * column[A.col])
-    sizes = [1] * int(dims.zero + dims.nonneg) + [int(k) for k in dims.soc]
-    psd = [int(k) * (int(k) + 1) // 2 for k in dims.psd]
-    sizes += psd
-    rest = m - sum(sizes)
-    sizes += [3] * (rest // 3) if rest % 3 == 0 else [rest]
+    sizes = [1] * linear + cones
     begin = np.cumsum([0, *sizes])[:-1]
     largest = np.maximum.reduceat(size, begin) if m else size
     size = np.repeat(largest, sizes) if m else size

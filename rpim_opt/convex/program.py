@@ -29,6 +29,8 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
+ACTIVE = 1e-7
+"""Part of the largest multiplier from which a constraint is active."""
 DIFFERENCE = 1e-4
 """Change of a solution, in scales, over which it is differentiated."""
 TOUCHING = 1e-9
@@ -657,6 +659,48 @@ class Program(Brief):
                 there = here + DIFFERENCE * s[j] ** 2 / (s[j] ** 2 + estimate.weight) * V[j]
             D[:, j] = (there - here) / (DIFFERENCE * s[j])
         return D, self.squared.A @ (V.T / s)
+
+    def tangent(self, z: Array, weight: float) -> Array | None:
+        """Return orthonormal directions (n, k) along which z (n,) may move with its active constraints; None for all.
+
+        Equations, and inequalities and cones with a multiplier, linearized at z; variables of the functions' own move
+        along.
+        """
+        if not self.formulation.constraints or self.predicts:
+            return None
+        found = self.apart(self.model)._minimum_at(z, weight)
+        if found is None:
+            return None
+        p = self._posed.canonical
+        limit = ACTIVE * max(np.abs(found.dual).max(initial=0.0), TOUCHING)
+        dense = p.A if isinstance(p.A, np.ndarray) else p.A.toarray()
+        linear = np.arange(p.linear)
+        active = (linear < p.zero) | (np.abs(found.dual[linear]) > limit)
+        normals = [dense[linear[active]]]
+        start = p.linear
+        for count in p.cone_sizes:
+            part = slice(start, start + count)
+            if np.abs(found.dual[part]).max() > limit:
+                normals.append(found.dual[part][None] @ dense[part])
+            start += count
+        G = np.vstack(normals)
+        if not len(G):
+            return None
+        _, values, V = np.linalg.svd(G)
+        rank = int(np.count_nonzero(values > RANK_TOLERANCE * values.max(initial=0.0)))
+        moves = V[rank:].T[p.at]
+        U, values, _ = np.linalg.svd(moves, full_matrices=False)
+        return U[:, values > TOUCHING]
+
+    def _minimum_at(self, z: Array, weight: float) -> Minimum | None:
+        """Return the minimum next to a solution z (n,), with its multipliers; None where it is not found."""
+        if self._posed.joint:
+            return None
+        self.beginning(z)
+        try:
+            return minimum(self._posed.loss, self._rows, self._warm, weight, self._squares)
+        except Unsolved:
+            return None
 
     def largest_slope(self, slope: Array) -> float:
         """Return max { -slope'z : penalty(z) <= 1 } (n,), the dual norm of a slope; 0 where it is not bounded."""

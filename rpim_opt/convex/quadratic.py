@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -195,3 +195,29 @@ def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:
     L = np.zeros((int(kept.sum()), len(frames)))
     L[:, rest] = (vectors[:, kept] * np.sqrt(values[kept])).T
     return Quadratic(L, L @ centre)
+
+
+def ridge_within(model: LinearModel, penalty: Quadratic | None, moves: Array, z: Array) -> Ridge:
+    """Decompose a linear model and a squared penalty where z (n,) may move in some directions alone.
+
+    Parameters
+    ----------
+    model, penalty
+        As for `ridge`.
+    moves
+        (n, k) orthonormal; z + moves y are the points that count, and covariances are conditional on them.
+    z
+        A point that meets the constraints.
+    """
+    form = penalty or identity(len(z))
+    inside = ridge(
+        replace(model, A=model.A @ moves, b=model.b - model.A @ z),
+        Quadratic(form.matrix @ moves, form.c - form.matrix @ z),
+    )
+    return replace(
+        inside,
+        B=moves @ inside.B,
+        offset=z + moves @ inside.offset,
+        free=moves @ inside.free,
+        unseen=moves @ inside.unseen,
+    )

@@ -21,7 +21,13 @@ ROOT = Path(__file__).parents[2]
 FILE = Path(__file__).with_name("results.json")
 LIMITS = {"x": 1e-9, "weight": 1e-8, "objective": 1e-8, "std": 1e-7, "expanded": 1e-7, "hyperparameters": 1e-3}
 """Largest differences that are rounding: of x by prior scale, of all else relative."""
+CONDITIONAL = ("std", "expanded")  # covariances are conditional on equations and active bounds
 INTENDED = {
+    "constrained:equal_links": CONDITIONAL,
+    "constrained:parallel_axes": CONDITIONAL,
+    "constrained:everything": CONDITIONAL,
+    "constrained:wrong_tolerance": CONDITIONAL,
+    "paper_arm:parallel_axes": CONDITIONAL,
     "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
     "paper_arm:misprints": ("x", "weight", "objective", "std"),  # what a rule sees of a robust loss is decided anew
