@@ -459,7 +459,7 @@ class Dataset(Tabled):
         return replace(whole, configuration=joined[whole.configuration])
 
 
-def named_sessions(names: Sequence[Any], N: int) -> np.ndarray | None:
+def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | None:
     """Return the names (N,) of the rows' sessions; None where there are none.
 
     Raises

@@ -196,7 +196,8 @@ def _widen(scalar: ca.Function, width: int) -> ca.Function | None:
         elif len(source) == 1:
             values[target[0]] = ca.MX.unary(operation, values[source[0]])
         else:
-            values[target[0]] = ca.MX.binary(operation, *(values[i] for i in source))
+            first, second = source
+            values[target[0]] = ca.MX.binary(operation, values[first], values[second])
     return ca.Function("vectorized", [common, table], [ca.horzcat(*outputs)])
 
 
@@ -241,7 +242,8 @@ class _Memory:
 
 def _buffer(function: ca.Function, inputs: Sequence[Array], output: Array) -> Any:
     """Return a buffer and what evaluates the function in it; both and the arrays have to be kept."""
-    buffer, trigger = function.buffer()
+    made: tuple[Any, Any] = function.buffer()  # CasADi's stubs ask for sizes, which its wrapper takes from the arrays
+    buffer, trigger = made
     for i, values in enumerate(inputs):
         buffer.set_arg(i, values.data)
     buffer.set_res(0, output.data)

@@ -454,7 +454,9 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    moves = ca.vertcat(moves, moved(term, Joint(i, posture), ca.SX.sym))
+                    more = moved(term, Joint(i, posture), ca.SX.sym)
+                    if more is not None:
+                        moves = ca.vertcat(moves, more)
         return Dependencies(
             torques=ca.depends_on(moves, torque),
             gravity=ca.depends_on(moves, gravity.payload),

@@ -453,14 +453,14 @@ def _sigma(table: DistanceTable | AngleTable, where: str, path: Path) -> float:
 
 def _require_enough(data: Dataset) -> None:
     """Refuse what was touched so few times that its touches say nothing."""
-    blocks = [block for block in data.blocks if block.touched is not None]
-    joined = {name for block in blocks if not block.measurement.touching for names in block.touched for name in names}
+    blocks = [(block, block.touched) for block in data.blocks if block.touched is not None]
+    joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
     count: Counter[str] = Counter()
     last: dict[str, tuple[Block, str]] = {}
-    for block in blocks:
+    for block, rows in blocks:
         if block.measurement.touching:
-            count.update(names[0] for names in block.touched)
-            last |= {names[0]: (block, data.label[i]) for i, names in zip(block.row, block.touched, strict=True)}
+            count.update(names[0] for names in rows)
+            last |= {names[0]: (block, data.label[i]) for i, names in zip(block.row, rows, strict=True)}
     for name, touches in count.items():
         block, label = last[name]
         least, column = (4, "plane") if block.measurement.planar else (2, "point")

@@ -531,10 +531,9 @@ def _block(block: Block, known: Mapping[str, Measurement], where: str) -> Block:
     arrays |= {f"columns.{name}": values for name, values in block.columns.items()}
     for key, array in arrays.items():
         shape = shapes.get(key, (N,))
-        fits = array is None or (
-            array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
-        )
-        if not fits:
+        if array is None:
+            continue
+        if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
             raise InputError(f"{where}.{key}", f"shape {array.shape}", f"shape {shape}")
     session = None if block.session is None else named_sessions(block.session, N)
     return replace(block, measurement=kind, session=session)

@@ -74,7 +74,7 @@ def _converter() -> Converter:
     made.register_unstructure_hook_func(_is_array, _listed)
     elsewhere = override(omit=True)
     by_name = override(unstruct_hook=lambda kind: kind.name, struct_hook=lambda name, _: _scalar(name, str))
-    fields = {
+    fields: dict[type, dict[str, Any]] = {
         Record: {"validation": elsewhere, "digest": elsewhere},  # among the data; of the file itself
         Robot: {"model": elsewhere},  # functions of a script, who gives them again
         Block: {"measurement": by_name},
@@ -101,7 +101,7 @@ def _scalar(value: Any, kind: type) -> Any:
 def _number(value: Any) -> float:
     if isinstance(value, str) and value in NOT_FINITE:
         return float(value)
-    if type(value) not in (int, float) or not abs(value) <= LARGEST:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
         raise _unfit(value, "a valid number")
     return float(value)
 

@@ -326,7 +326,7 @@ class TableMaker:
                 columns[name] = [f"{v:.12f}" for v in y[:, i]]
         return columns
 
-    def _read(self, columns: Columns) -> Dataset:
+    def _read(self, columns: Mapping[str, Sequence[Any]]) -> Dataset:
         noise = self.shape.observation.noise or self.world.stated.table.noise
         return read_data(columns, self.world.stated.robot, noise, self.shape.kind)
 
@@ -363,7 +363,7 @@ class TableMaker:
         width, height = plan.image_px
         points = np.array(list(board.values()))
         q = postures_in_sight(world, points, count, self.rng, self.world.x, plan.joint_share, (width, height))
-        table = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
+        table: Columns = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
         table |= self._joints(np.repeat(q, len(names), axis=0)[:, None], CAMERA_DIGITS)
         empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
         data = self._read(on_board({**table, **empty}, board))

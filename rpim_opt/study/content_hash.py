@@ -39,7 +39,7 @@ def content_hash(thing: Any, where: str) -> str:
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(max(limit, DEEPEST))
     try:
-        return _Hasher(where).hash(thing)
+        return str(_Hasher(where).hash(thing))
     finally:
         sys.setrecursionlimit(limit)
 
@@ -112,13 +112,12 @@ def _content(thing: Any) -> tuple[Any, ...] | None:
             return kind, thing.shape, thing.attributes
         case cp.Constant() | cp.Parameter():
             return kind, thing.shape, thing.attributes, thing.value
-        case cp.Expression():  # whose pickle holds running numbers
-            return kind, thing.args, thing.get_data()
+        case cp.Expression(args=args):  # whose pickle holds running numbers
+            return kind, args, thing.get_data()
     if kind.__module__.startswith("rpim_opt.") and is_dataclass(thing) and not isinstance(thing, type):
         return kind, {each.name: getattr(thing, each.name) for each in fields(thing)}
-    if "__wrapped__" in getattr(thing, "__dict__", ()):  # functools.lru_cache
-        return kind, thing.__wrapped__
-    return None
+    wrapped = getattr(thing, "__dict__", {}).get("__wrapped__")  # functools.lru_cache
+    return None if wrapped is None else (kind, wrapped)
 
 
 def _held(cell: Any) -> Any:
