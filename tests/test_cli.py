@@ -34,7 +34,7 @@ def test_calibrate_prints_the_tables_and_writes_the_result(monkeypatch, capsys, 
     for expected in (
         "0.0319",
         "2.6489",
-        "printed: RPIM",
+        "published: RPIM",
         "0.468",
         "corner of the L-curve",
         "beta4",

@@ -7,7 +7,15 @@ import sysconfig
 from dataclasses import fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
-from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, MethodType, ModuleType
+from types import (
+    CodeType,
+    FunctionType,
+    GetSetDescriptorType,
+    MappingProxyType,
+    MemberDescriptorType,
+    MethodType,
+    ModuleType,
+)
 from typing import Any
 
 import cvxpy as cp
@@ -54,6 +62,8 @@ class _Hasher(NumpyHasher):
     def save(self, obj: Any) -> None:
         if isinstance(obj, MethodType):
             obj = ("method", obj.__func__, obj.__self__)
+        elif isinstance(obj, MappingProxyType):
+            obj = ("read-only", dict(obj))
         elif isinstance(obj, set | frozenset):
             obj = (type(obj), sorted(content_hash(each, self.where) for each in obj))
         elif type(obj) is np.ndarray and obj.ndim:
