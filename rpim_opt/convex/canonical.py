@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -53,6 +54,7 @@ class Canonical:
             v.save_value(None)
         anchor = [] if variable.id in stated else [variable == cp.Variable(variable.shape)]
         problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor])
+        self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
         self.size = len(data["c"])
         self.at = data["param_prob"].var_id_to_col[variable.id] + np.arange(variable.size)
@@ -64,13 +66,15 @@ class Canonical:
         A = sparse.coo_array(data["A"])
         self.cone_sizes = _cone_sizes(dims, len(data["b"]))
         self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
-        self.A = sparse.csr_array((A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape)
+        self.A: Any = sparse.csr_array(
+            (A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape
+        )
         self.b = data["b"] * self.row_scale
         self.q = data["c"] * self.column_scale
         P = data.get("P")
         P = sparse.coo_array((self.size, self.size)) if P is None else sparse.coo_array(P)
         values = P.data * self.column_scale[P.row] * self.column_scale[P.col]
-        self.P = sparse.csc_array((values, (P.row, P.col)), P.shape)
+        self.P: Any = sparse.csc_array((values, (P.row, P.col)), P.shape)
 
     @classmethod
     def box(cls, n: int, penalty: Quadratic | None, bounds: Sequence[tuple[Array, Array]]) -> Canonical:
@@ -108,6 +112,11 @@ class Canonical:
         """Whether all constraints are equations and inequalities."""
         return self.linear == len(self.b)
 
+    @property
+    def entries(self) -> int:
+        """Number of entries of A as a dense matrix."""
+        return len(self.b) * self.size
+
     @cached_property
     def dense(self) -> tuple[Array, Array]:
         """A and P as dense matrices."""
@@ -127,7 +136,7 @@ class Canonical:
     @cached_property
     def linear_cones(self) -> list[Any]:
         """The cones as Clarabel has them."""
-        import clarabel
+        clarabel = import_module("clarabel")
 
         if self.cones is not None:
             return list(self.cones)
@@ -144,8 +153,9 @@ class Canonical:
 
     def at_best(self, fixed: Array) -> tuple[float, Array]:
         """Return the least objective at a fixed variable, and x (N,); infinite where there is none."""
-        import clarabel
         from scipy import sparse
+
+        clarabel = import_module("clarabel")
 
         rest = np.setdiff1d(np.arange(self.size), self.at)
         x = np.zeros(self.size)
@@ -195,7 +205,7 @@ class Canonical:
         made.P, made.offset, made.zero, made.size = self.P[columns][:, columns], self.offset, self.zero, len(columns)
         inequalities = int(((rows >= self.zero) & (rows < self.linear)).sum())
         made.linear = self.zero + inequalities
-        import clarabel
+        clarabel = import_module("clarabel")
 
         made.cones = [clarabel.NonnegativeConeT(inequalities) if "Nonneg" in str(cone) else cone for cone in self.cones]
         made.at = np.searchsorted(columns, self.at[kept])
@@ -232,7 +242,7 @@ def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int
 
 def clarabel_settings(other: dict[str, Any]) -> Any:
     """Return Clarabel's settings, some of them other ones."""
-    import clarabel
+    clarabel = import_module("clarabel")
 
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1

@@ -473,7 +473,7 @@ class Unposed(Posed):
         self._known = True
         self.values = self.trusted = lost(formulation.name)
 
-    @property
+    @cached_property
     def asked(self) -> Asked:
         """Raises InputError."""
         return lost(self.formulation.name)()

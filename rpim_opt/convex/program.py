@@ -616,7 +616,7 @@ class Program(Brief):
         if not self.closed_form or not self.squared_rows:
             return None
         A, _ = self._stacked(weight, damping)
-        L = np.linalg.qr(A, mode="r")
+        L: Any = np.linalg.qr(A, mode="r")
         pivots = np.abs(np.diag(L))
         if len(L) < A.shape[1] or pivots.min(initial=1.0) <= 1e-3 * pivots.max(initial=0.0):
             return None
@@ -711,7 +711,8 @@ class Program(Brief):
             problem.solve(solver=cp.CLARABEL)
         except cp.SolverError:
             return 0.0
-        return -float(problem.value) if problem.status == cp.OPTIMAL else 0.0
+        value: Any = problem.value
+        return -float(value) if problem.status == cp.OPTIMAL else 0.0
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
@@ -750,7 +751,7 @@ class Program(Brief):
             A, b = self._stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
             return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
         A, b = self._stacked(weight, damping)
-        return np.linalg.lstsq(A, b, rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=float)
 
     def _quadratic_values(self, Z: Array) -> tuple[Array, Array]:
         """Return loss and penalty (K,) of many points Z (K, n) of a quadratic program."""

@@ -100,7 +100,7 @@ class Rows:
         """Return the places of the equations of some entries."""
         if self.sizes is None:
             return which
-        places = [np.arange(self.starts[i], self.starts[i] + self.sizes[i]) for i in which]
+        places = [np.arange(int(self.sizes[i])) + self.starts[i] for i in which]
         return np.concatenate([np.zeros(0, dtype=int), *places])
 
     def of(self, which: np.ndarray) -> tuple[Array, Array]:
@@ -188,7 +188,7 @@ class Newton:
         return self._total(self._residual(z)) + self.weight * self.penalty.value(x) + self._damping(z)
 
     def _damping(self, z: Array) -> float:
-        if self.size is None:
+        if self.size is None or self.centre is None:
             return 0.0
         return float(np.sum((self.size * (z - self.centre)) ** 2))
 
@@ -223,7 +223,7 @@ class Newton:
             if promised <= tolerance * size:
                 break
             Ad = self.rows.A @ d
-            t, left = self._search(r, Ad, chord + pull, bend, h, gradient @ u + chord + pull)
+            t, left = self._search(r, Ad, chord + pull, bend, h, float(gradient @ u) + chord + pull)
             if t == 0:
                 break
             z = z + t * d
@@ -236,7 +236,7 @@ class Newton:
 
     def _damping_along(self, z: Array, d: Array) -> tuple[float, float]:
         """Return first and second derivative of the damping along a step."""
-        if self.size is None:
+        if self.size is None or self.centre is None:
             return 0.0, 0.0
         along = self.size**2 * d
         return float(2 * along @ (z - self.centre)), float(2 * along @ d)

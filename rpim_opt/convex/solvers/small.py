@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -104,13 +105,13 @@ class Small:
             Where there is none, or Clarabel does not find it.
         """
         p = self.penalty
-        faces = self.loss is None and squares is not None and p.polyhedral and p.A.shape[0] * p.A.shape[1] <= DENSE
-        if faces:
+        faces = self.loss is None and p.polyhedral and p.entries <= DENSE
+        if faces and squares is not None:
             found = self._on_faces(squares, weight, self.face, self.near)
             if found is not None:
                 return found
         point, slack = self._by_cones(squares, weight, A, b)
-        if faces:
+        if faces and squares is not None:
             tight = np.arange(p.zero, p.linear)
             face = tight[(point.dual > slack)[tight]]
             found = self._on_faces(squares, weight, face, point.x)
@@ -161,8 +162,7 @@ class Small:
         self, squares: Squares | None, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
-        import clarabel
-
+        clarabel = import_module("clarabel")  # a compiled module, without types
         d, k, p = self._data, self.rows, self.penalty
         x0 = np.zeros(p.size)  # tolerances are relative to the size of the unknowns: those are changes of a near point
         x0[p.at] = self._centre(squares, weight)
@@ -200,16 +200,16 @@ class Small:
             return last
         n = len(last)
         rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
-        return np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0], dtype=float)
 
 
 class _Data:
     """Clarabel's data of a small program, whose numbers are replaced and whose places stay."""
 
     def __init__(self, small: Small):
-        import clarabel
         from scipy import sparse
 
+        clarabel = import_module("clarabel")
         p, k, loss, sizes = small.penalty, small.rows, small.loss, small.sizes
         N = p.size
         m = 0
@@ -309,21 +309,22 @@ def on_face(
     if not len(b):
         R = np.zeros((len(squares.R), N))
         R[:, at] = np.sqrt(2) * squares.R
-        L = np.linalg.qr(np.vstack([R, np.sqrt(weight) * root]), mode="r")
+        L: Any = np.linalg.qr(np.vstack([R, np.sqrt(weight) * root]), mode="r")
         pivots = np.abs(np.diag(L))
         if len(L) >= N and pivots.min() > RANK * pivots.max():
             x = near
             for _ in range(3):
-                x = x - solve_triangular(L, solve_triangular(L, gradient(x), trans="T"))
+                x = x - solve_triangular(L, _transposed(L, gradient(x)))
             return x, np.zeros(0)
         Y, Z, T, order, rank = np.zeros((N, 0)), np.eye(N), np.zeros((0, 0)), np.zeros(0, dtype=int), 0
         x = near.copy()
     else:
-        Q, T, order = qr(A.T, pivoting=True)
+        factors: Any = qr(A.T, pivoting=True)
+        Q, T, order = factors
         pivots = np.abs(np.diag(T))
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
-        x = near + Y @ solve_triangular(T, (b - A @ near)[order[:rank]], trans="T")
+        x = near + Y @ _transposed(T, (b - A @ near)[order[:rank]])
         if rank < len(b) and np.abs(A @ x - b).max() > 1e-9 * (1 + np.abs(b).max()):
             return None
     largest = np.abs(squares.R).max()
@@ -346,6 +347,11 @@ def on_face(
     if rank:
         multipliers[order[:rank]] = solve_triangular(T, -Y.T @ gradient(x))
     return x, multipliers
+
+
+def _transposed(T: Array, b: Array) -> Array:
+    """Return the solution of T'x = b with an upper triangle T."""
+    return solve_triangular(T.T, b, lower=True)
 
 
 def _dense(rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

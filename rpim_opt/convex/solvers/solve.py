@@ -155,7 +155,7 @@ def _separable(loss: Loss, rows: Rows, warm: Warm, weight: float, size: Array | 
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
     known = z is not None and x is not None and len(x) == warm.penalty.size
-    if not known:
+    if z is None or x is None or not known:
         x = small.solve(rows.squares.damped(size, centre), weight).x
         z = x[warm.penalty.at]
     search = Newton(summands, rows, warm.penalty, small, weight, size, centre, warm.kink)
