@@ -157,10 +157,10 @@ class Loop:
         """Return the program that a rule sees: of a robust loss the linear estimator that its fit amounts to."""
         if not state.choice.robust:
             return state.program
+        if self.reweigh is None:
+            return state.program.on_squares(state.program.trusted(state.z))
         x = self.source.parameters.free.scale * state.z
         trust = trusted_rows(self.source, x, self.asked)
-        if self.reweigh is None:
-            return state.program.on_squares(trust(state.program.model, state.z)[0])
         return state.program.on(around(self.source.linearize(x, trust), *self.about))
 
     def advanced(self, state: State) -> State:

@@ -370,10 +370,10 @@ class Posed:
 
     @cached_property
     def distance(self) -> Canonical:
-        """The largest change of p (n,) that brings it to the constraints of z, as a function of p."""
+        """The distance of p (n,) from the constraints of z, as a function of p."""
         z, p = self.asked.z, cp.Variable(self.n)
         with self._lock:
-            return Canonical(cp.norm_inf(z - p), self._flat, p)
+            return Canonical(cp.norm(z - p), self._flat, p)
 
     @cached_property
     def constraints_alone(self) -> Canonical:

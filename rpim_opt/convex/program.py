@@ -374,15 +374,15 @@ class Program(Brief):
         >>> problem = ro.load("position").problem
         >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
         >>> z = program.solve().z
-        >>> round(program.violation(np.eye(34)[0] * 6), 5), bool(np.allclose(program.nearest(3 * z), z, atol=1e-6))
-        (3.51, True)
+        >>> round(program.violation(3 * z), 6), bool(np.allclose(program.nearest(3 * z), z, atol=1e-6))
+        (4.0, True)
         >>> program.excess(z), round(float(program.norms(z).max()), 1)  # sigmas
         (0.0, 16.4)
         """
         return max(self._distance(z), self.excess(z))
 
     def _distance(self, z: Array) -> float:
-        """Return the largest component of the shortest way to the constraints of z."""
+        """Return the distance of z (n,) from the constraints."""
         if self.box is not None:
             lower, upper = self.box
             return float(np.max(np.maximum(lower - z, z - upper), initial=0.0))
@@ -773,7 +773,7 @@ class Program(Brief):
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        if weight == 0 and damping is None and not self.constrained and self.formulation.penalty is None:
+        if weight == 0 and damping is None and not self.constrained:
             _, s, V = self.model.svd  # nothing says anything of directions that the data do not see: they stay nominal
             found = replace(found, z=found.z - V[s == 0].T @ (V[s == 0] @ found.z))
         return self._at(found.z, weight, self._duals(found, weight), found.iterations)

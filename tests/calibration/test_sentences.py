@@ -218,7 +218,7 @@ def test_a_program_that_cannot_be_solved_again_certifies_nothing(monkeypatch: py
         raise ro.NoSolutionFound("own", weight, "solver_error")
 
     assert certified(ro.tikhonov, model, 1.0, result.z, 1.0).holds(result.z)
-    monkeypatch.setattr("rpim_opt.convex.program.Program.proven", fails)
+    monkeypatch.setattr("rpim_opt.convex.program.Program.solve", fails)
     found = certified(ro.tikhonov, model, 1.0, result.z, 1.0)
     assert found.decrease is None
     assert not found.holds(result.z)

@@ -338,9 +338,9 @@ def on_face(
         for _ in range(3):  # refined
             slope = Z.T @ gradient(x)
             x = x - Z @ (V.T @ (V @ slope / values**2))
-    rounding = 1e-12 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
+    rounding = 1e-14 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
     pull = 2 * squares.R.T @ squares.y - squares.g
-    allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-11 * np.abs(pull).max(initial=0.0), rounding)
+    allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
     if np.abs(slope - V.T @ (V @ slope)).max(initial=0.0) > allowed:
         return None  # unbounded on this face
     multipliers = np.zeros(len(b))
