@@ -29,6 +29,8 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
+FAR_APART = 1e-6
+"""Ratio of pivots below which a formula for the change of a minimum is not trusted."""
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 DIFFERENCE = 1e-4
@@ -618,7 +620,7 @@ class Program(Brief):
         A, _ = self._stacked(weight, damping)
         L: Any = np.linalg.qr(A, mode="r")
         pivots = np.abs(np.diag(L))
-        if len(L) < A.shape[1] or pivots.min(initial=1.0) <= 1e-3 * pivots.max(initial=0.0):
+        if len(L) < A.shape[1] or pivots.min(initial=1.0) <= FAR_APART * pivots.max(initial=0.0):
             return None
         return np.linalg.solve(L, np.linalg.solve(L.T, self.model.A.T @ by))
 
