@@ -160,11 +160,31 @@ class Program(Brief):
         return self.apart(self.model.scaled(np.where(out, 0.0, 1.0)))
 
     def apart(self, model: LinearModel) -> Program:
-        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
+        """Return the program for another model, whose solutions leave those of this one nothing to begin with.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> nothing = program.apart(program.model.with_values(0 * program.model.b)).solve(1.0)
+        >>> bool(np.abs(nothing.z).max() < 1e-9)
+        True
+        """
         return replace(self, model=model, _kept={"warm": self._warm.begun(self._warm.z)})
 
     def on_squares(self, model: LinearModel) -> Program:
-        """Return the same penalty and constraints with the squares of other equations as the loss."""
+        """Return the same penalty and constraints with the squares of other equations as the loss.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("blunders").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> squares = program.on_squares(program.model)
+        >>> [(p.quadratic, p.separable, p.squared_rows, p.on_triangles) for p in (program, squares)]
+        [(False, True, False, False), (True, False, True, True)]
+        >>> program.rows[0].shape, squares.rows[0].shape
+        ((150, 34), (35, 34))
+        """
         if "squares" not in self._kept:
             posed = self._posed.on_squares()
             self._kept["squares"] = posed, {"warm": Warm(posed.canonical)}
@@ -233,6 +253,8 @@ class Program(Brief):
         bounded Tikhonov  False True True True
         lasso             False False False False
         Huber             False False True False
+        >>> p.polyhedral, p.predicts, p.inner
+        (True, False, False)
         >>> lower, upper = ro.convex.pose(ro.bounded, model).box
         >>> float(upper.max())  # in units of the scales
         10.0
@@ -287,7 +309,7 @@ class Program(Brief):
 
     @property
     def rows(self) -> tuple[Array, Array]:
-        """A and b as the posed residual has them: the triangle, where that says all."""
+        """A (m, n) and b (m,) as the posed residual has them: the triangle, where that says all."""
         n = self.model.A.shape[1]
         if self._posed.equations == len(self.model.b):
             return self.model.A, self.model.b
@@ -334,7 +356,7 @@ class Program(Brief):
         return loss + self.model.offset, penalty
 
     def objective(self, z: Array, weight: float) -> float:
-        """Return loss(A z - b) + weight penalty(z) of z (n,); infinite outside the functions' domain."""
+        """Return loss(A z - b) + weight penalty(z); infinite outside their domain. Arguments as for `value`."""
         loss, penalty = self.value(z, weight)
         if weight == 0:
             return loss
@@ -344,8 +366,17 @@ class Program(Brief):
         """Return z (n,), or where it lies just outside the functions' domain a point inside.
 
         An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
-        towards another (n,), or towards nominal, or away from it where that lies outside.
+        towards another, or towards nominal, or away from it where that lies outside.
 
+        Parameters
+        ----------
+        z, towards
+            (n,) in units of the scales.
+        weight
+            Of the penalty.
+
+        Examples
+        --------
         >>> import cvxpy as cp
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -380,6 +411,8 @@ class Program(Brief):
         (4.0, True)
         >>> program.excess(z), round(float(program.norms(z).max()), 1)  # sigmas
         (0.0, 16.4)
+        >>> program.meets(z), program.meets(2 * z)
+        (True, False)
         """
         return max(self._distance(z), self.excess(z))
 
@@ -417,7 +450,9 @@ class Program(Brief):
         return self._distance(z) <= feasibility_tolerance(z) and self.excess(z) <= FEASIBLE
 
     def gradient(self, z: Array, weight: float) -> Array | None:
-        """Return the gradient (n,) of the objective at z (n,), asked of the functions; None where CVXPY knows none.
+        """Return the gradient (n,) of the objective, asked of the functions; None where CVXPY knows none.
+
+        Arguments as for `value`.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -604,8 +639,17 @@ class Program(Brief):
         return self
 
     def moved(self, by: Array, weight: float, damping: Damping | None = None) -> Array | None:
-        """Return by how far the minimum (n,) of `solve` moves where b moves by (m,); None where no formula says it.
+        """Return by how far the minimum (n,) of `solve` moves where b moves; None where no formula says it.
 
+        Parameters
+        ----------
+        by
+            (m,) by how much b moves.
+        weight, damping
+            As for `solve`.
+
+        Examples
+        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
@@ -625,7 +669,16 @@ class Program(Brief):
         return np.linalg.solve(L, np.linalg.solve(L.T, self.model.A.T @ by))
 
     def solve_with_slope(self, weight: float) -> tuple[Estimate, Array | None]:
-        """Return the solution of a loss that is no square, and where the solver tells it the loss's slope (m,)."""
+        """Return the solution of a loss that is no square, and where the solver tells it the loss's slope (m,).
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("blunders").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> estimate, _ = program.solve_with_slope(1.0)
+        >>> bool(abs(estimate.objective / program.solve(1.0).objective - 1) < 1e-9)
+        True
+        """
         weight = self._weight(weight)
         if self._posed.joint:
             return self.solve(weight), None
@@ -643,6 +696,14 @@ class Program(Brief):
         """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e.
 
         By differences of the small program's solutions, in steps that move a parameter by `DIFFERENCE` of a scale.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> D, U = program.derivative(program.solve(1e-3))
+        >>> D.shape, U.shape
+        ((26, 20), (27, 20))
         """
         squares, n = self._squares, self._posed.n
         if squares is None:
@@ -663,10 +724,20 @@ class Program(Brief):
         return D, self.squared.A @ (V.T / s)
 
     def tangent(self, z: Array, weight: float) -> Array | None:
-        """Return orthonormal directions (n, k) along which z (n,) may move with its active constraints; None for all.
+        """Return orthonormal directions (n, k) along which z may move with its active constraints; None for all.
 
         Equations, and inequalities and cones with a multiplier, linearized at z; variables of the functions' own move
-        along.
+        along. Arguments as for `value`.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(1.0, "*"),))
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> z = program.solve().z
+        >>> moves = program.tangent(z, 0.0)
+        >>> moves.shape, bool(np.abs(moves.T @ z).max() < 1e-4)  # on the sphere
+        ((26, 25), True)
         """
         if not self.formulation.constraints or self.predicts:
             return None
@@ -705,7 +776,15 @@ class Program(Brief):
             return None
 
     def largest_slope(self, slope: Array) -> float:
-        """Return max { -slope'z : penalty(z) <= 1 } (n,), the dual norm of a slope; 0 where it is not bounded."""
+        """Return max { -slope'z : penalty(z) <= 1 } of a slope (n,), its dual norm; 0 where it is not bounded.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> round(program.largest_slope(np.linspace(-3.0, 1.0, 26)), 6)  # the largest magnitude
+        3.0
+        """
         asked = self._posed.asked
         problem = cp.Problem(cp.Minimize(slope @ asked.z), [asked.penalty <= 1])
         asked.z.save_value(None)

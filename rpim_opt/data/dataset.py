@@ -306,6 +306,12 @@ class Dataset(Tabled):
 
         Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
         configuration: a fold of a cross-validation has all of them or none.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> touched = ro.data.touches(np.zeros((4, 6)), ["A", "B", "A", "B"], sigma=2e-5)
+        >>> touched.grouped_by_points().configuration.tolist()
+        [0, 1, 0, 1]
         """
         group: dict[Any, Any] = {}
 

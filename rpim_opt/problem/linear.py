@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -126,6 +126,7 @@ NARROW, WIDE = 8, 32
 """Columns that are reduced together, of matrices with few and with many columns: as is quickest."""
 MANY = 100
 """Columns from which there are many."""
+(GEQRT,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
 def reduced_rows(rows: Array, R: Array | None = None) -> Array:
@@ -159,7 +160,7 @@ def rotated(stacked: Array) -> Array:
     LAPACK's blocked QR whose blocks are reduced by halves: twice as fast as the usual one where rows are many.
     """
     n = stacked.shape[1]
-    R: Array = lapack.dgeqrt(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
+    R: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
     return np.triu(R)
 
 

@@ -33,63 +33,82 @@ class Source(Protocol):
     @property
     def robot(self) -> Robot:
         """The nominal robot."""
+        ...
 
     @property
     def arms(self) -> Mapping[str, Robot]:
         """The nominal robots by name; ``""`` for the only one."""
+        ...
 
     @property
     def parameters(self) -> Parameters:
         """All parameters of the model, some of them identified."""
+        ...
 
     @property
     def data(self) -> Dataset:
         """The measurements; InputError where they are in parts and stand together nowhere."""
+        ...
 
     @property
     def keeps_rows(self) -> bool:
         """Whether `linearize` returns the equations themselves, and not their triangle."""
+        ...
 
     @property
     def labels(self) -> tuple[str, ...]:
         """N labels of the rows, unique."""
+        ...
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
         """Return the linear model around the deviations x (n,), its equations weighed by their residuals there."""
+        ...
 
     def rows(self) -> Iterator[CalibrationProblem]:
         """Yield problems that together have all the rows; the number of a configuration occurs in one of them."""
+        ...
 
     def sample(self) -> CalibrationProblem:
         """Return rows enough to place frames by."""
+        ...
 
     def errors(self, x: Array, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m or rad]."""
+        ...
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norm of every row's residual (N,), and how many equations each has (N,)."""
+        ...
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the same of every configuration, (C,) and (C,)."""
+        ...
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements."""
+        ...
 
     def with_parameters(self, parameters: Parameters) -> Source:
         """Return the same problem with another table of parameters."""
+        ...
 
     @property
     def scatter(self) -> Scatter | None:
         """The robot's own noise; None for the instrument's alone."""
+        ...
 
     def scattered(self, scatter: Scatter | None) -> Source:
         """Return the same problem with other noise of the robot's own, or none."""
+        ...
 
     def identifying(self, identified: np.ndarray) -> Source:
         """Return the same problem with other parameters identified, (P,) true or false."""
+        ...
 
     def without(self, labels: Collection[str]) -> Source:
         """Return the same problem without the rows of these labels."""
+        ...
 
     def frozen(self) -> Source:
         """Return a copy that asks every measurement once and keeps the answer."""
+        ...

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 import scipy
@@ -174,9 +174,10 @@ class Plane:
         # E_1 = (a - n n'a) / |a - n n'a| with a coordinate axis a, E_2 = n x E_1
         a = np.eye(3)[self.axis]
         first = -(np.outer(n, a @ normal) + normal * (a @ n))
-        first = (first - np.outer(E[0], E[0] @ first)) / np.sqrt(1 - n[self.axis] ** 2)
-        second = np.cross(normal, E[0][:, None], axis=0) + np.cross(n[:, None], first, axis=0)
-        return Moved(values.mean(axis=0), normal, np.stack([first, second]))
+        across = np.empty((2, *normal.shape))
+        across[0] = (first - np.outer(E[0], E[0] @ first)) / np.sqrt(1 - n[self.axis] ** 2)
+        across[1] = np.cross(normal, E[0][:, None], axis=0) + np.cross(n[:, None], across[0], axis=0)
+        return Moved(values.mean(axis=0), normal, across)
 
 
 AXES = np.arange(3)
@@ -256,6 +257,12 @@ class Touches:
         """Return how far all touches spread (RMS distance from their mean) [m], of a residual as `located` has it."""
         p = -residual[np.concatenate(self.rows)]
         return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+
+    @overload
+    def centred(self, residual: Array, jacobian: None = None, size: float = 0.0) -> tuple[Array, None]: ...
+
+    @overload
+    def centred(self, residual: Array, jacobian: Array, size: float = 0.0) -> tuple[Array, Array]: ...
 
     def centred(self, residual: Array, jacobian: Array | None = None, size: float = 0.0) -> tuple[Array, Array | None]:
         """Return residual (m,) and Jacobian (m, n) with every point and plane where its touches put it.

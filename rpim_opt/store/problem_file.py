@@ -42,13 +42,30 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def problems_folder() -> Path:
-    """Return the folder of the problems that come with the package: inside it, or beside it in a checkout."""
+    """Return the folder of the problems that come with the package: inside it, or beside it in a checkout.
+
+    >>> import rpim_opt as ro
+    >>> (ro.store.problems_folder() / "position" / "problem.toml").is_file()
+    True
+    """
     inside = PACKAGE / "problems"
     return inside if inside.is_dir() else PACKAGE.parent / "problems"
 
 
 def find_problem(name: str | Path) -> Path:
-    """Return the folder of a problem, given its path or the name of one that comes with the package."""
+    """Return the folder of a problem, given its path or the name of one that comes with the package.
+
+    Raises
+    ------
+    InputError
+        For a folder or a name that is not there.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.store.find_problem("position").name
+    'position'
+    """
     path = Path(name)
     if path.is_file() and path.name == "problem.toml":
         return path.parent

@@ -153,7 +153,7 @@ def copied(folder: Path, **changed: str) -> Path:
 @pytest.mark.parametrize(
     ("target", "said"),
     [
-        ("", "the target: found nothing"),
+        ("", "column for 'target_x'.*the target's points: target = "),
         ('target = "board.csv"', "board.csv"),
         ('target = "../board.csv"', "key target"),
         ("target = { columns = 5, rows = 1, spacing_mm = 40 }", "two to 300 along either side"),

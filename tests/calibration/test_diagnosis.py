@@ -11,7 +11,8 @@ import pytest
 from scipy.stats import chi2
 
 import rpim_opt as ro
-from rpim_opt.calibration.diagnosis import Flag, error_vectors, factor, flagged
+from rpim_opt.bayes.outliers import error_vectors
+from rpim_opt.calibration.diagnosis import Flag, factor, flagged
 from rpim_opt.convex.trust import limits
 from tests.simulate import simulated
 

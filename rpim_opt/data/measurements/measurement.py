@@ -172,7 +172,12 @@ class Measurement(Brief):
 
     @property
     def by_camera(self) -> bool:
-        """Whether a row is where a camera sees a point of a board."""
+        """Whether a row is where a camera sees a point of a board.
+
+        >>> import rpim_opt as ro
+        >>> [ro.load(name).problem.data.blocks[0].measurement.by_camera for name in ("position", "camera")]
+        [False, True]
+        """
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:

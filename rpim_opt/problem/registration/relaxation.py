@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ def relax(Q: Array, shared: int | None = None, tolerance: float = TOLERANCE) -> 
     others have products with, and they have none among themselves; all by default. ``tolerance``: of gap and
     feasibility.
     """
-    import clarabel
+    clarabel = import_module("clarabel")
 
     count = (len(Q) - 1) // 9
     shared = count if shared is None else shared
@@ -182,7 +183,7 @@ def _completed(triangles: Array, blocks: Sequence[np.ndarray], common: int) -> A
 
 @lru_cache
 def _settings(tolerance: float) -> Any:
-    import clarabel
+    clarabel = import_module("clarabel")
 
     settings = clarabel.DefaultSettings()
     settings.verbose = False
