@@ -337,7 +337,10 @@ def on_face(
         values = values[: len(V)]
         for _ in range(3):  # refined
             slope = Z.T @ gradient(x)
-            x = x - Z @ (V.T @ (V @ slope / values**2))
+            with np.errstate(all="ignore"):  # no curvature: there is no minimum to be had by a formula
+                x = x - Z @ (V.T @ (V @ slope / values**2))
+            if not np.isfinite(x).all():
+                return None
     rounding = 1e-14 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
     pull = 2 * squares.R.T @ squares.y - squares.g
     allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
