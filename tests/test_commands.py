@@ -271,6 +271,7 @@ def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp
     assert run(monkeypatch, *arguments, "--limit", "0.1", "--out", str(tmp_path / "rows.csv")) == 0
     said = capsys.readouterr().out
     assert "No row is beyond" in said
+    assert "touches by point" not in said
     result, rows = ro.load_result(made / "results"), table(cell / "later.csv")[1]
     error = np.linalg.norm(rows[:, :3] - result.forward(rows[:, 3:])[:, :3, 3], axis=1)
     for figure in (error.mean(), np.sqrt(np.mean(error**2)), error.max()):

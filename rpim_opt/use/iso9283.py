@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
-from rpim_opt.basics.units import UNITS
+from rpim_opt.basics.units import LARGEST, UNITS
 from rpim_opt.data.tables.layout import read_raw
 from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.units import FOREIGN, dimension_of, parse_units, split
@@ -269,6 +269,10 @@ def _rows(values: Array | None, N: int, what: str) -> Array | None:
     array = np.asarray(values, dtype=float)
     if array.shape != (N, 3) or not np.isfinite(array).all():
         raise InputError(what, f"shape {array.shape}", f"finite numbers of shape {(N, 3)}")
+    far = np.abs(array).max(axis=1) > LARGEST
+    if far.any():
+        row = int(far.argmax())
+        raise InputError(f"{what}, row {row + 1}", f"{array[row]}", f"sizes of at most {LARGEST:g} m or rad")
     return array
 
 

@@ -90,8 +90,10 @@ def test_noise_and_inflation_widen_it() -> None:
     result = result_of(ro.tikhonov, model(1), WEIGHT, noise=4.0)
     plain = Prior.from_result(result, noise=1.0).stated(PROBLEM.parameters)
     found = Prior.from_result(result).stated(PROBLEM.parameters)
+    loud = Prior.from_result(result, noise=3.0).stated(PROBLEM.parameters)
     inflated = Prior.from_result(result, inflate=6.0).stated(PROBLEM.parameters)
     assert np.abs(plain.rows) == pytest.approx(2 * np.abs(found.rows), rel=1e-9)
+    assert np.abs(plain.rows) == pytest.approx(3 * np.abs(loud.rows), rel=1e-9)  # 3 standard deviations, not variances
     assert np.abs(found.rows) == pytest.approx(6 * np.abs(inflated.rows), rel=1e-9)
 
 

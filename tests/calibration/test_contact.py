@@ -121,6 +121,7 @@ def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path)
             # touches count in units of how far all of them spread on the nominal robot
             assert each.largest == pytest.approx(away.max(), rel=0.01)
     assert "Error of a touch" in str(found)
+    assert "touches by point" in str(found)
     assert "Not held out" not in str(found)
     again = ro.use.validate(result, instance.problem.data)
     assert "Not held out: the calibration has touches of" in str(again)

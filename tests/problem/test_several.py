@@ -83,6 +83,21 @@ def test_every_problem_keeps_its_equations_and_columns() -> None:
         assert np.array_equal(alone.residual(again), part.residual(own))
 
 
+def test_a_term_of_a_users_own_stays_its_robots() -> None:
+    """Its parameters are the robot's, not a frame's, under whatever name."""
+    soft = ro.Model([ro.robot.Term(lambda joint, size: size * joint.q**2, {"wave_mrad": 0.1}, joints=(2, 3))])
+    left, right, _ = two(identify=("theta?",))
+    left = left.with_model(soft)
+    whole = ro.together(left=left, right=right, shared=TOOL)
+    assert whole.parameters.terms == ("left.wave2", "left.wave3")
+    names = whole.parameters.free.names
+    assert not whole.parameters.free.of_frames[[names.index(name) for name in whole.parameters.terms]].any()
+    assert set(whole.alone("left").parameters.free.names) == set(left.parameters.free.names)
+    x = np.random.default_rng(0).normal(size=len(names)) * whole.parameters.free.scale
+    own = parts_of(whole, left, "left", x)
+    assert np.array_equal(whole.residual(x)[: len(left.residual(own))], left.residual(own))
+
+
 def test_names_say_of_what_kind_a_parameter_is_whosever_it_is() -> None:
     left, right, _ = two()
     free = ro.together(left=left, right=right, shared=TOOL).parameters.free

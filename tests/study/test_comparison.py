@@ -369,6 +369,26 @@ def test_intervals_of_other_problems_cover_as_they_say(count: int) -> None:
     assert np.mean(covered) < 0.99
 
 
+def test_an_interval_of_one_problem_is_of_its_seeds_and_not_of_its_folds() -> None:
+    """Folds of one seed have its draw in common: with seeds enough they add nothing to what is independent."""
+    seeds = dict(zip(range(6), [-0.5, 0.4, 0.1, -0.2, 0.3, 0.6], strict=True))
+
+    def rows(folds: int) -> tuple[dict, ...]:
+        of = {"a": dict.fromkeys(seeds, 0.0), "b": seeds}
+        return tuple(
+            {**row, "split": f"{folds} folds", "fold": fold, "seed": seed, "rms_mm": float(np.exp(of[row["method"]][seed]))}
+            for row in rows_of({"a": {"p": 1.0}, "b": {"p": 1.0}})
+            for seed in seeds
+            for fold in range(folds)
+        )
+
+    once, often = (ro.study.Comparison(rows(folds), ("rms_mm",)).summary(against="a") for folds in (1, 4))
+    one, other = ({each.method: each for each in found.standings}["b"] for found in (once, often))
+    assert (one.low, one.high) == (pytest.approx(other.low), pytest.approx(other.high))
+    assert one.ratio == pytest.approx(np.exp(np.mean(list(seeds.values()))))
+    assert one.low < one.ratio < one.high
+
+
 def test_few_problems_say_that_intervals_are_of_these() -> None:
     folds = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5, progress=False)
     assert any("these problems alone" in note for note in folds.summary().notes)

@@ -362,6 +362,20 @@ def test_several_reflectors_and_torques() -> None:
         ro.use.compensate(result, q)
 
 
+def test_torques_of_a_table_are_those_of_an_array(tmp_path) -> None:
+    instance = ro.load("joints")
+    result = ro.calibrate(instance.problem, instance.formulation, 1.0)
+    block = instance.problem.data.blocks[0]
+    q, torque = block.q[:5, 0], block.torque[:5, 0]
+    rows = np.hstack([np.degrees(q), torque])
+    names = [f"q{i}_deg" for i in range(1, 7)] + [f"tau{i}_Nm" for i in range(1, 7)]
+    np.savetxt(tmp_path / "targets.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.17g")
+    found = ro.use.compensate_file(result, tmp_path / "targets.csv", tmp_path / "out.csv", orientation=False)
+    assert found.q == pytest.approx(ro.use.compensate(result, q, torque=torque, orientation=False).q, abs=1e-12)
+    other = ro.use.compensate(result, q, torque=torque[:, ::-1], orientation=False)
+    assert np.abs(found.q - other.q).max() > 1e-6
+
+
 def wanted_position(result: ro.calibration.Calibration, q: np.ndarray, torque: np.ndarray) -> np.ndarray:
     base = [name.startswith("base_") for name in result.problem.parameters.free.names]
     data = ro.Dataset.of(q, np.zeros((len(q), 3)), 1.0)

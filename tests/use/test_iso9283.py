@@ -65,6 +65,7 @@ def test_what_the_standard_asks_for_is_said_where_it_is_not_there() -> None:
         ((["P1", "P1"], np.zeros((3, 3))), "shape"),
         ((["P1", "P1"], np.full((2, 3), np.nan)), "finite"),
         ((["P1", "P1"], np.zeros((2, 3)), np.arange(6.0).reshape(2, 3)), "more than one position"),
+        ((["P1", "P1"], np.array([[0.0, 0, 0], [0, -1e308, 0]])), "positions, row 2: .* at most 1e"),
         (([], np.zeros((0, 3))), "no approach"),
     ],
 )
@@ -113,6 +114,13 @@ def test_a_table_as_it_is_exported(monkeypatch, capsys, tmp_path) -> None:
 def test_a_table_that_lacks_something_is_refused(monkeypatch, capsys, tmp_path, old: str, new: str, said: str) -> None:
     assert run(monkeypatch, "iso9283", str(written(tmp_path, HEAD.replace(old, new)))) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_cell_that_is_no_position_is_refused(monkeypatch, capsys, tmp_path) -> None:
+    file = written(tmp_path)
+    file.write_text(file.read_text().replace(";0,1;0;0", ";0,1;0;-1e308"))
+    assert run(monkeypatch, "iso9283", str(file)) == 2
+    assert "at most 1e+07" in capsys.readouterr().err
 
 
 def test_a_limit_needs_a_command(monkeypatch, capsys, tmp_path) -> None:
