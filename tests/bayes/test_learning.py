@@ -410,6 +410,7 @@ def test_sizes_agree_with_the_deviations_that_they_lead_to() -> None:
     assert 0 < fit.spare < 1
     assert np.linalg.eigvalsh(fit.covariance / np.outer(*2 * [fit.laid.parameters.free.scale])).min() > 0
 
+
 def test_a_reading_scatters_as_surely_as_its_noise_is_known() -> None:
     """V = tr(X C X' + R) goes with the square of the noise, but for what the prior holds: var(ln V) = 4 var(ln s)."""
     problem = measured(POSITION, drawn(3), 3, scatter=3e-4)

@@ -376,7 +376,13 @@ def test_an_interval_of_one_problem_is_of_its_seeds_and_not_of_its_folds() -> No
     def rows(folds: int) -> tuple[dict, ...]:
         of = {"a": dict.fromkeys(seeds, 0.0), "b": seeds}
         return tuple(
-            {**row, "split": f"{folds} folds", "fold": fold, "seed": seed, "rms_mm": float(np.exp(of[row["method"]][seed]))}
+            {
+                **row,
+                "split": f"{folds} folds",
+                "fold": fold,
+                "seed": seed,
+                "rms_mm": float(np.exp(of[row["method"]][seed])),
+            }
             for row in rows_of({"a": {"p": 1.0}, "b": {"p": 1.0}})
             for seed in seeds
             for fold in range(folds)
