@@ -84,7 +84,7 @@ Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit co
 Largest = Annotated[Number, Option(help="Largest error that is allowed [mm]; exit code 1 above.")]
 Box = Annotated[Text, Option(help="Where: x0,x1,y0,y1,z0,z1 [mm] in the base frame; else all that was measured.")]
 Marker = Annotated[Text, Option(help="Which reflector, where there are several.")]
-UrdfBase = Annotated[Text, Option(help="Link where the robot starts, if not the root.")]
+UrdfBase = Annotated[Text, Option(help="Link where the chain starts, if not the root: any link, a camera in the head.")]
 UrdfTip = Annotated[Text, Option(help="Link where it ends, if there are several.")]
 Workers = Annotated[int, Option(help="Processes on this machine.")]
 Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute on.")]

@@ -79,13 +79,19 @@ def random_urdf(seed: int, style: str) -> str:
     return "".join(parts).replace(f'"{parent}"', '"tip"') + EXTRA
 
 
-def urdf_kinematics(path: Path, tip: str, q: np.ndarray) -> np.ndarray:
-    """Return the transforms (N, 4, 4) from the root to a link, straight from the elements."""
+def joints_above(path: Path, link: str) -> list[ElementTree.Element]:
+    """Return the joint elements from the root to a link."""
     joints = {j.find("child").get("link"): j for j in ElementTree.parse(path).getroot().findall("joint")}
     chain = []
-    while tip in joints:
-        chain.insert(0, joints[tip])
-        tip = joints[tip].find("parent").get("link")
+    while link in joints:
+        chain.insert(0, joints[link])
+        link = joints[link].find("parent").get("link")
+    return chain
+
+
+def urdf_kinematics(path: Path, tip: str, q: np.ndarray) -> np.ndarray:
+    """Return the transforms (N, 4, 4) from the root to a link, straight from the elements."""
+    chain = joints_above(path, tip)
     result = np.tile(np.eye(4), (len(q), 1, 1))
     column = 0
     for joint in chain:
@@ -180,7 +186,7 @@ def test_origins_that_the_file_leaves_out_are_put_in(tmp_path: Path, mark: str) 
     ro.robot.write_urdf(path, better.robot, target)
     q = configurations(2)
     assert np.abs(reach(better, q) - urdf_kinematics(target, "hand", q)).max() < EXACT
-    with pytest.raises(ro.InputError, match=r"a tool or beta2 that moves the tip 'hand'.*joint 'j2' cannot express it"):
+    with pytest.raises(ro.InputError, match=r"a tool or beta2 that moves link 'hand'.*joint 'j2' cannot express it"):
         ro.robot.write_urdf(path, better.robot, target, tool_frame=np.array([0, 0, 1e-3, 0, 0, 0]))
 
 
@@ -290,14 +296,81 @@ def test_links_are_found_or_listed(tmp_path: Path) -> None:
         ro.read_urdf(path)
     with pytest.raises(ro.InputError, match=r"link 'tipp': found nothing.*did you mean tip"):
         ro.read_urdf(path, tip="tipp")
-    with pytest.raises(ro.InputError, match="no chain from 'L2' to it"):
-        ro.read_urdf(path, base="L2", tip="L1")
     with pytest.raises(ro.InputError, match="camera_mount', type: found 'floating'"):
         ro.read_urdf(path, tip="camera")
     part = ro.read_urdf(path, base="L1", tip="L2")
     assert part.names == ("J2",)
     with pytest.raises(ro.InputError, match="the file: found nothing"):
         ro.read_urdf(tmp_path / "none.urdf")
+
+
+def tree_urdf(seed: int) -> tuple[str, list[str]]:
+    """Return a random tree of 5 to 12 joints of all kinds, and its links; every leaf is held by a fixed joint."""
+    rng = np.random.default_rng(seed)
+    links = ["root"]
+    joints = []
+
+    def add(kind: str, parent: str) -> str:
+        child = f"{'tip' if kind == 'fixed' else 'L'}{len(links)}"
+        xyz, rpy, axis = rng.normal(size=3), rng.uniform(-3, 3, 3), rng.normal(size=3)
+        rest = f'<axis xyz="{text(axis)}"/><limit lower="-2" upper="1.5" effort="1" velocity="1"/>'
+        name = f"J{len(links)}"
+        joints.append(
+            JOINT.format(kind=kind, name=name, parent=parent, child=child, xyz=text(xyz), rpy=text(rpy), rest=rest)
+        )
+        links.append(child)
+        return child
+
+    for _ in range(int(rng.integers(5, 13))):
+        add(str(rng.choice(["revolute", "continuous", "prismatic"])), str(rng.choice(links[-3:])))
+    for link in list(links):
+        add("fixed", link)
+    return f'<robot name="tree">{"".join(LINK.format(name=n) for n in links)}{"".join(joints)}</robot>', links
+
+
+def between_links(path: Path, names: tuple[str, ...], base: str, tip: str, q: np.ndarray) -> np.ndarray:
+    """Return T_base_tip (N, 4, 4) of joint values q (N, n) by name, from the transforms of both links from the root."""
+    places = []
+    for link in (base, tip):
+        moving = [j for j in joints_above(path, link) if j.get("type") != "fixed"]
+        columns = [names.index(j.get("name")) if j.get("name") in names else None for j in moving]
+        values = np.column_stack(
+            [np.zeros(len(q)) if c is None else q[:, c] for c in columns] or [np.zeros((len(q), 0))]
+        )
+        places.append(urdf_kinematics(path, link, values))
+    return np.linalg.inv(places[0]) @ places[1]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_chain_between_any_two_links(tmp_path: Path, seed: int) -> None:
+    """Through branches and reversed joints; corrected origins written back move both links alike."""
+    path, target = tmp_path / "tree.urdf", tmp_path / "new.urdf"
+    content, links = tree_urdf(seed)
+    path.write_text(content)
+    rng = np.random.default_rng([seed, 1])
+    tips = [link for link in links if link.startswith("tip")]
+    base, tip = rng.choice(tips, 2, replace=False)
+    arm = ro.read_urdf(path, base=base, tip=tip)
+    q = configurations(arm.robot.dof, seed)
+    assert np.abs(reach(arm, q) - between_links(path, arm.names, base, tip, q)).max() < EXACT
+    mdh = arm.robot.mdh + 0.01 * rng.normal(size=arm.robot.mdh.shape)
+    place, tool = arm.base + 0.01 * rng.normal(size=6), arm.tool + 0.01 * rng.normal(size=6)
+    better = ro.robot.Described(replace(arm.robot, mdh=mdh), place, tool)
+    ro.robot.write_urdf(path, better.robot, target, base=base, tip=tip, base_frame=place, tool_frame=tool)
+    assert np.abs(reach(better, q) - between_links(target, arm.names, base, tip, q)).max() < EXACT
+
+
+def test_a_base_that_no_fixed_joint_holds_cannot_move(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(PLAIN)
+    arm = ro.read_urdf(path, base="hand", tip="base")  # upside down
+    assert arm.names == ("j2", "j1")
+    q = configurations(2)
+    there = urdf_kinematics(path, "hand", q[:, ::-1])
+    assert np.abs(reach(arm, q) - np.linalg.inv(there)).max() < EXACT
+    moved = arm.base + np.eye(6)[2] * 1e-3
+    with pytest.raises(ro.InputError, match=r"a base that moves link 'hand'.*joint 'j2' cannot express it"):
+        ro.robot.write_urdf(path, arm.robot, tmp_path / "new.urdf", base="hand", tip="base", base_frame=moved)
 
 
 def test_a_mimic_joint_beside_the_chain_does_not_matter(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""URDF: a serial chain in, identified origins back into the same file, of which every other byte stays.
+"""URDF: the chain between two links in, identified origins back into the same file, of which every other byte stays.
 
 A URDF is untrusted input. It goes through expat, which reports where in the file an element stands; document types, and
 with them entities and other files, are refused. A xacro file is expanded by the package that ROS has for it.
@@ -6,6 +6,7 @@ with them entities and other files, are refused. A xacro file is expanded by the
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -47,20 +48,22 @@ TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 
 
 def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None) -> Described:
-    """Return a serial chain of a URDF file as a robot in modified DH with Hayati's beta.
+    """Return the chain between two links of a URDF file as a robot in modified DH with Hayati's beta.
 
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
-    `chain.describe` states the conventions. Fixed joints are part of base, links and tool; limits are carried over
-    (continuous joints, and limits that are left out or equal, have none). Angles are roll, pitch, yaw, R = Rz Ry Rx,
-    and an axis that is left out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of link ``base``, wherever
-    the first axis points, and pulls at the masses that the file states.
+    `chain.describe` states the conventions. The chain goes up from the base to the links' common ancestor, through
+    reversed joints (a joint about axis w that is passed upwards turns about -w), and down to the tip: a camera in a
+    head sees a hand. Fixed joints are part of base, links and tool; limits are carried over (continuous joints, and
+    limits that are left out or equal, have none). Angles are roll, pitch, yaw, R = Rz Ry Rx, and an axis that is left
+    out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of the chain's highest link, wherever the first
+    axis points, and pulls at the masses that the file states; where joints move the base itself, no masses are read.
 
     Parameters
     ----------
     path
         A URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults (``rpim-opt[xacro]``).
     base, tip
-        Names of links; the root, and the only leaf below the base.
+        Names of any two links; the root, and the only leaf below the base.
 
     Raises
     ------
@@ -77,16 +80,21 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     (1, ('j1',), array([0.4, 0. , 0. ]))
     """
     urdf = _read(Path(path))
-    every, joints, chain = _chain(urdf, base, tip)
+    steps = urdf.path_between(base, tip)
+    joints = [step.joint for step in steps if step.joint.kind]
+    chain = _chain(urdf, steps)
     table, T_base, T_tool, G = describe(chain)
-    masses, centres = _carried_masses(urdf, every)
+    masses, centres = _carried_masses(urdf, steps)
+    T_top_base = np.linalg.inv(_product([step.constant for step in steps if step.up]))
     robot = Robot(
         name=urdf.name,
         mdh=table,
         joint_types=tuple(joint.kind for joint in joints),
         limits=np.array([joint.limits for joint in joints]),
-        source=f"{urdf.path.name}, {every[0].parent} to {every[-1].child}",
-        gravity=Gravity(masses=masses, centres=_on_frames(centres, table, G)).mounted("floor", T_base[:3, :3]),
+        source=f"{urdf.path.name}, {steps[0].start} to {steps[-1].end}",
+        gravity=Gravity(masses=masses, centres=_on_frames(centres, table, G)).mounted(
+            "floor", (T_top_base @ T_base)[:3, :3]
+        ),
     )
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
 
@@ -138,51 +146,97 @@ def write_urdf(
     if Path(target).suffix.lower() == XACRO:
         raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
     urdf = _read(Path(source))
-    every, joints, chain = _chain(urdf, base, tip)
+    steps = urdf.path_between(base, tip)
+    chain = _chain(urdf, steps)
     table, T_base, T_tool, G = describe(chain)
-    require_same_arm(robot, table, tuple(joint.kind for joint in joints), urdf.path)
+    require_same_arm(robot, table, tuple(step.joint.kind for step in steps if step.joint.kind), urdf.path)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
     origins, tail = corrected(G, robot.mdh, T_base, T_tool)
     size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
-    before = np.eye(4)
-    place = 0
-    for joint in every:
-        if joint.kind:  # the fixed joints before it stay, this one takes the whole correction
-            edits |= joint.origin_edits(urdf.data, np.linalg.inv(before) @ origins[place], size)
-            before = np.eye(4)
-            place = place + 1
-        else:
-            before = before @ joint.origin
-    if np.abs(tail - chain.tail).max() > 10 * ROUNDING * size:
-        if every[-1].kind:
-            what = f"a tool or beta{len(joints)} that moves the tip '{every[-1].child}'"
-            accepted = f"a tip that a fixed joint holds, as joint '{joints[-1].name}' cannot express it, or no tool"
-            raise InputError("robot", what, accepted, urdf.path)
-        rest = np.linalg.inv(before @ np.linalg.inv(every[-1].origin))
-        edits |= every[-1].origin_edits(urdf.data, rest @ tail, size)
+    for between, old, new in zip(_rigid_parts(steps), [*chain.origins, chain.tail], [*origins, tail], strict=True):
+        taker = _taker(between)
+        if taker is not None:  # the other origins stay, this one takes the whole correction
+            before = _product([step.constant for step in between[:taker]])
+            after = _product([step.constant for step in between[taker + 1 :]])
+            T = np.linalg.inv(before) @ new @ np.linalg.inv(after)
+            step = between[taker]
+            edits |= step.joint.origin_edits(urdf.data, np.linalg.inv(T) if step.up else T, size)
+        elif np.abs(new - old).max() > 10 * ROUNDING * size:
+            raise _inexpressible(urdf, steps, at_tip=new is tail)
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
-def _chain(urdf: _Urdf, base: str | None, tip: str | None) -> tuple[list[_Joint], list[_Joint], Chain]:
-    """Return all joints between two links, those of them that move, and their geometry."""
-    every = urdf.path_between(base, tip)
-    joints: list[_Joint] = []
-    origins: list[Array] = []
-    T = np.eye(4)
-    for joint in every:
-        T = T @ joint.origin
-        if joint.kind:
-            mimic = [e.attributes.get("joint", "") for e in joint.element.every("mimic")]
-            if mimic:
-                raise joint.error("mimic", f"motion that follows joint '{mimic[0]}'", "joints that move on their own")
-            joints.append(joint)
-            origins.append(T)
-            T = np.eye(4)
-    if not joints:
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A joint on the way between two links, passed down the tree or up, where its motion and origin are inverted."""
+
+    joint: _Joint
+    up: bool
+
+    @property
+    def constant(self) -> Array:
+        """Transform (4, 4) of the joint's origin: before its motion, or after it where it is passed up."""
+        return np.linalg.inv(self.joint.origin) if self.up else self.joint.origin
+
+    @property
+    def start(self) -> str:
+        return self.joint.child if self.up else self.joint.parent
+
+    @property
+    def end(self) -> str:
+        return self.joint.parent if self.up else self.joint.child
+
+
+def _product(transforms: Sequence[Array]) -> Array:
+    return functools.reduce(np.matmul, transforms, np.eye(4))
+
+
+def _rigid_parts(steps: Sequence[_Step]) -> list[list[_Step]]:
+    """Return the steps whose origins stand before the first motion, between the motions and after the last one."""
+    parts: list[list[_Step]] = [[]]
+    for step in steps:
+        if step.up and step.joint.kind:
+            parts.append([step])
+            continue
+        parts[-1].append(step)
+        if step.joint.kind:
+            parts.append([])
+    return parts
+
+
+def _taker(between: Sequence[_Step]) -> int | None:
+    """Return which origin of a rigid part is corrected: that of the joint after it, before it, or a fixed one."""
+    if not between:
+        return None
+    first_fixed = between[0].up and not between[-1].joint.kind
+    return 0 if first_fixed else len(between) - 1
+
+
+def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:
+    """Return the geometry of the joints that move."""
+    moving = [step for step in steps if step.joint.kind]
+    for step in moving:
+        mimic = [e.attributes.get("joint", "") for e in step.joint.element.every("mimic")]
+        if mimic:
+            raise step.joint.error("mimic", f"motion that follows joint '{mimic[0]}'", "joints that move on their own")
+    if not moving:
         raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint", urdf.path)
-    return every, joints, Chain(np.array(origins), np.array([joint.axis for joint in joints]), T)
+    *origins, tail = [_product([step.constant for step in part]) for part in _rigid_parts(steps)]
+    axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
+    return Chain(np.array(origins), np.array(axes), tail)
+
+
+def _inexpressible(urdf: _Urdf, steps: Sequence[_Step], at_tip: bool) -> InputError:
+    """Return the error for a correction before the first or after the last joint where no fixed joint takes it."""
+    link, what = (steps[0].start, "a base")
+    joint = steps[0].joint
+    if at_tip:
+        link, what = (steps[-1].end, f"a tool or beta{sum(bool(step.joint.kind) for step in steps)}")
+        joint = steps[-1].joint
+    accepted = f"a link that a fixed joint holds, as joint '{joint.name}' cannot express it, or no such correction"
+    return InputError("robot", f"{what} that moves link '{link}'", accepted, urdf.path)
 
 
 # Elements
@@ -327,17 +381,29 @@ class _Urdf:
     links: Mapping[str, _Element]
     above: Mapping[str, _Joint]
 
-    def path_between(self, base: str | None, tip: str | None) -> list[_Joint]:
-        """Return the joints from link ``base`` to link ``tip``; by default from the root to the only leaf."""
+    def path_between(self, base: str | None, tip: str | None) -> list[_Step]:
+        """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
         for given in (base, tip):
             if given is not None and given not in self.links:
                 raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
         base = base or self._root()
         tip = tip or self._leaf(base)
-        chain = self._up(tip, base)
-        if chain is None:
-            raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "a link below the base", self.path)
-        return chain
+        up = self._to_root(base)
+        down = self._to_root(tip)
+        while up and down and up[-1] is down[-1]:
+            up.pop()
+            down.pop()
+        if (up[-1].parent if up else base) != (down[-1].parent if down else tip):
+            raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "links of one tree", self.path)
+        return [*(_Step(joint, True) for joint in up), *(_Step(joint, False) for joint in reversed(down))]
+
+    def _to_root(self, link: str) -> list[_Joint]:
+        """Return the joints from a link up to its root."""
+        joints: list[_Joint] = []
+        while link in self.above:
+            joints.append(self.above[link])
+            link = joints[-1].parent
+        return joints
 
     def _root(self) -> str:
         roots = [link for link in self.links if link not in self.above]
@@ -348,20 +414,15 @@ class _Urdf:
 
     def _leaf(self, base: str) -> str:
         parents = {joint.parent for joint in self.above.values()}
-        leaves = [link for link in self.links if link not in parents and self._up(link, base) is not None]
-        if len(leaves) != 1:
+        leaves = [link for link in self.links if link not in parents and link != base]
+        below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))]
+        if not leaves:
+            return base
+        if len(below) != 1:
             accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
-            raise InputError(f"links at the end of chains from '{base}'", ", ".join(leaves), accepted, self.path)
-        return leaves[0]
-
-    def _up(self, tip: str, base: str) -> list[_Joint] | None:
-        chain: list[_Joint] = []
-        while tip != base:
-            if tip not in self.above:
-                return None
-            chain.append(self.above[tip])
-            tip = chain[-1].parent
-        return chain[::-1]
+            found = ", ".join(below or leaves)
+            raise InputError(f"links at the end of chains from '{base}'", found, accepted, self.path)
+        return below[0]
 
 
 def _read(path: Path) -> _Urdf:
@@ -476,7 +537,7 @@ def _urdf_text(path: Path) -> bytes:
 # Masses
 
 
-def _carried_masses(urdf: _Urdf, chain: Sequence[_Joint]) -> tuple[tuple[float, ...], tuple[Array, ...]]:
+def _carried_masses(urdf: _Urdf, steps: Sequence[_Step]) -> tuple[tuple[float, ...], tuple[Array, ...]]:
     """Return the mass [kg] that each moving joint of a chain carries up to the next, and its centre [m].
 
     Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
@@ -484,9 +545,12 @@ def _carried_masses(urdf: _Urdf, chain: Sequence[_Joint]) -> tuple[tuple[float, 
 
     Returns
     -------
-    n masses, and n centres (3,) in the frames of the file's joints; none of both where nothing that moves has a mass.
+    n masses, and n centres (3,) in the frames of the file's joints; none of both where nothing that moves has a mass,
+    or the base itself is moved.
     """
-    frames = _frames(chain)
+    if any(step.up and step.joint.kind for step in steps):
+        return (), ()
+    frames = _frames(steps)
     count = max(i for i, _ in frames.values())
     masses = np.zeros(count)
     moments = np.zeros((count, 3))
@@ -517,15 +581,15 @@ def _on_frames(centres: Sequence[Array], table: Array, G: Array) -> tuple[Vector
     return tuple(found)
 
 
-def _frames(chain: Sequence[_Joint]) -> dict[str, tuple[int, Array]]:
+def _frames(steps: Sequence[_Step]) -> dict[str, tuple[int, Array]]:
     """Return for the links of a chain which moving joint (from 1; 0: none) carries them, and where they are on it."""
-    frames = {chain[0].parent: (0, np.eye(4))}
-    for joint in chain:
-        i, T = frames[joint.parent]
-        if joint.kind:
-            frames[joint.child] = (i + 1, np.eye(4))
+    frames = {steps[0].start: (0, np.eye(4))}
+    for step in steps:
+        i, T = frames[step.start]
+        if step.joint.kind:
+            frames[step.end] = (i + 1, np.eye(4))
         else:
-            frames[joint.child] = (i, T @ joint.origin)
+            frames[step.end] = (i, T @ step.constant)
     return frames
 
 
