@@ -41,6 +41,7 @@ from .convex import within_tolerance as within_tolerance
 from .data import Dataset as Dataset
 from .data import read_data as read_data
 from .problem import CalibrationProblem as CalibrationProblem
+from .problem import problem_from as problem_from
 from .problem import together as together
 from .report import plot as plot
 from .robot import Model as Model

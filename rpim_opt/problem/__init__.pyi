@@ -18,6 +18,7 @@ from .registration.closed_forms import hand_eye as hand_eye
 from .registration.closed_forms import register as register
 from .registration.closed_forms import tool_from_distances as tool_from_distances
 from .registration.frames import fitted_frames as fitted_frames
+from .registration.frames import problem_from as problem_from
 from .registration.frames import starting_parameters as starting_parameters
 from .scatter import Scatter as Scatter
 from .several import together as together

@@ -17,8 +17,9 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.position import position
+from rpim_opt.problem.identified import near_parallel
 from rpim_opt.problem.misreadings import Points, better_reading, lever_arms, misfit, placed, points_of
-from rpim_opt.problem.observability import Observability, combination, near_parallel, observe
+from rpim_opt.problem.observability import Observability, combination, observe
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import Fit
 from rpim_opt.problem.registration.frames import fitted_frames

@@ -1,7 +1,9 @@
-"""The identified parameters of a problem, which know the machine that they belong to."""
+"""The identified parameters of a problem: which they are by default, and the machine that they belong to."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -12,6 +14,12 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
+
+GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
+BASE = re.compile(r"base_.*")
+PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
+POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
+"""Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,3 +79,30 @@ def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -
         farthest = x
     machine = replace(known.machine, at=x, farthest=farthest)
     return replace(model, parameters=replace(known, machine=machine))
+
+
+def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
+    """Return Hayati's parameters that a robot needs: ``beta{i}`` where the axes of joints i and i+1 are near parallel.
+
+    Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
+    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
+    from parallel an axis pair still counts.
+    """
+    return tuple(
+        f"beta{i}"
+        for i in range(1, robot.dof)
+        if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
+    )
+
+
+def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
+    """Return patterns of parameters; ``"auto"`` stands for geometry, Hayati's beta where it is needed, and frames."""
+    if patterns != "auto":
+        return patterns
+    kinds = [block.measurement for block in data.blocks]
+    kept = [GEOMETRY]
+    if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
+        kept.append(BASE)
+    kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
+    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
+    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

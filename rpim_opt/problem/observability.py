@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import Brief
-from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.source import Source
-from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import Parameters
 
 FAINT = 1e-2
 """Coefficients of a combination (in millimetres and milliradians) below this part of its largest are left out."""
 TIE = 1e-6
 """Sizes that differ by less than this part are the same but for rounding: the order of the parameters decides."""
-
-GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
-BASE = re.compile(r"base_.*")
-PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
-POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
-"""Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observability(Brief):
@@ -204,28 +193,3 @@ def combination(terms: dict[str, float]) -> str:
         sign = ("" if value > 0 else "-") if not text else (" + " if value > 0 else " - ")
         text += f"{sign}{size}{name}"
     return text
-
-
-def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
-    """Return Hayati's parameters that a robot needs: ``beta{i}`` where the axes of joints i and i+1 are near parallel.
-
-    Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
-    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
-    from parallel an axis pair still counts.
-    """
-    return tuple(
-        f"beta{i}"
-        for i in range(1, robot.dof)
-        if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
-    )
-
-
-def identifiable(robot: Robot, parameters: Parameters, data: Dataset) -> list[str]:
-    """Return the names that ``identify = "auto"`` means: geometry, Hayati's beta where it is needed, and places."""
-    kinds = [block.measurement for block in data.blocks]
-    patterns = [GEOMETRY]
-    if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
-        patterns.append(BASE)
-    patterns.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
-    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in patterns)
-    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

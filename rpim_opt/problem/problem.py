@@ -15,7 +15,7 @@ from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.problem.identified import Identified, identified_of
+from rpim_opt.problem.identified import Identified, identifiable, identified_of
 from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
 from rpim_opt.problem.row_functions import Evaluation, Kept, measured_torques, require_loads, require_same_torques
 from rpim_opt.problem.scatter import Scatter, Stack, joint_slopes, shifts, stacked
@@ -96,6 +96,30 @@ class CalibrationProblem(Tabled):
     data: Dataset
     asked: Kept | None = field(default=None, repr=False)
     scatter: Scatter | None = None
+
+    def identify(self, patterns: Iterable[str]) -> CalibrationProblem:
+        """Return the same problem with just the parameters identified that match one of the patterns.
+
+        Parameters
+        ----------
+        patterns
+            Names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links, Hayati's
+            beta between nearly parallel axes, and the frames that the measurements can tell.
+
+        Raises
+        ------
+        InputError
+            For a pattern that matches no parameter.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> [len(problem.identify(each).parameters.free) for each in ("auto", ["theta?", "tool_[xyz]"])]
+        [34, 9]
+        """
+        p = self.parameters
+        return self.with_parameters(p.identify(identifiable(patterns, self.robot, p, self.data)))
 
     def _short(self) -> str:
         names = ", ".join(f"'{robot.name}'" for robot in self.arms.values())

@@ -15,7 +15,7 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, 
 from rpim_opt.robot.mdh import MDH, Robot
 
 NEAR_PARALLEL = 0.1
-"""Axes nearer to parallel than this [rad] get Hayati's beta, as `observability.near_parallel` proposes."""
+"""Axes nearer to parallel than this [rad] get Hayati's beta, as `identified.near_parallel` proposes."""
 ANOTHER_ARM = 0.1
 """A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
 SAME_PLACE = (0.01, 0.1)

@@ -22,7 +22,7 @@ from rpim_opt.data.measurements.measurement import Measurement, Words, of_fixtur
 from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.units import parse_units
-from rpim_opt.problem.observability import identifiable
+from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import Described, placed, same_place
@@ -350,7 +350,7 @@ def _problem_text(
         **said,
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
-        identify=toml(_patterns(identifiable(arm.robot, parameters, rows), arm.robot.dof)),
+        identify=toml(_patterns(identifiable("auto", arm.robot, parameters, rows), arm.robot.dof)),
         noise=list(noise.items()),
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),

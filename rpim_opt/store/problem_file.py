@@ -21,6 +21,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
@@ -221,12 +222,7 @@ class ProblemFile:
         """Return the parameters with the file's scales and tolerances, and those identified that it names."""
         table = self.table
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
-        patterns = table.identify
-        if patterns == "auto":
-            from rpim_opt.problem.observability import identifiable  # most files name them
-
-            patterns = identifiable(self.robot, parameters, data)
-        return parameters.identify(patterns)
+        return parameters.identify(identifiable(table.identify, self.robot, parameters, data))
 
 
 def read_problem(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
@@ -30,7 +33,9 @@ from rpim_opt.problem.registration.closed_forms import (
     transforms,
 )
 from rpim_opt.problem.source import Source
+from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
+from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters, model_parameters
@@ -332,6 +337,53 @@ MOST_STEPS = 200
 SHORT, ROUNDING = 1e-11, 1e-12
 """Frames are found when a full step is shorter than the first, relative to 1 + |z|; a step is refused when it raises
 the objective by more than the second."""
+
+
+def problem_from(
+    robot: Robot | Described | str | Path,
+    data: Dataset,
+    identify: Iterable[str] = "auto",
+    base: ArrayLike | Literal["auto"] = "auto",
+    tool: ArrayLike | None = None,
+) -> CalibrationProblem:
+    """Return the problem of a robot and its measurements, base and tool located in closed form.
+
+    Parameters
+    ----------
+    robot
+        The nominal robot, what `read_urdf` returns, a file that describes one, or the name of a ready robot.
+    data
+        The measurements.
+    identify
+        Patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`.
+    base
+        (6,) start of the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx;
+        ``"auto"`` registers it.
+    tool
+        (6,) start of the reflector in the flange frame; where it is not stated, that of the URDF, or the flange.
+
+    Raises
+    ------
+    InputError
+        For data that do not determine where the base is, or a pattern that matches no parameter.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("position").problem
+    >>> problem = ro.problem_from(arm.robot, arm.data, tool=[0.02, 0, 0.06, 0, 0, 0])
+    >>> len(problem.parameters.free), problem.parameters.free.nominal[-9:-6].round(2)
+    (34, array([ 1.8 , -0.7 ,  0.35]))
+    """
+    if isinstance(robot, str | Path):
+        robot = read_arm(Path(robot) if Path(robot).is_file() else find_robot(str(robot)))
+    if isinstance(robot, Described):
+        tool = robot.tool if tool is None else tool
+        robot = robot.robot
+    start = np.zeros(6) if tool is None else np.asarray(tool, dtype=float)
+    placed = None if isinstance(base, str) else np.asarray(base, dtype=float)
+    parameters = starting_parameters(robot, data, placed, {"": start})
+    return CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
 
 
 def starting_parameters(
