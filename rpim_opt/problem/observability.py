@@ -16,6 +16,7 @@ FAINT = 1e-2
 TIE = 1e-6
 """Sizes that differ by less than this part are the same but for rounding: the order of the parameters decides."""
 
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Observability(Brief):
     """How well a set of configurations shows the identified parameters.
