@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from rpim_opt.problem.diagnosis import (
     rows_without_values,
     shared_rows,
 )
-from rpim_opt.problem.misreadings import Better, better_reading
+from rpim_opt.problem.misreadings import EXACT, Better, better_reading
 from rpim_opt.problem.problem import CalibrationProblem
 
 NOISY = 3.0
@@ -36,6 +36,16 @@ NOTHING = (
     "No mistake that was tried explains it: another drawing, or a robot that bends and repeats worse than the "
     "instrument measures? Look at rpim-opt inspect."
 )
+
+
+class Cause(NamedTuple):
+    """A likely cause of a bad fit in a sentence, and how many times better the data fit without it.
+
+    The factor is 1 where single rows are the cause, which no refit has judged.
+    """
+
+    sentence: str
+    factor: float = 1.0
 
 
 def likely_causes(result: Outcome) -> list[str]:
@@ -72,17 +82,38 @@ def likely_causes(result: Outcome) -> list[str]:
     errors, pixels = (_but(problem.errors(result.x, of), distrusted) for of in ("length", "pixel"))
     signs = _signs(result, problem, errors, pixels)
     head: list[str] = []
-    causes: list[str] = []
+    causes: tuple[Cause, ...] = ()
     if signs:
         head = [f"The fit is bad: {'; '.join(signs)}."]
-        causes = _causes(problem, result.x, errors)
+        causes = find_causes(result)
     elif distrusted.any():
-        causes = list(_of_rows(problem))
+        causes = tuple(map(Cause, _of_rows(problem)))
     if causes or shared:
-        return [*head, *(f"Likely: {text}" for text in causes), *shared]
+        return [*head, *(f"Likely: {cause.sentence}" for cause in causes), *shared]
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
         return [*head, NOTHING]
     return []
+
+
+def find_causes(result: Outcome) -> tuple[Cause, ...]:
+    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some.
+
+    The table is read in other ways; rows without value, exchanged rows, rounded joints and a base that moved are looked
+    for. Asked only of a fit that is bad, for it takes seconds; empty for measurements in parts, and where nothing does.
+    """
+    if not result.problem.keeps_rows:
+        return ()
+    problem = cast(CalibrationProblem, result.problem)
+    if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
+        return tuple(map(Cause, _of_rows(problem)))
+    better = better_reading(problem)
+    if better is not None:
+        factor = better.stated / max(better.left, EXACT)
+        return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, factor))
+    found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
+    if not found:
+        found += rounded_joints(problem, _rms(_but(problem.errors(result.x), _distrusted(result))))
+    return tuple(map(Cause, found))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
@@ -152,21 +183,6 @@ def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
     yield from rows_without_values(problem)
     if len(problem.arms) == 1:
         yield from exchanged_rows(problem)
-
-
-def _causes(problem: CalibrationProblem, x: Array, errors: Array) -> list[str]:
-    """Return what explains a bad fit: something of all rows, else of some."""
-    if len(problem.arms) > 1:  # a table is read anew with the drawing of one robot
-        return list(_of_rows(problem))
-    better = better_reading(problem)
-    if better is not None:
-        return [*rows_without_values(problem), better.sentence]
-    found = list(_of_rows(problem))
-    far = list(moved_far(problem)) or list(moved(problem, x))
-    found += far
-    if not found:
-        found += rounded_joints(problem, _rms(errors))
-    return found
 
 
 def _signs(result: Outcome, problem: CalibrationProblem, errors: Array, pixels: Array) -> list[str]:
