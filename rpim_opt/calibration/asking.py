@@ -21,6 +21,7 @@ from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.convex.named import formulation_of, weight_of
 from rpim_opt.convex.select import Selector
 from rpim_opt.problem.registration.frames import relocated
+from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
 from rpim_opt.problem.source import Source
 
 NOISE = {
@@ -89,8 +90,9 @@ def calibrate(
         What is learned of it: ``"robot"``, the robot's scatter beside the instrument's noise as declared; ``"free"``,
         that of the instrument too; ``"level"``, one factor on what was declared; ``"declared"``, nothing.
     start
-        (n,) deviations [SI] to begin with; nominal by default, and then frames that are stated metres or half a
-        turn from where the data put them count from there (`frames.relocated`). The answer does not depend on
+        (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
+        nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from
+        where the data put them count from there (`frames.relocated`). The answer does not depend on
         a given start, as long as the loop converges: the deviations count from nominal all the same, angles within
         half a turn.
     max_iterations, tolerance
@@ -140,9 +142,13 @@ def calibrate(
     require_passes(max_iterations)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
+    mapping: JointMapping | None = None
     if start is not None:
         start = require_start(start, len(problem.parameters.free))
     else:
+        found = find_mapping(problem)
+        if found is not None:
+            mapping, problem = found
         elsewhere = relocated(problem)
     problem = elsewhere or problem
     if weight is None and formulation.penalty is None:
@@ -163,7 +169,16 @@ def calibrate(
     message = result.message
     if elsewhere is not None:
         message += ELSEWHERE
-    return replace(result, message=message, asked=asked)
+    if mapping is not None:
+        message += f" {mapping.sentence}"
+    return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
+
+
+def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:
+    """Return a calibration of problems whose joints are mapped already, which says so."""
+    if mapping is None:
+        return asked
+    return lambda problem: replace(asked(problem), mapping=mapping)
 
 
 def _refit(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:

@@ -88,6 +88,8 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = find_causes(result)
     elif distrusted.any():
         causes = tuple(map(Cause, _of_rows(problem)))
+    if result.mapping is not None:
+        shared += result.mapping.doubts
     if causes or shared:
         return [*head, *(f"Likely: {cause.sentence}" for cause in causes), *shared]
     if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:

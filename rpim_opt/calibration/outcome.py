@@ -44,6 +44,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.row_functions import bearing, transform
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
@@ -154,6 +155,7 @@ class Outcome:
     record: Record = field(default_factory=Record)
     kept: Kept | None = None
     learned: Learned | None = None
+    mapping: JointMapping | None = None
 
     @property
     def z(self) -> Array:

@@ -38,6 +38,8 @@ class Calibration(Outcome):
         Where the data come from, for files and reports.
     learned
         What was learned before the fit: sizes of deviations and noise, families, rows left out; None with a weight.
+    mapping
+        Signs and zeros of the joints that were found from the data; None where the nominal ones explain them.
     kept
         What functions said that a file cannot hold; None where they can be asked.
 

@@ -17,7 +17,7 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import believed
-from rpim_opt.calibration.asking import calibrate
+from rpim_opt.calibration.asking import calibrate, mapped_as
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.prices import Price
@@ -38,6 +38,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
@@ -224,6 +225,7 @@ class Stored:
     learned: Learned | None
     record: Record
     rows: dict[str, list[RowErrors]]
+    mapping: JointMapping | None = None
     digest: str = ""
 
 
@@ -255,6 +257,7 @@ def content(result: Calibration) -> dict[str, Any]:
         learned=result.learned,
         record=result.record,
         rows=_rows(result),
+        mapping=result.mapping,
     )
     parts = {
         "format": FORMAT,
@@ -454,10 +457,13 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         history=file.history,
         program=program,
         certificate=file.certificate,
-        asked=partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file)),
+        asked=mapped_as(
+            file.mapping, partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file))
+        ),
         record=replace(file.record, validation=validation, digest=file.digest),
         kept=None if formulation.solvable else _kept(file, program),
         learned=file.learned,
+        mapping=file.mapping,
     )
 
 

@@ -1,0 +1,389 @@
+"""Global start: joint signs, joint zeros, base and reflectors of an arm that its nominal model does not explain.
+
+Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base eliminated at every step:
+random zeros, all signs in turn, a few steps for all and more for the best, until enough starts end in one optimum.
+There is no certificate: a better optimum that one start reaches with probability h is missed with (1 - h)^starts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import joined, three_digits
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.closed_forms import proper
+from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
+from rpim_opt.problem.source import Source
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import tool_prefix
+
+UNEXPLAINED = 0.01
+"""Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
+EXPLAINED = 3.0
+"""A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""
+NEAR_ZERO = 0.2
+"""Joint zeros up to this [rad] are left to the calibration, as deviations of theta."""
+ROUND, SNAP = np.pi / 2, np.radians(2)
+"""Zeros this close to a multiple of a quarter turn are that."""
+FEWEST_STARTS, STARTS_PER_SIGNS = 600, 6
+SHORT, LONG = 14, 45
+"""Steps of all starts of a round, and of the best quarter."""
+ROUNDS, HITS = 4, 5
+"""Rounds at most, and starts that have to end in the best optimum."""
+SAME_OPTIMUM = 1.05
+FEW = 40
+"""Rows of a search; the best candidates are fitted to more."""
+KEPT = 64
+"""Candidates that are fitted to all rows."""
+LEAST_NOISE = 5e-5
+"""Floor of the error of a point [m]: what is nearer is rounding."""
+ODDS = 30.0
+"""Difference of chi-squared up to which data do not tell two mappings apart."""
+GROSS = 6.0
+"""Rows farther off than so many medians of the best fit's errors do not tell mappings apart."""
+FEWEST_FREE = 4
+"""Degrees of freedom below which any mapping would fit."""
+MOST_JOINTS = 8
+"""Joints beyond which signs are too many to be tried."""
+MIRRORED = 1.3
+"""A left-handed frame fits as well if it leaves up to so many times what a mapping leaves."""
+UNSEEN = 200
+"""Configurations at which mappings are compared."""
+RARE_BASIN = 0.005
+"""Probability of reaching a basin with one start whose probability of being missed is told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another mapping that fits as well: signs and zeros (dof,), and how far it is from the first one.
+
+    ``apart`` [m] is the RMS distance of their predictions at unseen configurations, ``told_by`` (dof,) the joint values
+    of the controller [rad or m] among these at which they are farthest apart.
+    """
+
+    sign: Array
+    zero: Array
+    apart: float
+    told_by: Array
+
+
+@dataclass(frozen=True, eq=False)
+class JointMapping:
+    """Signs and zeros of joints that were found from the data.
+
+    ::
+
+        q_model = joint_map (sign * q) + zero
+
+    Parameters
+    ----------
+    joint_types
+        Of the robot.
+    sign, zero
+        (dof,) +1 or -1; [rad or m].
+    nominal, left
+        RMS error of the best three quarters of the points [m]: with joints as stated, and with the mapping.
+    starts
+        Random starts of the search.
+    alternatives
+        Mappings that the data cannot tell from this one though they predict otherwise elsewhere.
+    mirrored
+        Whether a left-handed measured frame and joints as stated fit as well.
+    """
+
+    joint_types: tuple[str, ...]
+    sign: Array
+    zero: Array
+    nominal: float
+    left: float
+    starts: int
+    alternatives: tuple[Alternative, ...] = ()
+    mirrored: bool = False
+
+    @property
+    def missed(self) -> float:
+        """Probability that a basin which one start in 200 reaches was missed."""
+        return (1 - RARE_BASIN) ** self.starts
+
+    @property
+    def sentence(self) -> str:
+        """Say what was found, from what, and how certain it is."""
+        text = (
+            f"Joint mapping found from the data: {described(self.joint_types, self.sign, self.zero)} "
+            f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
+            f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
+            f"with a probability of {self.missed:.1g})."
+        )
+        return " ".join([text, *self.doubts])
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Say what fits as well, and what would tell."""
+        said = []
+        if self.mirrored:
+            said.append(
+                "A left-handed measured frame with the joints as stated fits as well: a known direction in the "
+                "instrument's frame (up, for instance) or measured orientations would tell."
+            )
+        for other in self.alternatives:
+            values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
+            said.append(
+                f"{described(self.joint_types, other.sign, other.zero).capitalize()} fits as well, and predicts "
+                f"{three_digits(1e3 * other.apart)} mm elsewhere: measure at ({values}) to tell."
+            )
+        return tuple(said)
+
+
+def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
+    """Say signs and zeros (dof,) in words."""
+    parts = []
+    reversed_ = [f"{i + 1}" for i in np.flatnonzero(sign < 0)]
+    if reversed_:
+        parts.append(f"joint{'s' * (len(reversed_) > 1)} {joined(reversed_)} reversed (sign = -1)")
+    shifts = [
+        f"joint {i + 1} {_value(kind, zero[i], '+')}" for i, kind in enumerate(joint_types) if abs(zero[i]) > 1e-9
+    ]
+    if shifts:
+        parts.append(f"zero of {joined(shifts)}")
+    return ", ".join(parts) or "joints as stated"
+
+
+def _value(kind: str, value: float, plus: str = "") -> str:
+    """Return a joint value with its unit."""
+    if kind == "prismatic":
+        return f"{1e3 * value:{plus}.1f} mm"
+    return f"{np.degrees(value):{plus}.1f} deg"
+
+
+def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
+    """Return a robot whose joints are counted with signs (dof,) of the controller and zeros (dof,) of the model."""
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    mdh = robot.mdh.copy()
+    mdh[:, 2] += np.where(turning, zero, 0.0)
+    mdh[:, 2] = np.where(turning & (zero != 0), np.angle(np.exp(1j * mdh[:, 2])), mdh[:, 2])
+    mdh[:, 3] += np.where(turning, 0.0, zero)
+    return replace(robot, mdh=mdh, joint_map=robot.joint_map * sign)
+
+
+def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | None:
+    """Return signs and zeros of the joints where the nominal robot does not explain the data, and the mapped problem.
+
+    Sought where the base and all reflectors' positions are identified, and the nominal robot leaves more than
+    `UNEXPLAINED` of the extent of positions or poses (weights of gross errors fall as 1 / error). None where nominal
+    signs and small zeros explain them, no mapping does, or a left-handed measured frame is as good an explanation.
+    """
+    if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1 or not _placed(problem):
+        return None
+    points = points_of(problem)
+    if points is None or explained(problem.robot, points):
+        return None
+    found = search(problem.robot, points)
+    if found is None or found.mirrored:
+        return None
+    return found, with_mapping(problem, points, found)
+
+
+def _placed(problem: CalibrationProblem) -> bool:
+    """Whether base and reflectors are identified: otherwise their statements decide what joints are."""
+    p = problem.parameters
+    prefixes = {tool_prefix(marker) for block in problem.data.blocks for marker in block.markers}
+    frames = {f"base_{c}" for c in FRAME} | {prefix + c for prefix in prefixes for c in FRAME[:3]}
+    return frames <= set(p.free.names)
+
+
+def explained(robot: Robot, points: Points) -> bool:
+    """Whether the nominal robot explains points but for gross errors."""
+    few = points.evenly(FEW)
+    fit = fit_arms(robot, Candidates.of(robot, [few]), SHORT, robust=True)
+    return bool(rms(fit)[0] <= UNEXPLAINED * few.extent)
+
+
+def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapping) -> CalibrationProblem:
+    """Return the problem with the joints mapped, and base and reflectors where the points put them then."""
+    robot = mapped(problem.robot, mapping.sign, mapping.zero)
+    fit = fit_arms(robot, Candidates.of(robot, [points]), LONG, robust=True)
+    p = problem.parameters
+    values = {f"theta{i + 1}": row[2] for i, row in enumerate(robot.mdh)}
+    values |= {f"d{i + 1}": row[3] for i, row in enumerate(robot.mdh)}
+    places = {"base_": fit.base[0]}
+    several = len(fit.tools[0]) // len(points.names)
+    for name, tool in zip(points.names, fit.tools[0].reshape(len(points.names), several, 3), strict=True):
+        T = np.eye(4)
+        T[:3, 3] = tool[0]
+        if several > 1:
+            T[:3, :3] = proper((tool[1:] - tool[0]).T)
+        places[tool_prefix(name)] = T
+    nominal = p.nominal.copy()
+    for i, name in enumerate(p.names):
+        nominal[i] = values.get(name, nominal[i])
+    index = {name: i for i, name in enumerate(p.names)}
+    for prefix, T in places.items():
+        for c, value in zip(FRAME, frame_numbers(T), strict=True):
+            if p.identified[index[prefix + c]]:
+                nominal[index[prefix + c]] = value
+    return replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
+
+
+def rms(fit: Fit) -> Array:
+    """Return the RMS errors (B,) [m] of the best three quarters of the points, of poses with their tips."""
+    error = np.sort(fit.error, axis=1)[:, : int(np.ceil(0.75 * fit.error.shape[1]))]
+    return np.sqrt(np.mean(error**2, axis=1))
+
+
+def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
+    """Return the mapping that explains points, None where the nominal one does as well, or none does."""
+    rng = np.random.default_rng(seed)
+    n = robot.dof
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    few = points.evenly(FEW)
+    base = Candidates.of(robot, [few])
+    free = few.y.size - max(n - 2, 0) - base.tools.size - 6
+    if free < FEWEST_FREE or n > MOST_JOINTS:
+        return None
+    near = fit_arms(robot, base, 2 * LONG, zeros=True, robust=True, noise=LEAST_NOISE)
+    small = np.abs(np.where(turning, near.zero[0], 0.0))[1:-1].max(initial=0.0) < NEAR_ZERO
+    if small and rms(near)[0] <= UNEXPLAINED * few.extent:
+        return None
+    signs = np.array(list(product([1.0, -1.0], repeat=n)))
+    count = max(FEWEST_STARTS, STARTS_PER_SIGNS * len(signs))
+    pool = [_round(robot, few, *_plain_starts(n, signs, turning))]
+    starts = 0
+    for _ in range(ROUNDS):
+        sign = signs[np.resize(rng.permutation(len(signs)), count)]
+        zero = rng.uniform(-np.pi, np.pi, (count, n)) * turning
+        pool.append(_round(robot, few, sign, zero))
+        starts += count
+        cost = np.concatenate([fit.cost for _, fit in pool])
+        if np.count_nonzero(cost < SAME_OPTIMUM * cost.min() + 1e-12) >= HITS:
+            break
+    sign = np.concatenate([each for each, _ in pool])
+    zero = np.concatenate([fit.zero for _, fit in pool])
+    tools = np.concatenate([fit.tools for _, fit in pool])
+    best = np.argsort(cost)[:KEPT]
+    asked = _signed(robot, points, np.vstack([np.ones((1, n)), sign[best]]))
+    asked = asked._replace(zero=np.vstack([near.zero, zero[best]]), tools=np.concatenate([near.tools, tools[best]]))
+    fits = fit_arms(robot, asked, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
+    return _judged(robot, points, np.vstack([np.ones((1, n)), sign[best]]), fits, starts, small, rng)
+
+
+def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Array]:
+    """Return what happens most: any joints reversed, or at most one, and one that is a quarter or half a turn off."""
+    zero = [np.zeros(n)]
+    for i in np.flatnonzero(turning):
+        zero += [angle * np.eye(n)[i] for angle in (ROUND, -ROUND, 2 * ROUND)]
+    one = np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
+    sign = np.vstack([signs, np.repeat(one, len(zero) - 1, axis=0)])
+    return sign, np.vstack([np.zeros_like(signs), np.tile(zero[1:], (len(one), 1))])
+
+
+def _signed(robot: Robot, points: Points, sign: Array) -> Candidates:
+    """Return candidates of the points with signs (B, dof) of their joints."""
+    one = Candidates.of(robot, [points])
+    q, y, marker = points.targets
+    B = len(sign)
+    return Candidates(
+        q=(sign[:, None] * q) @ robot.joint_map.T,
+        y=np.broadcast_to(y, (B, *y.shape)),
+        marker=np.broadcast_to(marker, (B, len(marker))),
+        zero=np.zeros((B, robot.dof)),
+        tools=np.repeat(one.tools, B, axis=0),
+        stated=one.stated,
+        spread=np.full(len(one.stated), 3.0 * one.spread.max()),
+    )
+
+
+def _round(robot: Robot, points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
+    """Return the best quarter of random starts, fitted: signs (B, dof) and fits."""
+    asked = _signed(robot, points, sign)._replace(zero=zero)
+    first = fit_arms(robot, asked, SHORT, zeros=True, noise=LEAST_NOISE)
+    best = np.argsort(first.cost)[: max(len(sign) // 4, 1)]
+    begun = asked.take(best)._replace(zero=first.zero[best], tools=first.tools[best])
+    return sign[best], fit_arms(robot, begun, LONG, zeros=True, noise=LEAST_NOISE)
+
+
+def _judged(
+    robot: Robot, points: Points, sign: Array, fits: Fit, starts: int, small: bool, rng: np.random.Generator
+) -> JointMapping | None:
+    """Return the plainest mapping of the best robot class, and others that fit as well; the first fit is nominal."""
+    left = rms(fits)
+    least = left.min()
+    if not least <= UNEXPLAINED * points.extent or (small and EXPLAINED * least >= left[0]):
+        return None
+    best = int(np.argmin(left))
+    kept = fits.error[best] <= GROSS * np.median(fits.error[best])
+    equations = 3 * int(kept.sum())
+    free = max(equations - max(robot.dof - 2, 0) - fits.tools[0].size - 6, 1)
+    cost = (fits.error[:, kept] ** 2).sum(axis=1)
+    chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
+    near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    low, high = points.q.min(axis=0), points.q.max(axis=0)
+    unseen = np.where(
+        turning, rng.uniform(-np.pi, np.pi, (UNSEEN, robot.dof)), rng.uniform(low, high, (UNSEEN, robot.dof))
+    )
+    zeros = [_gauged(robot, fits.zero[i]) for i in range(len(sign))]
+    classes: list[list[int]] = []
+    said: list[Array] = []
+    for i in near:
+        there = _predicted(robot, sign[i], fits.take(np.array([i])), unseen)
+        gaps = [float(np.sqrt(((there - other) ** 2).sum(axis=-1).mean())) for other in said]
+        if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
+            classes[int(np.argmin(gaps))].append(i)
+        else:
+            classes.append([i])
+            said.append(there)
+    plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
+    first = plainest[0]
+    others = []
+    for k, i in enumerate(plainest[1:], start=1):
+        far = np.linalg.norm(said[k] - said[0], axis=-1).max(axis=-1)
+        apart = float(np.sqrt(((said[k] - said[0]) ** 2).sum(axis=-1).mean()))
+        others.append(Alternative(sign[i], zeros[i], apart, unseen[int(np.argmax(far))]))
+    nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
+    return JointMapping(
+        robot.joint_types,
+        sign[first],
+        zeros[first],
+        nominal,
+        float(left[first]),
+        starts,
+        tuple(others),
+        _mirrored(robot, points, float(left[first])),
+    )
+
+
+def _mirrored(robot: Robot, points: Points, left: float) -> bool:
+    """Whether a left-handed measured frame and joints as stated leave as little [m]."""
+    fit = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), SHORT, zeros=True, robust=True)
+    small = np.abs(_gauged(robot, fit.zero[0])).max() < NEAR_ZERO
+    return bool(small and rms(fit)[0] < MIRRORED * left)
+
+
+def _gauged(robot: Robot, zero: Array) -> Array:
+    """Return zeros (dof,) that base and tool do not take up, near multiples of a quarter turn these."""
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    zero = np.where(turning, np.angle(np.exp(1j * zero)), zero)
+    if turning[0]:
+        zero[0] = 0.0
+    if turning[-1] and robot.mdh[-1, 4] == 0:
+        zero[-1] = 0.0
+    quarter = ROUND * np.round(zero / ROUND)
+    quarter = np.where(quarter < -1.5 * ROUND, np.pi, quarter)  # half a turn either way
+    return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < SNAP), quarter, zero)
+
+
+def _plain(sign: Array, zero: Array) -> tuple[int, int, float]:
+    """How far a mapping is from the stated one: joints that change, reversed ones, then the size of the zeros."""
+    changed = (sign < 0) | (np.abs(zero) > NEAR_ZERO)
+    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2)
+
+
+def _predicted(robot: Robot, sign: Array, fit: Fit, q: Array) -> Array:
+    """Return where reflectors are at joint values (K, dof) of the controller, (K, M, 3) [m]."""
+    T = fit.base[0] @ forward_kinematics(mapped(robot, sign, fit.zero[0]), q)
+    return np.einsum("kij,mj->kmi", T[:, :3, :3], fit.tools[0]) + T[:, None, :3, 3]

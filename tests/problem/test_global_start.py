@@ -1,0 +1,149 @@
+"""Signs and zeros of joints are found from measurements where the nominal robot does not explain them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.problem.registration.global_start import mapped
+from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
+from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.mdh import Robot
+
+COUNT, UNSEEN, NOISE = 20, 60, 5e-4
+QUARTER = np.pi / 2
+HOBBY = Robot(
+    "hobby arm",
+    np.array([[0, 0, 0, 0.06, 0], [-QUARTER, 0.03, 0, 0, 0], [0, 0.12, 0, 0, 0], [0, 0.13, 0, 0, 0],
+              [-QUARTER, 0, 0, 0.06, 0]]),
+    limits=np.array([[-1.9, 1.9], [-1.7, 1.7], [-1.7, 1.7], [-1.6, 1.6], [-2.7, 2.7]]),
+)  # fmt: skip
+SCARA = Robot(
+    "SCARA",
+    np.array([[0, 0, 0, 0.2, 0], [0, 0.325, 0, 0, 0], [np.pi, 0.275, 0, 0, 0], [0, 0, 0, 0.05, 0]]),
+    ("revolute", "revolute", "prismatic", "revolute"),
+    limits=np.array([[-2.3, 2.3], [-2.5, 2.5], [0.0, 0.2], [-3.1, 3.1]]),
+)
+
+
+def robot_of(name: str) -> Robot:
+    return {"hobby": HOBBY, "scara": SCARA}.get(name) or ro.read_robot(find_robot(name))
+
+
+def simulated(name: str, seed: int, sign: np.ndarray | None = None, zero: np.ndarray | None = None, kind="position"):
+    """Return the problem, unseen rows, and the same problem with the true mapping stated."""
+    robot = robot_of(name)
+    rng = np.random.default_rng([seed, robot.dof])
+    turning = np.array([each == "revolute" for each in robot.joint_types])
+    low, high = np.clip(robot.limits, -2.5, 2.5).T
+    q = rng.uniform(low, high, (COUNT + UNSEEN, robot.dof))
+    sign = rng.choice([-1.0, 1.0], robot.dof) if sign is None else sign
+    zero = rng.uniform(-np.pi, np.pi, robot.dof) * turning if zero is None else zero
+    true = replace(robot, mdh=robot.mdh + rng.normal(size=robot.mdh.shape) * [2e-3, 1e-3, 2e-3, 1e-3, 0])
+    T = numeric_frame([1.2, -0.7, 0.35, 0.2, -0.4, 1.1]) @ forward_kinematics(true, q)
+    T = T @ numeric_frame([0.03, -0.02, 0.08, 0.3, 0.2, -0.5])
+    y = T[:, :3, 3] + NOISE * rng.normal(size=(len(q), 3))
+    if kind == "pose":
+        turns = quaternions(T[:, :3, :3])
+        y = np.hstack([y, turns])
+    counted = sign * (q - zero)
+    parameters = ro.robot.model_parameters(robot, (1.0, 0, 0, 0, 0, 0), {"": [0.0] * 6})
+    tool = ["tool_[xyz]"] if kind == "position" else ["tool_*"]
+    parameters = parameters.identify(["alpha?", "a?", "theta?", "d?", "base_*", *tool])
+    parameters = parameters.scaled({"base_mm": 10, "base_mrad": 10, "tool_mm": 10})
+    noise = NOISE if kind == "position" else [NOISE, 1e-3]
+    data, unseen = (rows(counted[part], y[part], noise, kind) for part in (slice(COUNT), slice(COUNT, None)))
+    problem = ro.CalibrationProblem(robot, parameters, data)
+    truth = mapped(robot, sign, zero)
+    nominal = parameters.nominal.copy()
+    nominal[: 5 * robot.dof] = truth.mdh.ravel()
+    return problem, unseen, replace(problem, robots=truth, parameters=replace(parameters, nominal=nominal))
+
+
+def quaternions(R: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
+
+
+def rows(q: np.ndarray, y: np.ndarray, noise, kind: str) -> ro.Dataset:
+    if kind == "position":
+        return ro.Dataset.of(q, y, noise)
+    sigma = np.repeat(noise, 3)
+    return ro.Dataset.of(q, y, np.diag(sigma**2), measurement=pose)
+
+
+def error(result: ro.Calibration, unseen: ro.Dataset) -> float:
+    return float(np.sqrt(np.mean(result.errors(unseen) ** 2)))
+
+
+@pytest.mark.parametrize("name", ["hobby", "ur5e", "scara"])
+def test_random_signs_and_zeros_are_found(name: str) -> None:
+    problem, unseen, truth = simulated(name, 3)
+    result = ro.calibrate(problem)
+    assert result.converged
+    assert result.mapping is not None
+    assert "Joint mapping found from the data: " in result.message
+    assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen)
+    assert np.abs(np.degrees(result.x[["theta" in n for n in result.problem.parameters.free.names]])).max() < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hobby", "ur5e", "kr6_r900", "panda", "scara"])
+@pytest.mark.parametrize("seed", range(10))
+def test_many_random_signs_and_zeros_are_found(name: str, seed: int) -> None:
+    problem, unseen, truth = simulated(name, seed)
+    result = ro.calibrate(problem)
+    assert result.mapping is not None
+    assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen) or result.mapping.alternatives
+
+
+def test_poses_show_signs_and_zeros() -> None:
+    problem, unseen, truth = simulated("ur5e", 2, kind="pose")
+    result = ro.calibrate(problem)
+    assert result.mapping is not None
+    assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen)
+
+
+def test_what_is_found_goes_into_the_mapping() -> None:
+    """One joint reversed and one a quarter turn off are said exactly, in the words of robot.toml."""
+    sign = np.array([1.0, 1, -1, 1, 1, 1])
+    zero = np.array([0.0, QUARTER, 0, 0, 0, 0])
+    problem, _, _ = simulated("ur5e", 1, sign, zero)
+    result = ro.calibrate(problem)
+    assert (result.problem.robot.joint_map == np.diag(sign)).all()
+    assert np.allclose(result.problem.robot.mdh[:, 2] - problem.robot.mdh[:, 2], zero)
+    assert "joint 3 reversed (sign = -1), zero of joint 2 +90.0 deg" in result.message
+
+
+def test_a_result_keeps_its_mapping(tmp_path) -> None:
+    problem, unseen, _ = simulated("scara", 4)
+    result = ro.calibrate(problem)
+    ro.store.save_result(result, tmp_path / "result.json")
+    again = ro.load_result(tmp_path / "result.json")
+    assert again.mapping.sentence == result.mapping.sentence
+    assert np.allclose(again.errors(unseen), result.errors(unseen))
+    assert again.without_flagged().mapping is not None
+
+
+def test_gross_errors_do_not_hide_it() -> None:
+    problem, unseen, truth = simulated("ur5e", 5)
+    (block,) = problem.data.blocks
+    y = block.y.copy()
+    y[[3, 11]] += [0.3, -0.2, 0.1]
+    wrong = problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
+    assert error(ro.calibrate(wrong), unseen) < 1.5 * error(ro.calibrate(truth), unseen)
+
+
+def test_robots_that_are_nominal_or_read_otherwise_are_not_mapped() -> None:
+    """Neither is a left-handed measured frame, which reversed joints would fit as well."""
+    problem, _, _ = simulated("ur5e", 6, np.ones(6), np.zeros(6))
+    assert ro.calibrate(problem).mapping is None
+    (block,) = problem.data.blocks
+    for y in (block.y * [1, -1, 1], block.y[::-1]):
+        wrong = problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
+        assert ro.calibrate(wrong).mapping is None
