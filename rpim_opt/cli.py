@@ -106,7 +106,8 @@ def new(
     key: Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")] = "",
     time_tolerance: Annotated[Number, Option(help="Join files by the nearest time, within so many s.")] = None,
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
-    rotation: Annotated[str, Option(help="vector, where rx, ry, rz are a rotation vector.")] = "",
+    rotation: Annotated[str, Option(help="What rx, ry, rz are: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
+    prefix: Annotated[str, Option(help="Of the robot's joints, if columns of several are there.")] = "",
     encoding: Annotated[str, Option(help="Of text files, if not found: utf-8, cp1252, utf-16.")] = "",
     separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
@@ -127,8 +128,8 @@ def new(
         from rpim_opt.store.raw import understand_tables
 
         options = console.table_options(
-            units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, encoding=encoding,
-            separator=separator, decimal=decimal, within=time_tolerance,
+            units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, prefix=prefix,
+            encoding=encoding, separator=separator, decimal=decimal, within=time_tolerance,
         )  # fmt: skip
         if dry_run:
             found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip)
@@ -472,16 +473,13 @@ def compensate(
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
         from rpim_opt.data.measurements.pose import pose
-        from rpim_opt.data.tables.layout import read_raw
-        from rpim_opt.data.tables.naming import rename
-        from rpim_opt.data.tables.units import parse_units
+        from rpim_opt.data.tables.understanding import understand
         from rpim_opt.use.compensation import compensate
         from rpim_opt.use.targets import read_targets
 
         robot = loaded.problem.robot
         try:
-            raw = read_raw(targets)
-            named = rename(raw.columns, robot, pose, parse_units(units), heads=raw.heads)
+            named = understand(targets, robot, pose, console.table_options(units, ""), targets=True)
             read = read_targets(named.columns, robot)
         except InputError as error:
             raise error.within(targets) from None

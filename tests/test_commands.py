@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
+from rpim_opt.basics.layout import RawTable, TableOptions
+from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.tables.naming import rename
-from rpim_opt.data.tables.units import parse_units
+from rpim_opt.data.tables.understanding import understand
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
@@ -247,7 +248,7 @@ def test_names_that_people_use() -> None:
         "reflector": "marker", "sigma_mm": "sigma_mm", "effort_1": "tau1_Nm",
     }  # fmt: skip
     source = {name: ["1"] for name in (*names, "temperature", "timestamp")}
-    found = rename(source, ARM, pose, parse_units("rad,mm,Nm"))
+    found = understand(RawTable(source), ARM, pose, TableOptions(units=parse_units("rad,mm,Nm")), targets=True)
     assert list(found.columns) == list(names.values())
     assert found.left_out == ("temperature", "timestamp")
     assert [each.name for each in found.meant if each.name] == list(names.values())
@@ -255,11 +256,19 @@ def test_names_that_people_use() -> None:
 
 
 def test_joints_may_count_from_zero_or_have_the_files_names() -> None:
-    zero = rename({f"q{i}": ["1"] for i in range(6)}, ARM, position, parse_units("deg"))
+    zero = understand(
+        RawTable({f"q{i}": ["1"] for i in range(6)}), ARM, position, TableOptions(units=parse_units("deg"))
+    )
     assert list(zero.columns) == [f"q{i}_deg" for i in range(1, 7)]
     assert (zero.meant[0].column, zero.meant[0].name) == ("q0", "q1_deg")
     joints = ["pan", "lift", "elbow", "w1", "w2", "w3"]
-    named = rename({name: ["1"] for name in reversed(joints)}, ARM, position, parse_units("rad"), joints)
+    named = understand(
+        RawTable({name: ["1"] for name in reversed(joints)}),
+        ARM,
+        position,
+        TableOptions(units=parse_units("rad")),
+        joints,
+    )
     assert list(named.columns) == [f"q{i}_rad" for i in range(6, 0, -1)]
 
 

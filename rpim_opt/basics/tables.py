@@ -44,6 +44,18 @@ LONGEST = 2**16
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
+THOUSANDS = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))")
+"""Signs between thousands that are no decimal marks."""
+OPEN = re.compile(r"[\[({][\s\d.+\-\[({]")
+"""How a cell of several numbers begins."""
+ONE_READ = 2**20
+ZEROS = bytes(8)
+"""No text has so many zeros in a row, in whatever encoding."""
+BRACKETS = frozenset("[({")
+ROW_OF_NUMBERS = 1 / 3
+"""Part of a row's cells that are numbers, from which on it tells what separates them."""
+BLANKS_CLEARLY = 1.5
+"""Blanks separate cells where they part so many times more numbers than any sign does: a label may hold some."""
 FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")
 """What a spreadsheet computes, be it behind apostrophes that keep it from that."""
 BYTE_ORDER_MARKS = (  # that of UTF-32 begins as UTF-16's does
@@ -56,11 +68,15 @@ Columns = Mapping[str, Sequence[Any]]
 
 @dataclass(frozen=True)
 class Grid:
-    """The rows of a file: texts of those that are not blank, their line in the file (from 1), how it was read."""
+    """The rows of a file: texts of those that are not blank, their line in the file (from 1), how it was read.
+
+    ``blanks`` tells that blanks separate the cells, so that no cell can be empty.
+    """
 
     rows: list[list[str]]
     lines: list[int]
     notes: tuple[str, ...] = ()
+    blanks: bool = False
 
 
 # --- what has the shape that problem folders have ------------------------------------------------------------------
@@ -209,7 +225,18 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     return _text(path, encoding, separator)
 
 
-def _text(path: Path, encoding: str, separator: str) -> Grid:
+def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
+    """Return the text of a file, whatever ends its lines, and a sentence on its encoding unless that is UTF-8.
+
+    Raises
+    ------
+    InputError
+        For another encoding than the stated one, and a file with zeros, which may be no longer than its hole.
+    """
+    with path.open("rb") as stream:  # before it is in memory
+        while block := stream.read(ONE_READ):
+            if ZEROS in block:
+                raise InputError("the text", "bytes that are zero", "a text file, not a binary one")
     data = read_bytes(path, LARGEST_DATA)
     name, why = (encoding, "as stated") if encoding else _encoding(data)
     try:
@@ -219,14 +246,20 @@ def _text(path: Path, encoding: str, separator: str) -> Grid:
     if "\x00" in text:
         raise InputError("the text", "bytes that are zero", "a text file, not a binary one")
     text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
+    return text, () if name == "utf-8" else (f"read as {name}: {why}.",)
+
+
+def _text(path: Path, encoding: str, separator: str) -> Grid:
+    whole, said = decoded(path, encoding)
+    text = THOUSANDS.sub("", whole)
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
-    notes = [f"read as {name}: {why}."] if name != "utf-8" else []
+    notes = list(said)
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
         notes.append(f"cells are separated by {spelled}: {'as stated' if separator else 'it parts most numbers'}.")
-    return Grid(*_split(text, mark), tuple(notes))
+    return Grid(*_split(text, mark), tuple(notes), mark == " ")
 
 
 def _encoding(data: bytes) -> tuple[str, str]:
@@ -256,18 +289,38 @@ def is_numeral(cell: str) -> bool:
 
 
 def _separator(text: str) -> str:
-    """Return the separator that parts most numbers; a comma where none does."""
+    """Return the separator that parts most numbers in rows of numbers; a comma where none does."""
     lines = (line for line in io.StringIO(text[: SAMPLE * LONGEST]) if line.strip())
     sample = "".join(islice(lines, SAMPLE))[:LONGEST]
-    best, most = ",", (0, 0)
-    for mark in SEPARATORS.values():
-        rows = _split(sample, mark, strict=False)[0]
-        count = (sum(is_numeral(cell) for row in rows for cell in row), 0)
-        if not count[0] and mark != " ":  # a header so wide that no row is seen
-            count = (0, sum(map(len, rows)))
-        if count > most:
-            best, most = mark, count
+    rows = {mark: _split(sample, mark, strict=False)[0] for mark in SEPARATORS.values()}
+    parted = {mark: sum(map(_parted, split)) for mark, split in rows.items()}
+    blanks = parted.pop(" ")
+    best = max(parted, key=lambda mark: parted[mark])
+    if blanks > BLANKS_CLEARLY * parted[best]:
+        return " "
+    if not parted[best]:  # a header so wide that no row is seen
+        best = max(parted, key=lambda mark: sum(map(len, rows[mark])))
     return best
+
+
+def _parted(row: Sequence[str]) -> int:
+    """Return how many numbers a row of numbers has; those of a cell that lists several count, too."""
+    numbers = [len(list_of_numbers(cell)) or is_numeral(cell) for cell in row if cell]
+    return sum(numbers) if sum(numbers) >= ROW_OF_NUMBERS * len(numbers) else 0
+
+
+def list_of_numbers(cell: str) -> list[str]:
+    """Return the numbers of a cell that lists several, in brackets; none for any other cell.
+
+    >>> from rpim_opt.basics.tables import list_of_numbers
+    >>> list_of_numbers("[1.5, 2, -3e-2]"), list_of_numbers("((1 2) (3 4))"), list_of_numbers("1.5")
+    (['1.5', '2', '-3e-2'], ['1', '2', '3', '4'], [])
+    """
+    if not OPEN.match(cell) or cell[-1] not in "])}":
+        return []
+    parts = re.split(r"[\s\[\](){};]+" if ";" in cell else r"[\s\[\](){},]+", cell)  # else commas are decimal marks
+    numbers = [part for part in parts if part]
+    return numbers if len(numbers) > 1 and all(map(is_numeral, numbers)) else []
 
 
 def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], list[int]]:
@@ -277,9 +330,12 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, strict=strict, skipinitialspace=True)
     spaced = enumerate(map(_words, text.split("\n")), start=1)
     numbered = spaced if mark == " " else ((reader.line_num, row) for row in reader)
+    brackets = any(sign in text for sign in "[({")
     try:
         for number, cells in numbered:
             row = [cell.strip() for cell in cells]
+            if brackets:
+                row = _closed(row, mark)
             if strict and len(row) > WIDEST and any(row):
                 raise InputError("the table", f"a row of {len(row)} cells", f"at most {WIDEST} columns")
             if any(row):
@@ -291,10 +347,26 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
     return kept, lines
 
 
+def _closed(row: list[str], mark: str) -> list[str]:
+    """Return a row in which numbers between brackets are one cell, whatever stands between them."""
+    if not any(cell[:1] in BRACKETS and OPEN.match(cell) for cell in row):
+        return row
+    whole: list[str] = []
+    depth = 0
+    for cell in row:
+        if depth > 0:
+            whole[-1] += mark + cell
+        else:
+            whole.append(cell)
+        if depth > 0 or OPEN.match(cell):
+            depth += sum(map(cell.count, "[({")) - sum(map(cell.count, "])}"))
+    return whole if depth == 0 else row
+
+
 def _words(line: str) -> list[str]:
     """Return the words of a line; a header's names may hold single spaces where wider gaps part them."""
     words = line.split()
-    if any(map(is_numeral, words)):
+    if sum(map(is_numeral, words)) > ROW_OF_NUMBERS * len(words):
         return words
     wide = re.split(r"\s{2,}", line.strip())
     return wide if len(wide) > 2 else words

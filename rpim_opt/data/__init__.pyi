@@ -11,5 +11,5 @@ from .noise import LaserTracker as LaserTracker
 from .record import HeldOut as HeldOut
 from .record import Record as Record
 from .record import Requirement as Requirement
-from .tables.layout import TableOptions as TableOptions
+from .tables.formats.registry import TableOptions as TableOptions
 from .tables.reading import read_data as read_data

@@ -16,8 +16,8 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
+    from rpim_opt.basics.layout import TableOptions
     from rpim_opt.data.record import Requirement
-    from rpim_opt.data.tables.layout import TableOptions
 
 # --- output ------------------------------------------------------------------------------------------------
 
@@ -190,8 +190,8 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
 
 def table_options(units: str, columns: str, **stated: Any) -> TableOptions:
     """Return what the options of a command state of its raw tables."""
-    from rpim_opt.data.tables.layout import TableOptions
-    from rpim_opt.data.tables.units import parse_units
+    from rpim_opt.basics.layout import TableOptions
+    from rpim_opt.basics.units import parse_units
 
     names = tuple(name.strip() for name in columns.split(",")) if columns else ()
     return TableOptions(columns=names, units=parse_units(units), **stated)

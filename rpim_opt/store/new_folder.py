@@ -14,14 +14,13 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import make_folder, read_text, scratch_folder, undoing, write_text
+from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
-from rpim_opt.basics.units import UNITS
+from rpim_opt.basics.units import UNITS, parse_units
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, Words, of_fixture
-from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.units import parse_units
 from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.layout import RawTable, TableOptions, read_raw
 from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
@@ -24,9 +26,17 @@ from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_source, read_arm
 
-Files = Sequence[tuple[Path, RawTable]]
 CLEARLY = 3.0
-"""The right order of a quaternion leaves so many times less than the other one."""
+"""The right reading of orientations leaves so many times less than another one."""
+USUAL = "extrinsic xyz"
+GUESSED = (pose, position)
+"""What columns are taken for, the first that they have all values of."""
+READINGS = {
+    "quaternion": ORDERS,
+    "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
+                 "intrinsic zxy"),
+}  # fmt: skip
+"""What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,23 +191,32 @@ def understand_of(
     options = options or TableOptions()
     paths = [Path(each) for each in data]
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
-    files = [(path, read_raw(path, options)) for path in paths]
+    files = [read_raw(path, options) for path in paths]
     if known is None:
-        columns = [table.columns for _, table in files]
+        columns = [table.columns for table in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-    kind = known or pose
-    tables = _understood(files, arm, kind, options)
-    if known is None:
-        kind = _kind_of_names(tables, paths[0])
-        if kind is not pose:
-            tables = _understood(files, arm, kind, options)
-    if kind is pose and any(each.numbered for each in tables):
-        return _ordered(files, arm, options)
-    return _whole(paths, arm, kind, options, tables)
+    for kind in [known] if known else GUESSED:
+        tables = [_understood(path, file, arm, kind, options) for path, file in zip(paths, files, strict=True)]
+        if known or _has_values(tables, kind):
+            found = _whole(paths, arm, kind, options, tables)
+            doubt = next((each.doubt for each in tables if each.doubt), "")
+            return _checked(found, files, arm, doubt) if doubt and kind.turning else found
+    names = ", ".join(name for table in files for name in table.columns)
+    accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
+    raise InputError("the header", f"no positions among {names}", accepted, paths[0])
 
 
-def _understood(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> tuple[Understood, ...]:
-    return tuple(understand(path, arm.robot, kind, options, arm.names, table) for path, table in files)
+def _understood(path: Path, file: RawTable, arm: Described, kind: Measurement, options: TableOptions) -> Understood:
+    try:
+        return replace(understand(file, arm.robot, kind, options, arm.names), file=path.name)
+    except InputError as error:
+        raise error.within(path) from None
+
+
+def _has_values(tables: Sequence[Understood], kind: Measurement) -> bool:
+    """Return whether tables state the values of a type in one of its forms."""
+    stems = {stem for each in tables for stem in each.stems}
+    return any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms)))
 
 
 def _whole(
@@ -210,35 +229,35 @@ def _whole(
     return Understanding(kind, whole.columns, tuple(tables), whole.notes, options, str(paths[0]))
 
 
-def _kind_of_names(tables: Sequence[Understood], path: Path) -> Measurement:
-    """Return poses where the tables have orientations, else positions."""
-    stems = {stem for each in tables for stem in each.stems}
-    if not stems & {"x", "y", "z"}:
-        names = ", ".join(name for each in tables for name in each.raw)
-        accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
-        raise InputError("the header", f"no positions among {names}", accepted, path)
-    forms = [set(pose.columns), *(set(form) for form, _ in pose.forms)]
-    return pose if any(form <= stems for form in forms) else position
+def _checked(first: Understanding, files: Sequence[RawTable], arm: Described, doubt: str) -> Understanding:
+    """Return poses read as they fit the nominal robot, and say both figures: the order of a quaternion is found.
 
-
-def _ordered(files: Files, arm: Described, options: TableOptions) -> Understanding:
-    """Return poses with a quaternion in the order that fits the nominal robot, and say both figures."""
-    paths = [path for path, _ in files]
+    Turns that fit clearly better in another convention than roll, pitch, yaw are asked for.
+    """
+    paths = [Path(first.file).with_name(each.file) for each in first.tables]
     found: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
-    for order in ORDERS:
-        stated = replace(options, quaternion=order)
-        found[order] = _whole(paths, arm, pose, stated, _understood(files, arm, pose, stated))
-        data = read_data(found[order].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, pose)
-        misfit[order] = float(np.degrees(pose_misfit(arm.robot, data)))
-    best, other = sorted(ORDERS, key=lambda order: misfit[order])
-    if not misfit[other] > CLEARLY * misfit[best]:
-        figures = ", ".join(f"{order} {misfit[order]:.2f} deg" for order in ORDERS)
+    for reading in READINGS[doubt]:
+        options = replace(first.options, **{doubt: reading})
+        tables = [_understood(path, file, arm, first.kind, options) for path, file in zip(paths, files, strict=True)]
+        found[reading] = replace(_whole(paths, arm, first.kind, options, tables), file=first.file)
+        data = read_data(found[reading].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, first.kind)
+        misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
+    best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
+    clear = misfit[second] > CLEARLY * misfit[best]
+    figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))
+    if doubt == "rotation":
+        if misfit[USUAL] <= CLEARLY * misfit[best]:
+            return first
+        accepted = f"--rotation '{best}' if that is what they are, or '{USUAL}'"
+        found_ = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
+        raise InputError("rx, ry, rz", found_, accepted, first.file)
+    if not clear:
         raise InputError(
-            "the order of the quaternion", f"no clear one ({figures})", "--quaternion wxyz or xyzw", paths[0]
+            "the order of the quaternion", f"no clear one ({figures})", "--quaternion wxyz or xyzw", first.file
         )
     note = (
         f"the quaternion's order is {best}: on the nominal robot it leaves {misfit[best]:.2f} deg, "
-        f"{other} {misfit[other]:.1f} deg."
+        f"{second} {misfit[second]:.1f} deg."
     )
     return replace(found[best], notes=(*found[best].notes, note))

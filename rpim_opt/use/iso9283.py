@@ -13,10 +13,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
-from rpim_opt.basics.units import LARGEST, UNITS
-from rpim_opt.data.tables.layout import read_raw
+from rpim_opt.basics.units import FOREIGN, LARGEST, UNITS, dimension_of, parse_units, split
+from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import recognize
-from rpim_opt.data.tables.units import FOREIGN, dimension_of, parse_units, split
 
 CYCLES, POSES = 30, 5
 """How often the standard has how many poses approached."""

@@ -11,9 +11,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
+from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import Columns, csv_text, read_columns
 from rpim_opt.basics.text import listed, table
-from rpim_opt.basics.units import UNITS, accepted_units
+from rpim_opt.basics.units import UNITS, accepted_units, parse_units
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.held_out_rows import judged
 from rpim_opt.calibration.ranges import Outside
@@ -23,11 +24,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.layout import TableOptions
-from rpim_opt.data.tables.naming import rename
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import understand
-from rpim_opt.data.tables.units import parse_units
 from rpim_opt.robot.mdh import Robot
 
 
@@ -193,7 +191,7 @@ def validate(result: Calibration, data: Dataset) -> Validation:
 def read_measurements(
     result: Calibration, source: Any, measurement: str | None = None, units: str = ""
 ) -> tuple[Dataset, tuple[str, ...]]:
-    """Return the measurements of a table, whose columns `naming.rename` recognises, and columns that were left out.
+    """Return the measurements of a table, whose columns `understand` recognises, and columns that were left out.
 
     Rows that state no uncertainty have that of the calibration's data.
 
@@ -262,14 +260,12 @@ def _columns(
     """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
     if isinstance(source, str | Path):
         found = understand(Path(source), robot, kind, TableOptions(units=units))
-        if found.numbered and "qw" in kind.columns:
+        if found.doubt == "quaternion" and "qw" in kind.columns:
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-        columns, raw = found.columns, found.raw
-        left_out = tuple(each.column for each in found.meant if each.meaning == "left out")
     else:
-        raw = read_columns(source)
-        renamed = rename(raw, robot, kind, units)
-        columns, left_out = renamed.columns, renamed.left_out
+        columns = read_columns(source)
+        found = understand(RawTable(columns), robot, kind, TableOptions(units=units))
+    columns, raw, left_out = found.columns, found.raw, found.left_out
     if left_out and not columns:
         accepted = f"joints' values and {', '.join(kind.columns)}"
         raise InputError("the header", f"nothing that is known among {', '.join(left_out)}"[:200], accepted)

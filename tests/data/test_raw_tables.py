@@ -12,11 +12,11 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.tables import read_grid
+from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.understanding import Understood, understand
-from rpim_opt.data.tables.units import parse_units
 
 ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
 ROWS = "P1,1,2,401,5,6\nP2,3,4,402,6,7\n"

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 import rpim_opt as ro
+from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import csv_text, read_columns
+from rpim_opt.basics.units import parse_units
 from rpim_opt.convex.sentence import sentence
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.data.tables.layout import TableOptions
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.units import parse_units
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot

@@ -16,11 +16,10 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
-from rpim_opt.basics.units import LARGEST, split_unit
+from rpim_opt.basics.units import LARGEST, split, split_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement, Words
 from rpim_opt.data.tables.columns import quantities_of, require_unique
-from rpim_opt.data.tables.units import split
 
 INTRINSICS = {
     "fx": "pixel", "fy": "pixel", "cx": "pixel", "cy": "pixel",

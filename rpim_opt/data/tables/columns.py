@@ -144,7 +144,8 @@ def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
 
 def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:
     """Return the columns that state the measured values, and the function from them to y."""
-    for form, convert in kind.forms:
+    plain = all((stem, "") in columns for stem in kind.columns)
+    for form, convert in () if plain else kind.forms:
         if all((stem, "") in columns for stem in form):
             return list(form), convert
     return list(kind.columns), lambda y: y

@@ -16,7 +16,8 @@ Headers as they are exported, each read as it stands:
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 
@@ -46,16 +47,21 @@ class Dialect(NamedTuple):
     why: str
 
 
-_WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|coords?|coordinates?|cartesian|cart|tcp)_?)*"
+_WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
+_JOINT = "q|j|jt|joint|axis|a|theta|θ|rax|achse|gelenk|axe|eje|giunto|关节|轴|軸"
 _SPREAD = r"(?:std|stdev|stddev|std_?dev|sigma|sd)"
 NAMES = (
-    Name(r"(to_)?(?:q|j|jt|joint|axis|a|theta|rax|achse|gelenk|axe|eje)_?(\d+)(?:_?(?:pos|position|angle|value))?",
-         r"\1q\2"),
+    Name(rf"(to_)?(?:{_JOINT})_?(\d+)(?:_?(?:pos|position|angle|value))?", r"\1q\2"),
     Name(r"(?:joints?|axes|axis|achsen|gelenke)(?:_(?:angles?|positions?|values?|pos))?_(?:q|j|a|joint|axis)?_?(\d+)",
          r"q\1"),
     Name(r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
     Name(r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
-    Name(rf"{_WHERE}([xyz])(?:_?1)?", r"\1"),
+    Name(rf"{_WHERE}([xyz])(?:_?1|坐标)?", r"\1"),
+    Name(r"az(?:imuth|imut)?", "azimuth", "azimuth, counterclockwise from x about z"),
+    Name(r"hz|horizontal_?(?:angle|winkel)|hz_?(?:angle|winkel)", "hz", "horizontal angle, clockwise from x"),
+    Name(r"el(?:ev(?:ation)?)?(?:_angle)?", "elevation", "elevation above the horizontal plane"),
+    Name(r"v|zenith(?:_?(?:angle|distance))?|v_?(?:angle|winkel)|vertical_?(?:angle|winkel)|za", "zenith",
+         "angle from the vertical axis"),
     Name(r"(?:(?:field|pose|transform)_)*(?:q|quat|quaternion|orientation|rotation|rot)_?([wxyz])", r"q\1"),
     Name(r"roll", "rx"),
     Name(r"pitch", "ry"),
@@ -63,9 +69,9 @@ NAMES = (
     Name(r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
     Name(r"u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
     Name(rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
-    Name(r"distance|dist|cable|cable_length", "distance"),
+    Name(r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
     Name(r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
-         r"|punkt_?nr", "label"),
+         r"|punkt_?nr|feature|nom_du_point|punto|点名", "label"),
     Name(r"configuration|config|pose|pose_id", "configuration"),
     Name(r"marker|reflector|smr", "marker"),
     Name(r"temp(?:erature|eratur)?", "temperature"),
@@ -80,17 +86,23 @@ KINDS = {
     "derived": frozenset({"deviation", "dev", "delta", "diff", "difference", "error", "err", "residual", "velocity",
                           "vel", "speed", "acceleration"}),
     "wanted": frozenset({"nominal", "nom", "target", "soll", "theoretical", "programmed", "commanded", "command", "cmd",
-                         "desired", "setpoint", "reference", "ref"}),
-    "measured": frozenset({"measured", "meas", "measurement", "actual", "act", "ist", "tracker", "leica", "observed"}),
+                         "desired", "setpoint", "reference", "ref", "théorique", "nominale", "teorico", "理论"}),
+    "measured": frozenset({"measured", "meas", "measurement", "actual", "act", "ist", "tracker", "leica", "observed",
+                          "mesuré", "mesurée", "misurato", "misurata", "medido", "gemessen", "实测"}),
 }  # fmt: skip
 """Words of a name that say whether it was measured, wanted or computed from others."""
 TURNS = (
-    (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x"),
-    (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z"),
+    (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x", ""),
+    (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z", ""),
+    (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
 )
-"""Three letters that are angles where all of them are there."""
+"""Three letters that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
+MOTOMAN = "slurbt"
+"""Yaskawa's joints, from the base, where all of them are there."""
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
+MOST_PREFIXES = 6
+"""Words before a name that is known."""
 VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
 
@@ -104,16 +116,16 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     """Return what a name means, with why; without where it is not known.
 
     >>> from rpim_opt.data.tables.names import recognize
-    >>> [recognize(name).stem for name in ("Measured X", "Joint 3", "quat_w", "Std y")]
-    ['x', 'q3', 'qw', 'sigma_y']
+    >>> [recognize(name).stem for name in ("Measured X", "Joint 3", "quat_w", "Std y", "shoulder_pan_joint")]
+    ['x', 'q3', 'qw', 'sigma_y', 'q1']
     """
     path = [part for part in re.split(r"[/.]", stem.strip().strip("%")) if part]
-    plain = re.sub(r"[\s.\-/:\[\]()]+", "_", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower())).strip("_% ")
+    plain = re.sub(r"[\s.\-/:\[\]()$]+", "_", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower())).strip("_% ")
     words = plain.split("_")
     kind = next((name for name, signs in KINDS.items() if len(words) > 1 and signs & set(words)), "")
     rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)
     number, why = _joint_in(path, joints)
-    if number and path[-1] in VALUE | {"effort"}:
+    if number:
         return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
     for each in NAMES:
         match = re.fullmatch(each.pattern, rest)
@@ -127,9 +139,22 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     return Reading(plain, "", "", kind)
 
 
+def endings(stem: str) -> Iterator[tuple[str, str]]:
+    """Yield what may stand before a known name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``.
+
+    >>> from rpim_opt.data.tables.names import endings
+    >>> list(endings("robot1_joint_2"))
+    [('robot1_', 'joint_2'), ('robot1_joint_', '2')]
+    """
+    for match in islice(re.finditer(r"[\s._/:\-]+", stem), MOST_PREFIXES):
+        yield stem[: match.end()], stem[match.end() :]
+
+
 def _joint_in(path: Sequence[str], joints: Sequence[str]) -> tuple[int, str]:
     """Return the number of the joint that a path names, and whose name it is; 0 where it names none."""
-    for part in path[:-1]:
+    if len(path) > 1 and path[-1] not in VALUE | {"effort"}:
+        return 0, ""
+    for part in path[: max(len(path) - 1, 1)]:
         if part in joints:
             return joints.index(part) + 1, "a joint of the robot's file"
         number = ur_joint(part)

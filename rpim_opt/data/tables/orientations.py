@@ -19,6 +19,7 @@ MATRIX = re.compile(r"(?:m|t|h|r|mat|matrix|tf|pose)[_ \[(]*([0-4])[_ ,\]\[]*([0
 ENTRIES = re.compile(r"(?:m|t|h|mat|matrix|tf|pose)[_ \[]*(\d{1,2})\]?")
 SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 """Rows and columns of a matrix by its number of entries."""
+EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
 ROUNDED = 1e-6
 """The last row of a matrix is 0 0 0 1 within this."""
 Place = tuple[int, int]
@@ -31,6 +32,10 @@ def numbered(read: dict[str, Reading], table: Columns, dof: int, order: str) -> 
     for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
         why = f"component {i} of a quaternion, order {order}"
         read = {**read, name: read[name]._replace(stem=f"q{letter}", why=why)}
+    stems = {found.stem for found in read.values()}
+    if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
+        first = {name: each for name, each in read.items() if re.fullmatch(r"q_?0", name.strip().lower())}
+        read = {**read, **{name: each._replace(stem="qw", why="beside qx, qy, qz") for name, each in first.items()}}
     return {**read, **_matrix(read, table)}
 
 
@@ -111,8 +116,27 @@ def _numbers(table: Columns, name: str) -> np.ndarray:
     return numbers(table[name], [str(i) for i in range(1, len(table[name]) + 1)], name)
 
 
-def from_vectors(table: Columns, names: Sequence[str], si: float) -> dict[str, list[str]]:
-    """Return the quaternions ``qw, qx, qy, qz`` of rotation vectors in three columns, whose unit is si [rad]."""
-    vectors = np.column_stack([_numbers(table, name) for name in names])
-    xyzw = scipy.spatial.transform.Rotation.from_rotvec(si * vectors).as_quat()
-    return {f"q{letter}": [repr(float(v)) for v in xyzw[:, "xyzw".index(letter)]] for letter in "wxyz"}
+def require_rotation(stated: str) -> None:
+    """Refuse a rotation that is neither a vector nor three turns about axes that stand still or turn with it."""
+    if stated not in ("", "vector") and not EULER.fullmatch(stated):
+        accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
+        raise InputError("--rotation", f"'{stated}'", accepted)
+
+
+def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:
+    """Return ``qw, qx, qy, qz`` of columns rx, ry, rz (N, 3) [rad], which are a rotation vector or three turns.
+
+    Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
+    first, second and third turn. Rows that are not finite have no quaternion.
+    """
+    kept = np.isfinite(angles).all(axis=1)
+    rotations = scipy.spatial.transform.Rotation
+    if rotation == "vector":
+        found = rotations.from_rotvec(angles[kept])
+    else:
+        how, order = rotation.split()
+        places = ["xyz".index(axis) for axis in order] if len(set(order)) == 3 else [0, 1, 2]
+        found = rotations.from_euler(order.upper() if how == "intrinsic" else order, angles[kept][:, places])
+    cells = np.full((len(angles), 4), "", dtype=object)
+    cells[kept] = [list(map(repr, row)) for row in found.as_quat().tolist()]
+    return {f"q{part}": list(cells[:, "xyzw".index(part)]) for part in "wxyz"}

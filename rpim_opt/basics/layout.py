@@ -5,20 +5,22 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.tables import Columns, Grid, is_numeral, read_columns, read_grid
+from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.text import listed
-from rpim_opt.data.tables.units import UNIT_SIGNS
+from rpim_opt.basics.units import UNIT_SIGNS, split
 
 FULL = 0.6
 """A row belongs to the data if it has this part of the numbers of the fullest row."""
 MOSTLY = 0.8
 """A column is one of numbers if this part of its cells are."""
-LINES_OF_HEADER = 4
+LINES_OF_HEADER = 6
+ALONE = "\0"
+"""In a header's line: a cell that belongs to no group."""
 MOST_NAMED = 5
 """Lines that are left out and named one by one."""
 SUMMARIES = frozenset({
@@ -28,10 +30,14 @@ SUMMARIES = frozenset({
 """What a row begins with that is no measurement."""
 COMMENT = ("//", "#", "%", "!", "*")
 """What a line begins with that other programs skip."""
-MISSING = frozenset({"", "-", "--", "n/a", "na", "nan", "none", "null", "#n/a"})
+MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
+BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
+"""A name with its number and unit, in a header whose names and cells are separated by single blanks."""
 GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:[.,]\d{3})+")
 """What may be a whole number with its thousands apart, or one with three decimals."""
+VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
+"""What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 
@@ -49,11 +55,14 @@ class TableOptions:
     columns
         The columns' names, instead of a header; a column called ``-`` is left out.
     units
-        Of columns whose name carries none, by dimension.
+        Of columns whose name carries none, by dimension or by the columns' stem (`parse_units`).
     quaternion
         Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
     rotation
-        ``"vector"`` where rx, ry, rz are a rotation vector (Universal Robots), else roll, pitch, yaw.
+        What rx, ry, rz are: ``"vector"`` (Universal Robots), or turns about axes that stand still or turn with the
+        body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
+    prefix
+        Of the names of the joints, where columns of several robots are there.
     key
         The column by which several files are joined; ``"row"`` for the number of the row.
     within
@@ -75,6 +84,7 @@ class TableOptions:
     units: Mapping[str, str] = field(default_factory=dict)
     quaternion: str = ""
     rotation: str = ""
+    prefix: str = ""
     key: str = ""
     within: float | None = None
 
@@ -111,8 +121,11 @@ class RawTable:
     notes: tuple[str, ...] = ()
 
 
-def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
-    r"""Return the table of a file as people have them: text of any kind, Excel, Parquet.
+def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
+    r"""Return the table of a file as people have them: text of any kind, Excel, Parquet; or of columns of texts.
+
+    A column whose cells list several numbers, ``[1.5, 2, 3]``, becomes a column each; rows that hold one coordinate
+    each, ``P1, X, 1.5``, become one.
 
     Raises
     ------
@@ -122,18 +135,22 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     Examples
     --------
     >>> from pathlib import Path
-    >>> from rpim_opt.data.tables.layout import read_raw
+    >>> from rpim_opt.basics.layout import read_table
     >>> text = "Cell 7;;;\nJoints;;Position;\nJ1;J2;X;Y\n[deg];[deg];[mm];[mm]\n1,5;2;3;4\n"
     >>> _ = Path("raw.csv").write_text(text)
-    >>> raw = read_raw(Path("raw.csv"))
+    >>> raw = read_table(Path("raw.csv"))
     >>> list(raw.columns), raw.columns["Joints J1 [deg]"]
     (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
     options = options or TableOptions()
     try:
-        if path.suffix.lower() == ".parquet":
-            return RawTable(read_columns(path))
-        return _table(read_grid(path, options.sheet, options.encoding, options.separator), options)
+        if columns is None and path.suffix.lower() == ".parquet":
+            columns = read_columns(path)
+        if columns is not None:
+            raw = RawTable(columns, {name: Head(name) for name in columns})
+        else:
+            raw = _table(read_grid(path, options.sheet, options.encoding, options.separator), options)
+        return _one_row_each(_one_number_each(raw))
     except InputError as error:
         raise error.within(path) from None
 
@@ -143,7 +160,7 @@ def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
     if not names:  # nor columns, perhaps
         return []
     rows = zip(*(columns[name] for name in names), strict=True)
-    return [i for i, row in enumerate(rows) if all(_is_missing(str(cell)) for cell in row)]
+    return [i for i, row in enumerate(rows) if all(is_missing(str(cell)) for cell in row)]
 
 
 def _table(grid: Grid, options: TableOptions) -> RawTable:
@@ -173,24 +190,28 @@ def _first(row: Sequence[str]) -> str:
     return next(cell for cell in row if cell)
 
 
-def _is_missing(cell: str) -> bool:
-    return cell.strip().lower() in MISSING
+def is_missing(cell: str) -> bool:
+    """Return whether a cell says that there is no value."""
+    return MISSING.fullmatch(cell.strip()) is not None
 
 
 def _count(row: Sequence[str]) -> int:
     """Return how many cells of a row are numbers, or say that there is none where one could be."""
-    numbers = sum(is_numeral(cell) or _unit_of([cell]) != "" for cell in row)
-    return numbers and numbers + sum(cell != "" and _is_missing(cell) for cell in row)
+    numbers = sum(is_numeral(cell) or len(list_of_numbers(cell)) or _unit_of([cell]) != "" for cell in row)
+    return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
 # --- header --------------------------------------------------------------------------------------------------------
 
 
 def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> list[int]:
-    """Return the rows of numbers without a header that numbers its joints, 1 2 3 4 5 6 X Y Z."""
+    """Return the rows of numbers without those of the header: joints 1 2 3 4 5 6 X Y Z, numbers above more names."""
     while len(full) > 1:
         pairs = zip(rows[full[0]], rows[full[1]], strict=False)
-        if sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs) < 2:
+        names = rows[full[0] + 1 : full[1]]
+        bare = not rows[full[0]][0] and rows[full[1]][0] != ""  # numbers above, without what rows begin with
+        named = bare and any(not _count(row) for row in names)
+        if not named and sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs) < 2:
             break
         full = full[1:]
     return full
@@ -199,7 +220,7 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
 def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list[Head], list[int]]:
     """Return what stands above every column, and the numbers of the rows of the header."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
-    above = _header_rows(grid.rows, full[0], width)
+    above = _header_rows(grid, full[0], width)
     if options.columns:
         return [Head(name) for name in options.columns], above
     if not above:
@@ -209,24 +230,34 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     header = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, header))
     lines = [[*row, *[""] * (width - len(row))] for row in header]
+    if grid.blanks and _is_units(header[-1]):  # the label has none, and a blank cell cannot be seen
+        lines[-1] = [*[""] * (width - len(header[-1])), *header[-1]]
     units = [""] * width
     if len(lines) > 1 and _is_units(lines[-1]):
         units = [cell.strip("[]()") for cell in lines.pop()]
     names = lines.pop()
+    for i, name in enumerate(names):  # one that is merged downwards stands higher up
+        higher = [line for line in lines if line[i]]
+        if not name and higher and any(line[i + 1 : i + 2] != [""] for line in higher):
+            names[i] = higher[-1][i]
+            for line in lines:
+                line[i] = ALONE
     groups = [" ".join(filter(None, parts)) for parts in zip(*map(_unmerged, lines), strict=True)] or [""] * width
     units = ["" if unit in ("-", "1") else unit for unit in units]
     return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
 
 
-def _header_rows(rows: Sequence[Sequence[str]], first: int, width: int) -> list[int]:
-    """Return the rows of text directly above the data that are as wide as these."""
+def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
+    """Return the rows of text directly above the data that are as wide as these, without a blank line among them."""
     found: list[int] = []
     for i in reversed(range(max(first - LINES_OF_HEADER, 0), first)):
-        row = _uncommented(rows[i], width)
+        row = _uncommented(grid.rows[i], width)
         filled = [place for place, cell in enumerate(row, start=1) if cell]
+        if found and grid.lines[i + 1] - grid.lines[i] > 1:
+            break
         if not any(map(str.isalpha, "".join(row))):
             continue  # a line of dashes
-        wide = len(filled) >= width / 2 or (len(filled) > 1 and filled[-1] > width / 2)
+        wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
         if not wide or len(row) > width + 1:
             break
         found.insert(0, i)
@@ -234,8 +265,11 @@ def _header_rows(rows: Sequence[Sequence[str]], first: int, width: int) -> list[
 
 
 def _uncommented(row: Sequence[str], width: int) -> list[str]:
-    """Return a row without the sign that makes it a comment."""
+    """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks."""
     cells = list(row)
+    if len(cells) > width:
+        named = BLANK_NAME.findall(" ".join(cells))
+        cells = named if len(named) == width else cells
     for sign in COMMENT:
         if cells and cells[0].startswith(sign):
             cells[0] = cells[0].removeprefix(sign).strip()
@@ -252,8 +286,10 @@ def _is_units(row: Sequence[str]) -> bool:
 def _unmerged(line: Sequence[str]) -> list[str]:
     """Return a line in which merged cells have the text of their first."""
     cells: list[str] = []
+    last = ""
     for cell in line:
-        cells.append(cell or (cells[-1] if cells else ""))
+        last = "" if cell == ALONE else cell or last
+        cells.append(last)
     return cells
 
 
@@ -329,7 +365,7 @@ def _plain(columns: dict[str, list[str]], decimal: str) -> tuple[dict[str, list[
 
 def _is_numeric(cells: Sequence[str]) -> bool:
     numbers = sum(map(is_numeral, cells))
-    return numbers > 0 and numbers >= MOSTLY * sum(not _is_missing(cell) for cell in cells)
+    return numbers > 0 and numbers >= MOSTLY * sum(not is_missing(cell) for cell in cells)
 
 
 def _decimal_mark(cells: Iterable[str], stated: str) -> str:
@@ -379,9 +415,88 @@ def _as_python(cell: str, mark: str) -> str:
     return cell.replace("," if mark == "." else ".", "").replace(mark, ".")
 
 
+def _one_number_each(raw: RawTable) -> RawTable:
+    """Return a table whose cells that list numbers are columns of one number each."""
+    columns: dict[str, Sequence[Any]] = {}
+    heads: dict[str, Head] = {}
+    for name, cells in raw.columns.items():
+        lists = [list_of_numbers(cell) for cell in cells if isinstance(cell, str) and not is_missing(cell)]
+        counts = set(map(len, lists))
+        if len(counts) != 1 or counts == {0}:
+            columns[name] = cells
+            heads[name] = raw.heads[name]
+            continue
+        stem, unit = split(name)
+        for i, part in enumerate(_parts(stem, counts.pop())):
+            head = Head(part, stem if part in "xyz" else "", unit if part in "xyz" or part[:5] == "joint" else "")
+            heads[str(head)] = head
+            columns[str(head)] = [(list_of_numbers(str(cell)) or [""] * (i + 1))[i] for cell in cells]
+    return replace(raw, columns=columns, heads=heads)
+
+
+def _parts(stem: str, count: int) -> Sequence[str]:
+    """Return what the numbers are called of which a column lists so many."""
+    turns = re.search(r"rot|orient|rpy|euler|quat", stem, re.IGNORECASE)
+    if count == 3 and not re.search(r"joint|axes|angle", stem, re.IGNORECASE):
+        return ("rx", "ry", "rz") if turns else "xyz"
+    if count == 4 and turns:
+        return [f"quat_{i}" for i in range(4)]
+    if count in (9, 12, 16):
+        return [f"m{i // (4 if count > 9 else 3)}{i % (4 if count > 9 else 3)}" for i in range(count)]
+    return [f"joint {i}" for i in range(1, count + 1)]
+
+
+def _one_row_each(raw: RawTable) -> RawTable:
+    """Return a table whose rows each had one coordinate of a point, ``P1, X, 1.5``, with a row a point."""
+    axis = next((name for name, cells in raw.columns.items() if {str(c).lower() for c in cells} == set("xyz")), "")
+    if not axis:
+        return raw
+    axes = [str(cell).lower() for cell in raw.columns[axis]]
+    others = {name: cells for name, cells in raw.columns.items() if name != axis}
+    keys = next((cells for cells in others.values() if _one_of_each(cells, axes)), None)
+    if keys is None:
+        raise InputError(
+            "the header", f"a row a coordinate ('{axis}')", "a column that names its point, all three once"
+        )
+    places: dict[str, dict[str, int]] = {}
+    for i, (key, letter) in enumerate(zip(keys, axes, strict=True)):
+        places.setdefault(key, {})[letter] = i
+    first = [min(place.values()) for place in places.values()]
+    same = [
+        name
+        for name, cells in others.items()
+        if all(cells[i] == cells[first[k]] for k, place in enumerate(places.values()) for i in place.values())
+    ]
+    values = [name for name in others if name not in same and _is_numeric(list(map(str, others[name])))]
+    measured = [name for name in values if VALUE.search(name)] or values
+    if len(measured) != 1:
+        found = f"a row a coordinate, with values {', '.join(measured) or 'nowhere'}"
+        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
+    columns: dict[str, Sequence[Any]] = {name: [others[name][i] for i in first] for name in same}
+    heads = {name: raw.heads[name] for name in same}
+    for letter in "xyz":
+        head = Head(letter, "", raw.heads[measured[0]].unit or split(measured[0])[1])
+        heads[str(head)] = head
+        columns[str(head)] = [
+            str(others[measured[0]][place[letter]]) if letter in place else "" for place in places.values()
+        ]
+    return replace(
+        raw,
+        columns=columns,
+        heads=heads,
+        notes=(*raw.notes, f"a row a coordinate: column '{measured[0]}' by '{axis}'."),
+    )
+
+
+def _one_of_each(keys: Sequence[Any], axes: Sequence[str]) -> bool:
+    """Return whether no key has an axis twice, and all but the last have all three."""
+    pairs = list(zip(map(str, keys), axes, strict=True))
+    return all(map(str.strip, map(str, keys))) and len(set(pairs)) == len(pairs) and len(pairs) > 2 * len(set(keys))
+
+
 def _unit_of(cells: Sequence[str]) -> str:
     """Return the unit that stands behind all numbers; nothing where it is not so."""
-    matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not _is_missing(cell)]
+    matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not is_missing(cell)]
     units = {match[2] if match else "" for match in matches}
     unit = units.pop() if len(units) == 1 else ""
     return unit if unit.lower() in UNIT_SIGNS else ""

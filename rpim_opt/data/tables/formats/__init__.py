@@ -1,0 +1,1 @@
+"""Table formats beside plain tables, one file each."""

@@ -1,0 +1,48 @@
+"""JSON: an object a line, an array of objects, or an object of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import parse_json
+from rpim_opt.data.tables.formats.registry import Rows, TableFormat
+
+
+def read(text: str) -> Rows:
+    """Return the rows; names of objects within objects are joined by points, ``measured.x_mm``."""
+    if text.lstrip().startswith("["):
+        found = parse_json(text)
+    else:
+        lines = [line for line in text.splitlines() if line.strip()]
+        whole = len(lines) > 1 and lines[0].rstrip().endswith("}")
+        found = [_parsed(line, i) for i, line in enumerate(lines, start=1)] if whole else parse_json(text)
+    if isinstance(found, dict) and all(isinstance(cells, list) for cells in found.values()):
+        if len(set(map(len, found.values()))) != 1:
+            raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
+        found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
+    elif isinstance(found, dict):
+        found = [found]
+    if not all(isinstance(row, dict) for row in found):
+        raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
+    return [dict(_flat("", row)) for row in found]
+
+
+def _parsed(line: str, number: int) -> Any:
+    try:
+        return parse_json(line)
+    except InputError as error:
+        raise InputError(f"line {number}", error.found, error.accepted) from None
+
+
+def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the values of an object with their names; lists of numbers stay together."""
+    if isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from _flat(f"{prefix}.{name}" if prefix else name, part)
+    elif value is not None:
+        yield prefix, value
+
+
+FORMATS = (TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),)

@@ -1,0 +1,84 @@
+"""The formats of tables that are no plain tables: those of every module in this folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, NamedTuple
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import LARGEST_DATA, require_file
+from rpim_opt.basics.layout import RawTable, TableOptions, read_table
+from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
+
+Rows = Sequence[Mapping[str, Any]]
+"""Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
+
+
+class TableFormat(NamedTuple):
+    """A format of tables: a module of this folder lists its own in ``FORMATS``.
+
+    ``endings`` are those of its files, ``shown_by(text)`` tells its texts from others with such an ending, and
+    ``read(text)`` returns the rows. What a program commands is called so, ``commanded x [mm]``: no measurement.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    shown_by: Callable[[str], bool]
+    read: Callable[[str], Rows]
+
+
+def formats() -> list[TableFormat]:
+    """Return the formats of all modules here.
+
+    >>> from rpim_opt.data.tables.formats.registry import formats
+    >>> sorted(each.name for each in formats())[:2]
+    ['FANUC program', 'JSON']
+    """
+    names = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
+    return [each for name in names for each in import_module(f"{__package__}.{name}").FORMATS]
+
+
+def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
+    """Return the table of a file of any format.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, and a table without header of which no columns are stated.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rpim_opt.data.tables.formats.registry import read_raw
+    >>> _ = Path("points.jsonl").write_text('{"id": "P1", "xyz": [1.5, 2, 3]}')
+    >>> list(read_raw(Path("points.jsonl")).columns)
+    ['id', 'xyz x', 'xyz y', 'xyz z']
+    """
+    ending = path.suffix.lower()
+    fitting = [each for each in formats() if ending in each.endings]
+    if not fitting:
+        known = {*TEXTS, *EXCEL, ".parquet"}
+        if ending not in known:
+            accepted = ", ".join(sorted(known.union(*(each.endings for each in formats()))))
+            raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
+        return read_table(path, options)
+    try:
+        require_file(path, LARGEST_DATA)
+        text, _ = decoded(path, options.encoding if options else "")
+        found = next((each for each in fitting if each.shown_by(text)), None)
+        if found is None and ending in TEXTS:
+            return read_table(path, options)
+        rows = found.read(text) if found else []
+        if found is None or not rows:
+            names = " or ".join(each.name for each in fitting)
+            raise InputError("the file", "neither targets nor rows", f"{names} with some")
+    except InputError as error:
+        raise error.within(path) from None
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
+    raw = read_table(path, options, columns)
+    return replace(raw, notes=(f"read as {found.name}.", *raw.notes))

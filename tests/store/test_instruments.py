@@ -1,0 +1,114 @@
+"""Files of instruments, controllers and drivers become the clean table's problem through the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.robot.formats.tables import write_robot
+from tests.simulate import ARM
+from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, krl
+from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, cells, text
+from tests.test_cli import run
+
+NOT_READ = {"ROS, rostopic echo as YAML", "MELFA joint variables"}
+"""Formats without a reader."""
+FILES = {**REFUSED_THOUGH_RIGHT, **{name: shape for name, shape in INSTRUMENTS.items() if name not in NOT_READ}}
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    write_robot(ARM, "robot.toml")
+    return tmp_path
+
+
+def new(patch: pytest.MonkeyPatch, *files: str, **options: str) -> int:
+    data = [part for file in files for part in ("--data", file)]
+    stated = [part for name, value in options.items() for part in (f"--{name}", value)]
+    return run(patch, "new", "cell", "--robot", "robot.toml", *data, *stated)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_as_it_is_exported_is_the_clean_table(monkeypatch, capsys, empty, name) -> None:
+    write, options, kind = FILES[name]
+    files = write(empty)
+    paths = [path.name for path in (files if isinstance(files, list) else [files])]
+    assert new(monkeypatch, *paths, **options) == 0, capsys.readouterr().err
+    (block,) = ro.load("cell").problem.data.blocks
+    labels = ro.load("cell").problem.data.label
+    order = [LABELS.index(label) for label in labels] if set(labels) <= set(LABELS) else list(range(len(Q)))
+    assert block.measurement.name == kind
+    assert len(order) == len(Q)
+    assert np.abs(np.degrees(block.q[:, 0]) - Q[order]).max() < 1e-6
+    assert np.abs(1e3 * block.y[:, :3] - P[order]).max() < 2e-4
+    if kind == "pose":
+        turned = Rotation.from_quat(block.y[:, [4, 5, 6, 3]]).as_matrix()
+        assert np.abs(turned - T[order][:, :3, :3]).max() < 1e-8
+
+
+@pytest.mark.parametrize("name", sorted(NOT_READ))
+def test_a_format_without_a_reader_is_one_sentence(monkeypatch, capsys, empty, name) -> None:
+    write, options, _ = INSTRUMENTS[name]
+    files = write(empty)
+    assert new(monkeypatch, *[path.name for path in (files if isinstance(files, list) else [files])], **options) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    assert "accepted:" in error
+
+
+def test_a_program_and_a_table_of_points_calibrate(monkeypatch, empty) -> None:
+    (empty / "calib.dat").write_text(krl())
+    (empty / "points.csv").write_text(text([["Point", *HEAD[7:]]], beside(NAMED, POINTS)))
+    assert new(monkeypatch, "calib.dat", "points.csv", **{"hold-out": "0.25"}) == 0
+    assert run(monkeypatch, "calibrate", "cell", "--selector", "1", "--out", "out") == 0
+    result = ro.load_result("out")
+    assert 1e3 * result.errors(result.record.validation).max() < 0.3
+
+
+def turns(folder: Path, angles: Rows) -> None:
+    head = [*HEAD, "rx [deg]", "ry [deg]", "rz [deg]"]
+    (folder / "raw.csv").write_text(text([head], beside(ROWS, angles)))
+
+
+def test_turns_in_another_convention_are_asked_for_and_what_they_are_is_printed(monkeypatch, capsys, empty) -> None:
+    intrinsic = cells(Rotation.from_matrix(T[:, :3, :3]).as_euler("XYZ", degrees=True))
+    turns(empty, intrinsic)
+    assert new(monkeypatch, "raw.csv") == 2
+    assert "--rotation 'intrinsic xyz'" in capsys.readouterr().err
+    turns(empty, RPY)
+    assert new(monkeypatch, "raw.csv") == 0
+    assert "measured roll (extrinsic xyz)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "said"),
+    [
+        (text([[f"{r}_joint_{i}" for r in "ab" for i in range(1, 7)] + HEAD[7:]],
+              [[*q, *q, *p] for q, p in zip(JOINTS, POINTS, strict=True)]), {"units": "deg"}, "--prefix"),
+        (text([["Point", *(f"J{i}" for i in range(1, 7)), "X", "Y", "Z"], [*["deg"] * 5, *["mm"] * 4, "-"]], ROWS, ";"),
+         {}, "(label of the row) in deg, accepted: one of no unit"),
+        (text([["Axis", *HEAD[1:7], "Value [mm]"]], [["XYZ"[i % 3], *ROWS[0][1:7], "1"] for i in range(9)]), {},
+         "a column that names its point"),
+        (text([["Point", *HEAD[1:]]], ROWS), {"rotation": "intrinsic xxy"}, "'extrinsic xyz', 'intrinsic zyx'"),
+    ],
+)  # fmt: skip
+def test_what_is_ambiguous_is_asked_in_one_sentence(monkeypatch, capsys, empty, content, options, said) -> None:
+    (empty / "raw.csv").write_text(content)
+    assert new(monkeypatch, "raw.csv", **options) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    assert said in error
+
+
+def test_a_units_line_between_blanks_has_no_cell_for_the_label(monkeypatch, empty) -> None:
+    head = ["Point", *(f"J{i}" for i in range(1, 7)), "X", "Y", "Z"]
+    units = [" " * 5, *["deg"] * 6, *["mm"] * 3]
+    (empty / "raw.txt").write_text(text([head, units], ROWS, " "))
+    assert new(monkeypatch, "raw.txt") == 0
+    data = ro.load("cell").problem.data
+    assert np.abs(np.degrees(data.q) - Q).max() < 1e-9
