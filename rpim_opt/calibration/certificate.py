@@ -63,6 +63,7 @@ def certified(
     weight: float,
     floor: float = 0.0,
     residual: Callable[[Array], Array] | None = None,
+    before: Program | None = None,
 ) -> Certificate:
     """Return the evidence that z (n,) minimizes the nonlinear problem.
 
@@ -79,10 +80,13 @@ def certified(
     residual
         The nonlinear problem's whitened residual b - A z at z (n,), where there is one: the model's derivative is held
         against its differences, and replaced by them where it is not theirs.
+    before
+        A program of the formulation: what CVXPY made of its functions serves again where they answer the same.
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
-    program = pose(formulation, model).beginning(z)  # where a minimum is looked for first proves nothing
+    program = before.anew(formulation, model) if before is not None else pose(formulation, model)
+    program = program.beginning(z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
     gradient = _gradient(program, slope, z, weight)

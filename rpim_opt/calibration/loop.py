@@ -477,7 +477,8 @@ def _certified(loop: Loop, formulation: Formulation, problem: Source, state: Sta
         model = around(anew.linearize(scale * state.z), *loop.about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew, scale)
-    return certified(solved, model, state.slope, state.z, state.choice.weight, state.floor, residual)
+    z, weight = state.z, state.choice.weight
+    return certified(solved, model, state.slope, z, weight, state.floor, residual, state.program)
 
 
 def _whitened(problem: CalibrationProblem, scale: Array, z: Array) -> Array:

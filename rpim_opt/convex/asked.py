@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import Given
 from rpim_opt.convex.given import given as told
-from rpim_opt.convex.terms import Frozen, Term, listed, reason, scalar
+from rpim_opt.convex.terms import Frozen, Term, alike, asked, listed, reason, scalar, substituted
 from rpim_opt.robot.parameters import Parameters
 
 
@@ -26,10 +27,12 @@ class Asked:
     ----------
     z, r
         The variables (n,) and (m,).
-    loss, penalty
-        Expressions of r and z; penalty is None where there is none.
+    groups
+        (m,) numbers of configurations.
     loss_term, penalty_term
-        The same of what the functions see: numbers of equations or configurations, z or norms of groups.
+        What loss and penalty say of what they see: numbers of equations or configurations, z or norms of groups.
+    penalty
+        The penalty as a function of z; None where there is none.
     differences
         Matrices D_k of ``penalty_over``.
     constraints
@@ -37,22 +40,41 @@ class Asked:
     own
         Variables that the functions brought along.
     live
-        Loss, penalty and constraints with the user's own parameters, and no copies of them.
+        Loss, as a function of what it sees, penalty and constraints with the user's own parameters, and no copies.
     predicts
         Whether constraints asked for positions, which are linear about some point.
     """
 
     z: cp.Variable
     r: cp.Variable
-    loss: Any
-    penalty: Any
+    groups: np.ndarray
     loss_term: Term
     penalty_term: Any
+    penalty: Any
     differences: list[Array]
     constraints: list[list[Any]]
     own: list[cp.Variable]
     live: tuple[Any, Any, list[list[Any]]]
     predicts: bool
+
+    @cached_property
+    def loss(self) -> Any:
+        """The loss as a function of r."""
+        return self.over_r(self.loss_term.expression)
+
+    def over_r(self, stated: Any) -> Any:
+        """Return an expression of what the loss gets as one of r."""
+        if self.loss_term.variable is self.r:
+            return stated
+        return substituted(stated, {id(self.loss_term.variable): norms(self.r, self.groups)})
+
+    def like(self, other: Asked) -> bool:
+        """Whether these are the answers that the functions gave another time."""
+        stated = [[a.loss_term.expression, a.penalty, a.constraints, a.differences, a.predicts] for a in (self, other)]
+        pairs: dict[int, int] = {}
+        for mine, its in ((self.z, other.z), (self.loss_term.variable, other.loss_term.variable)):
+            pairs |= {id(mine): id(its), id(its): id(mine)}
+        return alike(stated[0], stated[1], pairs)
 
 
 def ask(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Asked:
@@ -71,28 +93,28 @@ def ask(formulation: Formulation, parameters: Parameters, equations: int, groups
         differences = [np.asarray(D, dtype=float) for D in formulation.penalty_over(parameters)]
         given = cp.Variable(len(differences))
     copy = Frozen([z, r, seen, given], where)
-    live_loss = scalar(formulation.loss(seen), f"{where}, loss")
+    live_loss = scalar(asked(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
     loss_term = Term(copy(live_loss), seen)
     live_penalty = None
     penalty_term = None
     penalty = None
     if formulation.penalty is not None:
-        live_penalty = scalar(formulation.penalty(given), f"{where}, penalty")
+        live_penalty = scalar(asked(formulation.penalty, f"{where}, penalty", given), f"{where}, penalty")
         penalty_term = Term(copy(live_penalty), given)
         penalty = _over_z(penalty_term.expression, z, given, differences)
     known = told(z, parameters)
     live = [_listed(c, z, known, f"{where}, {called(c, k)}") for k, c in enumerate(formulation.constraints)]
-    loss = _over_r(loss_term.expression, r, seen, groups)
-    _require_convex(f"{where}, loss", loss)
+    if seen is not r:  # norms are convex and nonnegative, as absolute values are
+        _require_convex(f"{where}, loss", substituted(loss_term.expression, {id(seen): cp.abs(cp.Variable(seen.size))}))
     _require_convex(f"{where}, penalty", penalty)
     predicts = bool(known.asked)
-    stated = (_over_r(live_loss, r, seen, groups), _over_z(live_penalty, z, given, differences), live)
+    stated = (live_loss, _over_z(live_penalty, z, given, differences), live)
     constraints = [[copy(each) for each in group] for group in live]
-    return Asked(z, r, loss, penalty, loss_term, penalty_term, differences, constraints, copy.own, stated, predicts)
+    return Asked(z, r, groups, loss_term, penalty_term, penalty, differences, constraints, copy.own, stated, predicts)
 
 
 def _listed(constraint: Any, z: cp.Variable, known: Given, where: str) -> list[Any]:
-    return listed(constraint(z, known), where)
+    return listed(asked(constraint, where, z, known), where)
 
 
 def called(constraint: Any, k: int) -> str:
@@ -103,18 +125,11 @@ def called(constraint: Any, k: int) -> str:
     return str(name)
 
 
-def _over_r(expression: Any, r: cp.Variable, seen: cp.Variable, groups: np.ndarray) -> Any:
-    """Return the loss as a function of r."""
-    if seen is r:
-        return expression
-    return expression.tree_copy({id(seen): norms(r, groups)})
-
-
 def _over_z(expression: Any, z: cp.Variable, given: cp.Variable, differences: list[Array]) -> Any:
     """Return the penalty as a function of z."""
     if expression is None or given is z:
         return expression
-    return expression.tree_copy({id(given): cp.hstack([cp.norm(D @ z) for D in differences])})
+    return substituted(expression, {id(given): cp.hstack([cp.norm(D @ z) for D in differences])})
 
 
 def _require_convex(where: str, expression: Any) -> None:

@@ -70,6 +70,10 @@ class Canonical:
             (A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape
         )
         self.b = data["b"] * self.row_scale
+        free = np.isposinf(self.b)  # a bound that is none
+        if free.any():
+            self.A = sparse.csr_array(sparse.diags_array(np.where(free, 0.0, 1.0)) @ self.A)
+            self.b = np.where(free, 1.0, self.b)
         self.q = data["c"] * self.column_scale
         P = data.get("P")
         P = sparse.coo_array((self.size, self.size)) if P is None else sparse.coo_array(P)

@@ -16,6 +16,7 @@ from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.constraints import Box, spoken
 from rpim_opt.convex.drawn import Drawn
 from rpim_opt.convex.posed import Posed
+from rpim_opt.convex.terms import substituted
 from rpim_opt.problem.linear import LinearModel
 
 FAR = 1e6
@@ -77,7 +78,7 @@ def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated
         if isinstance(function, Box):
             units.append(_bounds(function, posed, z))
             continue
-        demands = [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+        demands = [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
         if isinstance(function, Drawn):
             units.append([Stated(function.name, tuple(demands))])
             continue
@@ -136,7 +137,7 @@ def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
     hard: list[Any] = []
     for k, function in enumerate(posed.formulation.constraints):
         if not isinstance(function, Box):
-            hard += [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+            hard += [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
             continue
         lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(posed.parameters))
         room = slack if loosen_boxes else 0.0
@@ -161,7 +162,7 @@ def _of_drawings(posed: Posed) -> dict[str, float]:
             place = drawn.index(function)
             demands += function.loosened(z, posed.parameters, units[place] * slack[place])
         else:
-            demands += [constraint.tree_copy({id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+            demands += [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
     least = _least_sum(slack, demands)
     return {function.name: float(unit * s) for function, unit, s in zip(drawn, units, least, strict=True) if s > 1e-6}
 

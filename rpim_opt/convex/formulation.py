@@ -57,7 +57,8 @@ class Formulation(Brief):
     Raises
     ------
     InputError
-        For another ``loss_over`` or ``largest``; when it is posed, for a program that is not convex.
+        For another ``loss_over`` or ``largest``, and what is no function; when it is posed, for a program that is
+        not convex.
 
     Examples
     --------
@@ -97,7 +98,14 @@ class Formulation(Brief):
             raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
         if not isinstance(self.constraints, tuple):
             object.__setattr__(self, "constraints", _functions(self.constraints))
-        if not self.largest > 0:
+        for key in ("loss", "penalty", "penalty_over"):
+            function = getattr(self, key)
+            if not callable(function) and (key == "loss" or function is not None):
+                raise InputError(key, f"{function!r}", "a function, as cp.norm1 is one")
+        for constraint in self.constraints:
+            if not callable(constraint):
+                raise InputError("constraints", f"{constraint!r}", "functions of z and the parameters")
+        if not isinstance(self.largest, float | int | np.number) or not self.largest > 0:
             raise InputError("largest", f"{self.largest}", "a number of sigmas above zero, or infinity")
 
     @property

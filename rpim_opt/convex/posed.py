@@ -20,7 +20,7 @@ from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.solvers.solve import Loss
 from rpim_opt.convex.structure import Quadratic, identity, quadratic
-from rpim_opt.convex.terms import Frozen, Term, apart, scalar, term
+from rpim_opt.convex.terms import Frozen, Term, apart, fulfilled, scalar, substituted, term
 from rpim_opt.convex.trust import SMALL, Trusted, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
@@ -226,7 +226,10 @@ class Posed:
         """Variables of the functions' own in loss or penalty: a value is a minimum over them."""
         if self._known:
             return []
-        ids = {v.id for term in (self.asked.loss, self.asked.penalty) if term is not None for v in term.variables()}
+        stated = [self.asked.loss_term.expression]
+        if self.asked.penalty is not None:
+            stated.append(self.asked.penalty)
+        ids = {v.id for each in stated for v in each.variables()}
         return [variable for variable in self.asked.own if variable.id in ids]
 
     @cached_property
@@ -235,7 +238,7 @@ class Posed:
         if self._known or not self.asked.own:
             return False
         own = {variable.id for variable in self.asked.own}
-        of_loss = own & {v.id for v in self.asked.loss.variables()}
+        of_loss = own & {v.id for v in self.asked.loss_term.expression.variables()}
         others = [*self._flat, *([] if self.asked.penalty is None else [self.asked.penalty])]
         return bool(of_loss & {v.id for each in others for v in each.variables()})
 
@@ -248,7 +251,7 @@ class Posed:
                 return self._together(z, r, weight)
             own = {variable.id for variable in self.inner}
             loss = penalty = 0.0
-            if own & {v.id for v in self.asked.loss.variables()}:
+            if own & {v.id for v in self.asked.loss_term.expression.variables()}:
                 loss = self._fixed_loss.at_best(self.seen(r))[0]
             else:
                 loss = self.loss_of(r)
@@ -277,14 +280,14 @@ class Posed:
         tied = [c for c in self._flat if own & {v.id for v in c.variables()}]
         total = asked.loss if asked.penalty is None else asked.loss + weight * asked.penalty
         instead = {id(asked.z): cp.Constant(z), id(asked.r): cp.Constant(r)}
-        problem = cp.Problem(cp.Minimize(total.tree_copy(instead)), [c.tree_copy(instead) for c in tied])
+        problem = cp.Problem(cp.Minimize(substituted(total, instead)), [substituted(c, instead) for c in tied])
         for variable in problem.variables():
             variable.save_value(None)
         problem.solve(solver=cp.CLARABEL)
         if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
             return float("inf"), 0.0
-        penalty = 0.0 if asked.penalty is None else float(asked.penalty.tree_copy(instead).value)
-        return float(asked.loss.tree_copy(instead).value), penalty
+        penalty = 0.0 if asked.penalty is None else float(substituted(asked.penalty, instead).value)
+        return float(substituted(asked.loss, instead).value), penalty
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
@@ -366,20 +369,19 @@ class Posed:
         """The bound of the configurations' norms."""
         return norms(self.asked.r, self.groups) <= self.formulation.largest
 
-    # --- feasibility -------------------------------------------------------------------------------------------
-
-    @cached_property
-    def distance(self) -> Canonical:
-        """The distance of p (n,) from the constraints of z, as a function of p."""
-        z, p = self.asked.z, cp.Variable(self.n)
+    def met(self, z: Array) -> bool:
+        """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
         with self._lock:
-            return Canonical(cp.norm(z - p), self._flat, p)
+            if any(variable is not self.asked.z for limit in self._flat for variable in limit.variables()):
+                return False
+            self.asked.z.save_value(z)
+            with np.errstate(all="ignore"):
+                return all(fulfilled(limit) for limit in self._flat)
 
-    @cached_property
-    def constraints_alone(self) -> Canonical:
-        """The constraints of z, with nothing to minimize."""
-        with self._lock:
-            return Canonical(cp.Constant(0.0), self._flat, self.asked.z)
+    def like(self, other: Posed) -> bool:
+        """Whether the functions answered what they answered another time, about data of the same shape."""
+        same = (self.n, self.equations) == (other.n, other.equations) and np.array_equal(self.groups, other.groups)
+        return same and not self._known and self.asked.like(other.asked)
 
 
 def posed(formulation: Formulation, model: LinearModel) -> Posed:

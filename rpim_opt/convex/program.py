@@ -21,9 +21,10 @@ from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.posed import Posed, Unposed, posed
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.convex.solvers.newton import Rows
-from rpim_opt.convex.solvers.small import Small, Squares, Unsolved
+from rpim_opt.convex.solvers.small import Squares, Unsolved, nearest
 from rpim_opt.convex.solvers.solve import Minimum, Warm, minimum
 from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.terms import substituted
 from rpim_opt.convex.trust import Trusted, kept_equations, outlying
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
@@ -145,6 +146,23 @@ class Program(Brief):
     def on(self, model: LinearModel) -> Program:
         """Return the program for another model of the same shape, without asking the functions anew."""
         return Program(self.formulation, model, self._posed, self._kept)
+
+    def anew(self, formulation: Formulation, model: LinearModel) -> Program:
+        """Return the program of a formulation whose functions are asked once more.
+
+        Where they answer what they answered to this program, what CVXPY made of that serves again.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+        >>> program.anew(ro.robust, program.model).solve(1.0).status
+        'optimal'
+        """
+        again = pose(formulation, model)
+        if self.formulation == formulation and again._posed.like(self._posed):
+            return self.on(model)
+        return again
 
     def without(self, out: np.ndarray) -> Program:
         """Return the program without some equations, ``out`` (m,), which become rows of zeros.
@@ -421,9 +439,10 @@ class Program(Brief):
         if self.box is not None:
             lower, upper = self.box
             return float(np.max(np.maximum(lower - z, z - upper), initial=0.0))
-        if not self.formulation.constraints:
-            return 0.0
-        return max(self._posed.distance.at_best(z)[0], 0.0)
+        found = self._projected(z)
+        if found is None:
+            return float("inf")
+        return float(np.linalg.norm(found - z))
 
     def excess(self, z: Array) -> float:
         """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
@@ -435,15 +454,16 @@ class Program(Brief):
         """Return the point of the constraints of z that is nearest to z (n,); z itself where none is found."""
         if self.box is not None:
             return np.clip(z, *self.box)
-        if self._distance(z) <= TOUCHING:
+        found = self._projected(z)
+        if found is None or np.linalg.norm(found - z) <= TOUCHING:
             return z
-        projection = Small(self._posed.constraints_alone, self._posed.n + 1)
-        n = len(z)
-        squares = Squares(np.vstack([np.eye(n), np.zeros((1, n))]), np.append(z, 0.0), np.zeros(n))
-        try:
-            return projection.solve(squares, 0.0).x[self._posed.constraints_alone.at]
-        except Unsolved:
+        return found
+
+    def _projected(self, z: Array) -> Array | None:
+        """Return the point of the constraints of z that is nearest to z (n,); None where the solver finds none."""
+        if not self.formulation.constraints or self._posed.met(z):
             return z
+        return nearest(self._posed.canonical, z)
 
     def meets(self, z: Array) -> bool:
         """Whether z (n,) meets its constraints as well as is asked for."""
@@ -534,7 +554,9 @@ class Program(Brief):
             cp.Parameter(b.shape, name="b", value=b),
             cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
         )
-        return self._written(data, self._posed.asked.live, None)[0]
+        asked = self._posed.asked
+        loss, penalty, groups = asked.live
+        return self._written(data, (asked.over_r(loss), penalty, groups), None)[0]
 
     def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
         """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
@@ -543,14 +565,14 @@ class Program(Brief):
         A, b, weight = data
         z, r = cp.Variable(posed.n, name="z"), cp.Variable(posed.equations, name="r")
         instead = {id(asked.z): z, id(asked.r): r}
-        groups = [[constraint.tree_copy(instead) for constraint in group] for group in groups]
+        groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
         if posed.limited:
-            every.append(posed.limit_of_norms.tree_copy(instead))
-        total = loss.tree_copy(instead) + self.model.offset
+            every.append(substituted(posed.limit_of_norms, instead))
+        total = substituted(loss, instead) + self.model.offset
         if penalty is not None:
-            price = penalty.tree_copy(instead)
+            price = substituted(penalty, instead)
             if price.parameters():  # a parameter times a parameter would not be DPP
                 above = cp.Variable(name="penalty")
                 every.append(above >= price)

@@ -82,6 +82,9 @@ def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
     """
     if {v.id for v in expression.variables()} != {variable.id}:
         return None
+    if not expression.is_quadratic() or cp.huber in expression.atoms():  # which CVXPY counts among quadratics
+        return None
+    variable.save_value(None)  # atoms ask for the value of what they are made of, and may get a stale one
     data = cp.Problem(cp.Minimize(expression)).get_problem_data(cp.CLARABEL, solver_opts={})[0]
     if data.get("P") is None or data["dims"].zero != len(data["b"]) or data.get("lower_bounds") is not None:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ def scalar(value: Any, where: str) -> Any:
         raise InputError(where, found, f"{accepted}: cp.sum or cp.max of it, for instance")
     if expression.is_complex():
         raise InputError(where, "a complex value", accepted)
+    _require_numbers(expression, where)
     if not expression.is_convex():
         raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; {reason(expression)}")
     if expression.shape == ():
@@ -44,9 +45,15 @@ def listed(value: Any, where: str) -> list[Any]:
             raise InputError(where, f"{constraint}", "a CVXPY constraint: something that depends on z")
         if not isinstance(constraint, cp.Constraint):
             raise InputError(where, f"a {type(constraint).__name__}", "a CVXPY constraint, or several in a list")
+        _require_numbers(constraint, where)
         if not constraint.is_dcp():
             raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; {reason(constraint)}")
     return made
+
+
+def _require_numbers(stated: Any, where: str) -> None:
+    if any(np.isnan(part).any() for constant in stated.constants() for part in _numbers(constant)):
+        raise InputError(where, "a constant that is not a number (NaN)", "numbers, or infinity as a bound")
 
 
 def reason(stated: Any) -> str:
@@ -73,6 +80,59 @@ def _short(expression: Any) -> str:
     return text[:77] + "..."
 
 
+def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
+    """Return a copy of an expression or constraint with other leaves, by the ``id`` of those that they replace.
+
+    Of three kinds CVXPY's own ``tree_copy`` leaves out or mixes up what they are made of.
+    """
+    if id(stated) in instead:
+        return instead[id(stated)]
+    if isinstance(stated, cp.transforms.indicator):
+        return cp.transforms.indicator([substituted(limit, instead) for limit in stated.args], stated.err_tol)
+    if isinstance(stated, cp.perspective):
+        parts = [stated.f, stated.args[0], stated.f_recession]
+        return cp.perspective(*(None if part is None else substituted(part, instead) for part in parts))
+    args = [substituted(arg, instead) for arg in stated.args]
+    if type(stated).__name__ == "SuppFuncAtom":
+        return type(stated)(args[0], stated._parent)
+    return stated.copy(args, instead)
+
+
+def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
+    """Return whether two expressions or constraints say the same of variables that stand for each other.
+
+    ``pairs`` gets which stand for each other, by their ``id``, in both directions.
+    """
+    if isinstance(one, cp.Expression | cp.Constraint):
+        if type(one) is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
+            return False
+        if isinstance(one, cp.Variable):
+            paired = pairs.setdefault(id(one), id(other)) == id(other) and pairs.setdefault(id(other), id(one)) == id(
+                one
+            )
+            return paired and alike(list(one.attributes.items()), list(other.attributes.items()), pairs)
+        if isinstance(one, cp.Constant):
+            return alike(_numbers(one), _numbers(other), pairs)
+        own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
+        data = [[part for part in each.get_data() or [] if part not in own] for each in (one, other)]
+        return alike(data[0], data[1], pairs) and alike(one.args, other.args, pairs)
+    if isinstance(one, list | tuple):
+        same = type(one) is type(other) and len(one) == len(other)
+        return same and all(alike(a, b, pairs) for a, b in zip(one, other, strict=True))
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)
+    return bool(one == other)
+
+
+def _numbers(constant: Any) -> list[Array]:
+    """Return the numbers of a constant, and where they stand in a sparse one."""
+    value = constant.value
+    if not scipy.sparse.issparse(value):
+        return [np.asarray(value)]
+    value = scipy.sparse.coo_array(value)
+    return [value.data, *value.coords]
+
+
 class Frozen:
     """Copies of expressions with the values that the user's parameters have now, and variables of their own.
 
@@ -94,7 +154,7 @@ class Frozen:
         for variable in stated.variables():
             if id(variable) not in self._shared | self._instead.keys():
                 self._instead[id(variable)] = self._copy(variable)
-        return stated.tree_copy(self._instead)
+        return substituted(stated, self._instead)
 
     def _copy(self, variable: cp.Variable) -> cp.Variable:
         if variable.attributes.get("boolean") or variable.attributes.get("integer"):
@@ -105,8 +165,27 @@ class Frozen:
         return made
 
 
-def _met(limit: Any) -> bool:
+def _domain(expression: Any) -> list[Any]:
+    """Return the constraints outside of which an expression is infinite; CVXPY's own forgets indicators."""
+    if isinstance(expression, cp.transforms.indicator):
+        return list(expression.args)
+    own = expression.domain if not expression.args else expression._domain()
+    return [*own, *(limit for arg in expression.args for limit in _domain(arg))]
+
+
+def fulfilled(limit: Any) -> bool:
+    """Whether a constraint is met at the values of its variables, with nothing missed."""
     return not np.any(limit.violation() > 0)
+
+
+def asked(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
+    """Return what a user's function answers; what CVXPY itself refuses in it is said in a sentence."""
+    try:
+        return function(*arguments)
+    except cp.SolverError as error:  # atoms that ask a solver when they are made
+        raise InputError(
+            where, f"an error of CVXPY: {error}".rstrip("."), "atoms that the installed solvers know"
+        ) from None
 
 
 class Term:
@@ -114,7 +193,7 @@ class Term:
 
     def __init__(self, expression: Any, variable: cp.Variable):
         self.expression, self.variable = expression, variable
-        self._domain = expression.domain
+        self._domain = _domain(expression)
         self._lock = threading.Lock()  # a variable has one value at a time
 
     def __call__(self, value: Array) -> float:
@@ -123,7 +202,7 @@ class Term:
             self.variable.save_value(value)
             with np.errstate(all="ignore"):
                 found = self.expression.value
-                if not all(_met(limit) for limit in self._domain):  # 1 / x is a number there, but not the atom's
+                if not all(fulfilled(limit) for limit in self._domain):  # 1 / x is a number there, but not the atom's
                     return float("inf")
         if found is None or not np.isfinite(found):
             return float("inf")
@@ -145,7 +224,7 @@ class Term:
 def apart(expression: Any, variable: cp.Variable) -> Term:
     """Return an expression as a term of a variable that nothing else sets."""
     own = cp.Variable(variable.size)
-    return Term(expression.tree_copy({id(variable): own}), own)
+    return Term(substituted(expression, {id(variable): own}), own)
 
 
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:

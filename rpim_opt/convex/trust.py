@@ -111,7 +111,10 @@ def trusted(
     if over == "equation":
         v = v / np.sqrt(count[keep])
     v = np.maximum(v, SMALL)
-    found, accepted = f"formulation '{name}'", "another selector: l_curve, corner, k_fold, or a number"
+    found, accepted = (
+        f"formulation '{name}'",
+        "a loss with slopes, which covariances and most rules need; monte_carlo, l_curve, k_fold do not",
+    )
     slope = slope_at(v)
     if slope is None or len(slope) != len(v):
         raise InputError(found, "a loss without slope", accepted)

@@ -80,7 +80,7 @@ def solved(objective: Any, limits: list[Any], z: Any) -> Plain:
                 continue
         ended.append(program.status)
         if program.status == cp.OPTIMAL:
-            return Plain(float(objective.value), np.asarray(z.value), attempt)
+            return Plain(float(np.squeeze(objective.value)), np.asarray(z.value), attempt)
         if program.value is not None and np.isfinite(program.value):
             size *= max(abs(float(program.value)), 1.0)
     raise AssertionError(f"plain CVXPY has no answer to compare with: {ended}")
@@ -93,7 +93,7 @@ def objective_at(formulation: ro.Formulation, model: ro.problem.LinearModel, wei
     objective = loss + weight * penalty
     own = [v for v in cp.Problem(cp.Minimize(objective), limits).variables() if v.id != at.id]
     if not own:
-        return float(objective.value)
+        return float(np.squeeze(objective.value))
     loss, penalty, limits = parts(formulation, model, cp.Constant(z))
     depends = [limit for limit in limits if limit.variables()]
     return solved(loss + weight * penalty, depends, cp.Constant(z)).objective

@@ -169,7 +169,7 @@ def test_names_in_a_script_say_the_same() -> None:
     mine = replace(ro.tikhonov, constraints=(by_hand,))
     result = ro.calibrate(ro.load("position").problem, mine, weight=1.0)
     assert result.converged
-    assert np.max(np.abs(result.z - stated.z)) < 2e-4  # a round of positions may change so much
+    assert np.max(np.abs(result.z - stated.z)) < 5e-4  # a round of positions may change so much
 
 
 def test_predicted_positions_are_those_of_the_result() -> None:

@@ -120,7 +120,7 @@ def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
     ],
 )
 def test_a_loss_that_has_no_factor_is_named(slope: Any, said: str) -> None:
-    with pytest.raises(ro.InputError, match=f"formulation 'mine': found {said}, accepted: another selector"):
+    with pytest.raises(ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss with slopes"):
         trusted("mine", slope, np.full(5, 2.0), np.full(5, 3), "configuration")
 
 

@@ -38,6 +38,10 @@ UNSEEN = 1e-12
 """Singular values of A below this part of the largest are rounding."""
 TINY = 1e-12
 """Norms are taken as no smaller."""
+POOR = 1e-3
+"""Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
+FEWER, LEAST_SECANTS = 0.1, 1e-8
+"""Factor on the secants after a full step, and their least part."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
 
@@ -211,8 +215,12 @@ class Newton:
         self.x = x
         r = self._residual(z)
         size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
+        secants, t_before = 0.0, 0.0
         for _ in range(most):
             gradient, H = self._model(r, h)
+            if secants or _poor(H):
+                secants = max(secants, LEAST_SECANTS) if t_before == 1.0 else 1.0
+                H = H + secants * self._secants(r, h)
             self.point = self._solved(z, gradient, H)
             ahead = self.point.x
             d = ahead[at] - z
@@ -226,6 +234,8 @@ class Newton:
             t, left = self._search(r, Ad, chord + pull, bend, h, float(gradient @ u) + chord + pull)
             if t == 0:
                 break
+            secants *= FEWER if t == 1.0 else 1.0
+            t_before = t
             z = z + t * d
             r = r + t * Ad
             self.x = self.x + t * (ahead - self.x)
@@ -233,6 +243,11 @@ class Newton:
             if (t == 1.0 and promised * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
                 break
         return z
+
+    def _secants(self, r: Array, h: float) -> Array:
+        """Return the Hessian by u = T z of squares with the loss's slopes at r and -r: they lie nowhere below it."""
+        U, v = self.rows.whitened[0], np.where(np.abs(r) > TINY, r, TINY)
+        return gram(U, np.maximum((self._slope(v, h) - self._slope(-v, h)) / (2 * v), 0.0))
 
     def _damping_along(self, z: Array, d: Array) -> tuple[float, float]:
         """Return first and second derivative of the damping along a step."""
@@ -339,6 +354,12 @@ class Newton:
             beside = self._near(self.rows.entries(self._residual(z)), h)
             near = np.union1d(near, np.union1d(np.flatnonzero(bent), beside))
         return None
+
+
+def _poor(H: Array) -> bool:
+    """Whether some directions have hardly any curvature: Newton's steps along them would be far too long."""
+    pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
+    return bool(pivots.min() < POOR * pivots.max())
 
 
 def gram(A: Array, weights: Array) -> Array:

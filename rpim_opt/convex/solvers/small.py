@@ -289,6 +289,25 @@ class _Data:
         return self._P, q
 
 
+def nearest(p: Canonical, z: Array) -> Array | None:
+    """Return the point (n,) of a form's constraints that is nearest to z (n,); None where Clarabel finds none."""
+    from scipy import sparse
+
+    clarabel = import_module("clarabel")
+    n, N = len(z), p.size
+    link = sparse.coo_array((-np.ones(n + 1), (np.arange(n + 1), np.append(N, p.at))), (n + 1, N + 1))
+    A = sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
+    bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
+    q = np.append(np.zeros(N), 1.0)
+    cones = [*p.linear_cones, clarabel.SecondOrderConeT(n + 1)]
+    for settings in ATTEMPTS:
+        P = sparse.csc_matrix((N + 1, N + 1))
+        found = clarabel.DefaultSolver(P, q, sparse.csc_matrix(A), bound, cones, clarabel_settings(settings)).solve()
+        if str(found.status) in SOLVED:
+            return np.array(found.x)[p.at]
+    return None
+
+
 def on_face(
     squares: Squares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
