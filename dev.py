@@ -55,11 +55,12 @@ def run(*command: str | Path) -> int:
 
 
 def docs(folder: str = "docs") -> int:
-    """Write the reference of every public name as HTML pages that need no server."""
-    os.environ["PYTHONWARNINGS"] = "ignore"  # names of types that only checkers import
-    folders = sorted(path.parent.name for path in (ROOT / "rpim_opt").glob("*/__init__.pyi"))
-    modules = ["rpim_opt", *(f"rpim_opt.{name}" for name in folders)]
-    return run("pdoc", *modules, "--docformat", "numpy", "--no-show-source", "--output-directory", folder)
+    """Build the documentation site: static pages that need no server and no network; a warning is a failure."""
+    target = Path(folder).resolve()
+    failed = run("sphinx-build", "-q", "-W", "--keep-going", "-c", GALLERY, "-d", target / ".trees", ROOT, target)
+    start = f'<meta http-equiv="refresh" content="0; url={GALLERY.relative_to(ROOT).as_posix()}/index.html">'
+    (target / "index.html").write_text(start, encoding="utf-8")
+    return failed
 
 
 def notebooks(folder: str = "notebooks", *pages: str) -> int:
@@ -113,9 +114,9 @@ def _readme(program: Path, folder: Path) -> str:
 def main(arguments: list[str]) -> int:
     """Carry out one command line."""
     what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check", "docs", "pictures", "notebooks", "coverage", "mutants", "versions"):
+    if what not in ("run", "test", "check", "docs", "pages", "strings", "notebooks", "coverage", "mutants", "versions"):
         print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
-        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pictures")
+        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pages [PAGE...] | strings")
         print("       | coverage [FOLDER] | mutants [COUNT] [FOLDER] | versions PYTHON...")
         return 2
     if what == "notebooks":
@@ -130,8 +131,10 @@ def main(arguments: list[str]) -> int:
         return run("pytest", "-n", "auto", *rest)  # on all cores
     if what == "docs":
         return docs(*rest)
-    if what == "pictures":
-        return run("python", GALLERY / "pages.py")
+    if what == "pages":
+        return run("python", GALLERY / "pages.py", *rest)
+    if what == "strings":
+        return run("python", GALLERY / "strings.py")
     if what == "coverage":
         return coverage(*rest)
     if what == "mutants":

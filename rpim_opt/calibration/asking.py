@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import count
+from logging import getLogger
 from typing import Any
 
 from rpim_opt.basics.arrays import Array
@@ -24,6 +26,7 @@ from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
 from rpim_opt.problem.source import Source
 
+LOGGER = getLogger("rpim_opt")
 NOISE = {
     "robot": ("position", "orientation", "joint"),
     "free": ("position", "orientation", "joint", "instrument"),
@@ -99,7 +102,7 @@ def calibrate(
         When to stop: linearizations, and length of a step. A calibration that did not converge says so in ``converged``
         and ``message``.
     progress
-        Called after every pass.
+        Called after every iteration, which the logger ``rpim_opt`` reports at level INFO, too.
     solver, settings, verbose
         Any installed solver of CVXPY, with its options (`Program.solve`).
 
@@ -127,7 +130,7 @@ def calibrate(
     how = {
         "max_iterations": max_iterations,
         "tolerance": tolerance,
-        "progress": progress,
+        "progress": _logged(progress),
         "solver": solver,
         "settings": settings,
         "verbose": verbose,
@@ -171,6 +174,7 @@ def calibrate(
         message += ELSEWHERE
     if mapping is not None:
         message += f" {mapping.sentence}"
+    LOGGER.info(message)
     return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
 
 
@@ -179,6 +183,18 @@ def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibratio
     if mapping is None:
         return asked
     return lambda problem: replace(asked(problem), mapping=mapping)
+
+
+def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration], None]:
+    """Return a function of iterations that logs them before it passes them on."""
+    number = count(1)
+
+    def report(it: Iteration) -> None:
+        LOGGER.info("iteration %d: objective %.6g, step %.1e", next(number), it.objective, it.step)
+        if progress is not None:
+            progress(it)
+
+    return report
 
 
 def _refit(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:

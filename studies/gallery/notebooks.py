@@ -18,7 +18,7 @@ import nbformat
 from nbclient import NotebookClient
 from nbconvert import HTMLExporter
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
-from pages import FENCE, PICTURE, Snippet, pages
+from pages import FENCE, PICTURE, Snippet, alike, pages
 
 LINK = re.compile(r"(\]\()([^)\s:#]*)(#[\w-]+)?(\))")
 STYLE = """\
@@ -91,15 +91,15 @@ def _heading(page: Path, anchor: str | None) -> str:
 
 
 def execute(book: nbformat.NotebookNode) -> list[str]:
-    """Run a notebook in a folder of its own, and return the lines of its page that it does not print."""
+    """Run a notebook in a folder of its own, and return the outputs that differ from its page."""
     with tempfile.TemporaryDirectory() as scratch:
         NotebookClient(book, timeout=300, resources={"metadata": {"path": scratch}}).execute()
     missing = []
     for cell in book.cells:
         if cell.cell_type == "code":
             said = "".join(output.get("text", "") for output in cell.outputs)
-            wanted = cell.metadata.pop("printed").splitlines()
-            missing += [line for line in wanted if line.strip() not in said]
+            wanted = cell.metadata.pop("printed")
+            missing += [] if alike(said, wanted) else [said]
     return missing
 
 

@@ -1,0 +1,153 @@
+"""Pages of the reference, made from the code: public names, commands with their options, keys of files."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import rpim_opt
+
+PACKAGE = Path(rpim_opt.__file__).parent
+NAMESPACES = ("select", "constraints", "plot", "baselines")
+FOLDERS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.pyi"))
+FILES = {
+    "problem.toml": ("store/problem_file.py", "ProblemTable", "The problem folder's file ([guide](../robots.md))."),
+    "robot.toml": ("robot/formats/tables.py", "_RobotTable", "A robot's table."),
+    "result.json": ("store/result_file.py", "Stored", "What `calibrate --out` writes and every other command reads."),
+}  # fmt: skip
+"""File, the class that reads or writes it, and what it is."""
+
+VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
+
+
+def write(folder: Path) -> None:
+    """Write all pages into a folder; Sphinx reads only those again that changed."""
+    folder.mkdir(exist_ok=True)
+    pages = {"commands": commands(), "files": files(), "names": top_level()}
+    pages |= {name: module(name) for name in (*NAMESPACES, *FOLDERS)}
+    for name, text in pages.items():
+        path = folder / f"{name}.md"
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def _table(*rows: tuple[str, ...]) -> str:
+    head, *body = rows
+    lines = [head, (":--",) * len(head), *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+# --- names -----------------------------------------------------------------------------------------------
+
+
+def _first(value: Any) -> str:
+    """Return the first line of a docstring; a constant's is in its source."""
+    return (inspect.getdoc(value) or "").partition("\n")[0].replace("`", "")
+
+
+def _directives(name: str, values: dict[str, Any]) -> Iterator[str]:
+    """Yield autodoc's directive of every name: classes with their members, then functions, then the rest."""
+    kinds = {
+        each: "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+        for each, value in values.items()
+        if not inspect.ismodule(value)
+    }
+    for kind in ("class", "function", "data"):
+        for each in sorted(kinds):
+            if kinds[each] == kind:
+                yield f".. auto{kind}:: rpim_opt.{name}.{each}\n" + "   :members:\n" * (kind == "class")
+
+
+def module(name: str) -> str:
+    """Return the page of a folder, or of a namespace such as ``ro.plot``."""
+    value = getattr(rpim_opt, name)
+    names = {each: getattr(value, each) for each in value.__all__}
+    text = inspect.getdoc(value) or ""
+    directives = "\n".join(_directives(name, names))
+    return f"# rpim_opt.{name}\n\n```{{eval-rst}}\n{text}\n\n{directives}```\n"
+
+
+def top_level() -> str:
+    """Return the page of the names at the top level, each with a link to its description."""
+    homes = {}
+    for folder in FOLDERS:
+        module = getattr(rpim_opt, folder)
+        homes |= {id(getattr(module, each)): folder for each in module.__all__}
+    rows = [("name", "what")]
+    for each in rpim_opt.__all__:
+        value = getattr(rpim_opt, each)
+        rows.append((f"{{py:obj}}`ro.{each} <rpim_opt.{homes[id(value)]}.{each}>`", _first(value)))
+    folders = [("namespace", "what")]
+    for each in (*NAMESPACES, *FOLDERS):
+        folders.append((f"[ro.{each}]({each}.md)", _first(getattr(rpim_opt, each))))
+    pages = "\n".join(["```{toctree}", ":hidden:", "", *NAMESPACES, *FOLDERS, "```", ""])
+    head = "# Public names\n\n`import rpim_opt as ro`. The top level has what most scripts need:"
+    return f"{head}\n\n{_table(*rows)}\n\nThe rest is in namespaces and folders:\n\n{_table(*folders)}\n\n{pages}"
+
+
+# --- commands ---------------------------------------------------------------------------------------------
+
+
+def commands() -> str:
+    """Return the page of every command with its arguments and options."""
+    import typer
+
+    from rpim_opt.cli import app
+
+    functions = [each.callback for each in app.registered_commands if each.callback]
+    callbacks = {each.__name__: each for each in functions}
+    group: Any = typer.main.get_command(app)
+    text = "# Commands\n\n" + inspect.cleandoc(group.help)
+    for name, command in sorted(group.commands.items()):
+        arguments = [each for each in command.params if each.param_type_name == "argument"]
+        usage = " ".join(["rpim-opt", name, *(_metavar(each) for each in arguments), "[OPTIONS]"])
+        rows = [("argument or option", "what", "default")]
+        own = [each for each in command.params if each.name != "help"]
+        rows += [(_spelled(each, callbacks[name]), each.help or "", _default(each)) for each in own]
+        text += f"\n\n## {name}\n\n{inspect.cleandoc(command.help)}\n\n```text\n{usage}\n```\n\n{_table(*rows)}"
+    return text + "\n"
+
+
+def _metavar(argument: Any) -> str:
+    name = argument.name.upper()
+    return f"{name}..." if argument.nargs == -1 else name
+
+
+def _spelled(param: Any, callback: Any) -> str:
+    if param.param_type_name == "argument":
+        return f"`{_metavar(param)}`"
+    annotation = str(inspect.signature(callback).parameters[param.name].annotation)
+    value = next((word for kind, word in VALUES.items() if kind in annotation), "TEXT")
+    flags = " / ".join([*param.opts, *param.secondary_opts])
+    return f"`{flags}`" if param.is_flag else f"`{flags} {value}`"
+
+
+def _default(param: Any) -> str:
+    if param.required:
+        return "required"
+    return "" if param.default in (None, "", False, ()) or callable(param.default) else f"`{param.default}`"
+
+
+# --- keys of files ----------------------------------------------------------------------------------------
+
+
+def files() -> str:
+    """Return the page of the keys of every file."""
+    text = "# Files\n\nA key that holds a quantity ends in its unit: `a_mm`, `theta_deg`. Unknown keys are refused."
+    for name, (source, owner, what) in FILES.items():
+        module = ast.parse((PACKAGE / source).read_text(encoding="utf-8"))
+        classes = {node.name: node for node in module.body if isinstance(node, ast.ClassDef)}
+        text += f"\n\n## {name}\n\n{what}\n\n{_table(('key', 'value', 'what'), *_keys(classes[owner]))}"
+    return text + "\n"
+
+
+def _keys(owner: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
+    """Yield key, type and description of every field of a class."""
+    for field, below in zip(owner.body, [*owner.body[1:], None], strict=True):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
+            described = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+            text = " ".join(str(below.value.value).split()) if described else ""
+            yield f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", text
