@@ -119,6 +119,7 @@ def new(
     seed: Annotated[int, Option(min=0, help="Of the configurations that are kept apart.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
+    dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: Json = False,
 ) -> None:
@@ -132,7 +133,7 @@ def new(
             encoding=encoding, separator=separator, decimal=decimal, within=time_tolerance,
         )  # fmt: skip
         if dry_run:
-            found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip)
+            found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
             console.show(found, found.content(), as_json)
             return
         from rpim_opt.store.new_folder import new_problem
@@ -140,7 +141,7 @@ def new(
         with refused(folder):
             made = new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
-                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, target=target,
+                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip
     document = {"written": [made.folder], "rows": made.rows, **made.understood.content(), "notes": made.notes}

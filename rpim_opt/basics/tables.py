@@ -32,6 +32,8 @@ WIDEST = 1000
 """Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
 MOST_CELLS = 2**27
 """Cells that a Parquet file may have: ten million rows of a dozen columns."""
+MOST_TEXT = 2**27
+"""Bytes of texts that a Parquet file may have, which a dictionary of one value repeats in every row."""
 LARGEST_WORKBOOK = 2**27
 """Bytes that a workbook may unpack to: some three hundred thousand rows."""
 EXCEL_ROWS = 2**20
@@ -163,20 +165,38 @@ def read_parquet(path: Path) -> Columns:
     parquet = _library("pyarrow.parquet", "Parquet files")
     try:
         with parquet.ParquetFile(path) as file:
-            metadata, names = file.metadata, file.schema_arrow.names
-            size = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
-            _require_names(names)
-            if metadata.num_rows * len(names) > MOST_CELLS or size > LARGEST_DATA:
-                found = f"{metadata.num_rows} rows of {len(names)} columns, {size} bytes unpacked"
-                raise InputError("the table", found, f"at most {MOST_CELLS} cells and {LARGEST_DATA} bytes")
+            metadata, schema = file.metadata, file.schema_arrow
+        _require_names(schema.names)
+        groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+        cells = sum(group.column(j).num_values for group in groups for j in range(group.num_columns))
+        size = sum(group.total_byte_size for group in groups)
+        if max(cells, metadata.num_rows * len(schema.names)) > MOST_CELLS or size > LARGEST_DATA:
+            found = f"{metadata.num_rows} rows of {len(schema.names)} columns, {size} bytes unpacked"
+            raise InputError("the table", found, f"at most {MOST_CELLS} cells and {LARGEST_DATA} bytes")
+        texts = [field.name for field in schema if str(field.type) in ("string", "large_string", "binary")]
+        with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that is there again once
             table = file.read()
-            return {name: _parquet_cells(table.column(name)) for name in table.column_names}
+        repeated = sum(_repeated(table.column(name)) for name in texts)
+        if repeated > MOST_TEXT:
+            raise InputError("the table", f"{repeated} bytes of texts", f"at most {MOST_TEXT}")
+        return {name: _parquet_cells(table.column(name)) for name in table.column_names}
     except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's derive from these
         raise InputError("the file", _first_line(error), "a readable Parquet file") from None
 
 
+def _repeated(column: Any) -> int:
+    """Return how many bytes the texts of a column have where each stands in every row that has it."""
+    compute = import_module("pyarrow.compute")
+    sizes = [compute.binary_length(chunk.dictionary).take(chunk.indices) for chunk in column.chunks]
+    return sum(compute.sum(each).as_py() or 0 for each in sizes)
+
+
 def _parquet_cells(column: Any) -> Sequence[Any]:
     """Return a column of numbers without gaps as an array, any other as a list."""
+    if str(column.type).startswith("dictionary"):
+        known = [chunk.dictionary.to_pylist() for chunk in column.chunks]
+        indices = [chunk.indices.to_pylist() for chunk in column.chunks]
+        return [None if i is None else known[k][i] for k, chunk in enumerate(indices) for i in chunk]
     numeric = str(column.type).startswith(("float", "double", "int", "uint"))
     return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
 

@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
 from rpim_opt.robot.chain import XACRO, Described
-from rpim_opt.robot.formats.tables import read_mdh
+from rpim_opt.robot.formats.tables import read_mdh, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
@@ -48,12 +48,16 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, ready)}", file)
 
 
-def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None) -> Described:
-    """Return the robot of a file, with base and tool where a URDF states them."""
+def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "") -> Described:
+    """Return the robot of a file, with base and tool where a URDF or a standard DH table states them."""
     if file.suffix in (".urdf", XACRO):
         from rpim_opt.robot.formats.urdf import read_urdf
 
         return read_urdf(file, urdf_base, urdf_tip)
+    if file.suffix == ".csv":
+        return read_sheet(file, convention)
+    if convention:
+        raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files say their convention")
     return Described(read_mdh(file), np.zeros(6), np.zeros(6))
 
 

@@ -71,6 +71,7 @@ def new_problem(
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
     target: str = "",
+    dh: str = "",
     understood: Callable[[Understanding], None] | None = None,
 ) -> Started:
     """Make a problem folder that `load` reads; the folder is whole or not there.
@@ -99,6 +100,8 @@ def new_problem(
         Links between which a URDF's robot is.
     target
         What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
+    dh
+        The convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it.
     understood
         Called with what was understood of the tables, before anything is computed.
 
@@ -121,7 +124,7 @@ def new_problem(
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a part to hold out", "one of them")
     source = find_source(robot)
-    arm = read_arm(source.file, urdf_base, urdf_tip)
+    arm = read_arm(source.file, urdf_base, urdf_tip, dh)
     paths = [data] if isinstance(data, str | Path) else data
     found = understand_of(arm, paths, measurement, options or TableOptions(units=parse_units(units)))
     if understood is not None:

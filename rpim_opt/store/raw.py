@@ -143,6 +143,7 @@ def understand_tables(
     options: TableOptions | None = None,
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
+    dh: str = "",
 ) -> Understanding:
     r"""Return what raw tables of a robot say: every column's meaning, unit, and why.
 
@@ -161,6 +162,8 @@ def understand_tables(
         What is stated of the tables.
     urdf_base, urdf_tip
         Links between which a URDF's robot is.
+    dh
+        The convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`).
 
     Raises
     ------
@@ -180,7 +183,7 @@ def understand_tables(
     >>> found.notes
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
-    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip)
+    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip, dh)
     return understand_of(arm, data, measurement, options)
 
 

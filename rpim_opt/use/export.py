@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import refused, write_files
+from rpim_opt.basics.files import read_bytes, refused, write_files
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
@@ -171,9 +171,15 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     mdh = robot.mdh.copy()
     mdh[0, :2] = 0.0
     write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
-    if np.array_equal(mdh, robot.mdh):
-        return []
-    return ["alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1."]
+    notes = []
+    if b"joint_checksum" in read_bytes(Path(source)):
+        notes.append(
+            "joint_checksum stands as in the source: nothing public says how it is formed, so that a controller may "
+            "refuse the file. Keep the original."
+        )
+    if not np.array_equal(mdh, robot.mdh):
+        notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
+    return notes
 
 
 def with_first_reflector(result: Calibration, marker: str | None = None) -> Described:

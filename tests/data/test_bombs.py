@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -187,3 +189,36 @@ def test_parquet_with_thousands_of_columns(tmp_path: Path) -> None:
     path = tmp_path / "data.parquet"
     parquet.write_table(pa.table({f"c{i}": [1.0] for i in range(3000)}), path)
     assert "3000 columns" in refused(path)
+
+
+def peak_of(script: str) -> int:
+    """Return the largest resident memory [bytes] of a process beyond that of one that only loads the package."""
+    measured = "import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    sizes = []
+    for body in ("", script):
+        code = f"import rpim_opt as ro, pyarrow.parquet, pyarrow.compute\n{body}\n{measured}"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        sizes.append(1024 * int(done.stdout.split()[-1]))
+    return sizes[1] - sizes[0]
+
+
+def test_one_text_in_three_million_rows_is_refused_before_it_is_repeated(tmp_path: Path) -> None:
+    path = tmp_path / "data.parquet"
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3_000_000, np.int32)), ["x" * 3600])
+    parquet.write_table(pa.table({"label": texts}), path)
+    assert path.stat().st_size < 2_000_000
+    assert "bytes of texts" in refused(path)
+    script = f"try: ro.read_data({str(path)!r}, ro.load('position').problem.robot)\nexcept ro.InputError: pass"
+    assert peak_of(script) < 2**28
+
+
+def test_a_hole_of_a_text_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_text("a,b\n1,2\n")
+    with path.open("r+b") as stream:
+        stream.truncate(900_000_000)
+    script = (
+        "from pathlib import Path\nfrom rpim_opt.basics.layout import read_table\n"
+        f"try: read_table(Path({str(path)!r}))\nexcept ro.InputError as error: assert 'zero' in str(error)"
+    )
+    assert peak_of(script) < 2**26

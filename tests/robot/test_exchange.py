@@ -671,8 +671,8 @@ def test_tables_come_back_to_the_last_bit(tmp_path: Path, ending: str, coupled: 
 def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
     ro.robot.write_robot(UR10, tmp_path / "ur10.csv")
     lines = (tmp_path / "ur10.csv").read_text().splitlines()
-    assert lines[0] == "alpha_deg,a_mm,theta_deg,d_mm,beta_deg,lower_deg,upper_deg"
-    assert lines[3] == ",-612.0,,,,-360.0,360.0"
+    assert lines[0] == "alpha_deg,a_mm,theta_deg,d_mm,beta_deg,lower_deg,upper_deg,convention"
+    assert lines[3] == "0.0,-612.0,0.0,0.0,0.0,-360.0,360.0,modified"
     ro.robot.write_robot(UR10, tmp_path / "ur10.toml")
     assert "[[joint]]\nalpha_deg = 90.0\nlimits_deg = [-360.0, 360.0]\n" in (tmp_path / "ur10.toml").read_text()
 
@@ -680,12 +680,12 @@ def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "found"),
     [
-        ("r.csv", "alpha_deg,a\n1,2\n", "unknown key|no unit"),
-        ("r.csv", "alpha_deg,alpha_rad\n1,2\n", "the same quantity twice"),
-        ("r.csv", "alpha_deg\nninety\n", "joint 1.alpha_deg: found 'ninety'"),
-        ("r.csv", "alpha_deg\nnan\n", "joint 1.alpha_deg"),
-        ("r.csv", "d_mm,type\n1,screw\n", "joint 1.type: found 'screw'"),
-        ("r.csv", "d_mm,lower_deg\n1,5\n", "joint 1.limits_deg: found None"),
+        ("r.csv", "alpha_deg,a,convention\n1,2,modified\n", "unknown key|no unit"),
+        ("r.csv", "alpha_deg,alpha_rad,convention\n1,2,modified\n", "the same quantity twice"),
+        ("r.csv", "alpha_deg,a_mm,d_mm,convention\nninety,1,2,modified\n", "joint 1.alpha_deg: found 'ninety'"),
+        ("r.csv", "alpha_deg,a_mm,d_mm,convention\nnan,1,2,modified\n", "joint 1.alpha_deg"),
+        ("r.csv", "a_mm,d_mm,type,convention\n1,1,screw,modified\n", "joint 1.type: found 'screw'"),
+        ("r.csv", "d_mm,lower_deg,convention\n1,5,modified\n", "joint 1.limits_deg: found None"),
         ("r.csv", "", "an empty file"),
         ("r.json", "[]", "found list"),
         ("r.json", "{", "the JSON text"),

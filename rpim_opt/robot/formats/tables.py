@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,13 +14,36 @@ from pydantic import Field, model_validator
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
+from rpim_opt.basics.layout import read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
-from rpim_opt.basics.tables import csv_text, read_columns
-from rpim_opt.basics.units import UNITS, accepted_units, display
-from rpim_opt.robot.chain import without_beta
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.units import UNITS, accepted_units, display, split
+from rpim_opt.robot.chain import Chain, Described, describe, without_beta
+from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 LIMITS = ("lower", "upper")
+SI = {"angle": "rad", "length": "m"}
+FAR = 10.0
+"""A common normal that is further away [m] is that of nearly parallel axes."""
+CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modified", "mdh": "modified",
+               "standard": "standard", "paul": "standard", "distal": "standard", "classic": "standard",
+               "hayati": "standard"}  # fmt: skip
+"""What people call the conventions of Denavit-Hartenberg tables."""
+INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
+"""Of alpha and a of the link before: the table is modified."""
+SHEET = {
+    "\u03b1": "alpha",
+    "θ": "theta",
+    "β": "beta",
+    "twist": "alpha",
+    "theta offset": "theta",
+    "offset": "theta",
+    "r": "a",
+}
+"""Other names of columns."""
+ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
+"""A joint's variable with its offset, ``q2 - 90``."""
 WITHOUT_COLUMN = {
     "coupling": "a coupling of joints",
     "mounting": "a mounting other than on the floor",
@@ -172,7 +197,7 @@ def read_mdh(path: str | Path) -> Robot:
     JSON has the keys of ``robot.toml`` (the guide "Your own robot"). CSV has a row a joint and the keys of a
     ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
-    cell is left out.
+    cell is left out. A column ``convention`` says ``modified`` or ``standard`` (`read_sheet`).
 
     Raises
     ------
@@ -205,18 +230,90 @@ def _read_json(path: Path) -> Robot:
 
 
 def _read_csv(path: Path) -> Robot:
-    try:
-        columns = read_columns(path)
-    except InputError as error:
-        raise error.within(path) from None
+    described = read_sheet(path)
+    if described.tool.any() or described.base.any():
+        raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new", path)
+    return described.robot
+
+
+def read_sheet(path: Path, convention: str = "") -> Described:
+    r"""Return the robot of a table with a row a joint, as people have them, in the convention that it or somebody says.
+
+    ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
+    Hayati are converted exactly; what follows the last joint becomes the tool::
+
+        modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
+        standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
+
+    Raises
+    ------
+    InputError
+        Where nobody says the convention, for rows that are no joints, and what `read_mdh` refuses.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from rpim_opt.robot.formats.tables import read_sheet
+    >>> _ = Path("dh.csv").write_text("i;theta [°];d [mm];a [mm];alpha [°]\n1;q1;99,5;0;90\n2;q2-90;0;425;0\n")
+    >>> read_sheet(Path("dh.csv"), "standard").robot.mdh.round(4).tolist()  # alpha, a, theta, d, beta
+    [[0.0, 0.0, 0.0, 0.0995, 0.0], [1.5708, 0.0, -1.5708, 0.0, 0.0]]
+    """
+    raw = read_table(path)
+    lost = next((note for note in raw.notes if "is no row of the table" in note or "sums others up" in note), "")
+    if lost:
+        raise InputError("the table", lost.rstrip("."), "a row a joint", path)
+    named = {name: _sheet_name(name) for name in raw.columns}
+    columns = {named[name]: [str(cell) for cell in cells] for name, cells in raw.columns.items() if named[name]}
+    if len(columns) < sum(map(bool, named.values())):
+        raise InputError("the header", ", ".join(raw.columns), "every column once", path)
+    said = {cell.lower() for cell in columns.pop("convention", [])} - {""}
+    if any(INDEX_BEFORE.search(name) for name in raw.columns):
+        said.add("modified")
+    known = {CONVENTIONS.get(each, each) for each in said | ({convention} if convention else set())}
+    if len(known) != 1 or not known <= set(CONVENTIONS.values()):
+        accepted = (
+            "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
+            "or a column convention with one of the words"
+        )
+        raise InputError("the convention of the table", " and ".join(sorted(known)) or "no word of it", accepted, path)
     rows = range(len(next(iter(columns.values()))))
     joints = [_joint({name: cells[i] for name, cells in columns.items()}) for i in rows]
-    return _robot({"name": path.stem, "joint": joints}, path)
+    robot = _robot({"name": path.stem, "joint": joints}, path)
+    if known == {"modified"}:
+        return Described(robot, np.zeros(6), np.zeros(6))
+    if robot.gravity.masses:
+        raise InputError("the table", "masses of links in the frames of another convention", "--dh modified", path)
+    return _from_standard(robot)
+
+
+def _sheet_name(name: str) -> str:
+    """Return the key of a ``[[joint]]`` that a column of a DH table is; nothing for the joint's own name."""
+    stem, unit = split(name.partition(" #")[0])
+    stem = INDEX_BEFORE.sub("", stem).strip().lower()
+    if stem in ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk"):
+        return ""
+    stem = SHEET.get(stem, stem)
+    return f"{stem}_{unit}" if unit else stem
+
+
+def _from_standard(robot: Robot) -> Described:
+    """Return the arm of numbers in the standard convention, with Hayati's beta behind every link."""
+    alpha, a, theta, d, beta = robot.mdh.T
+    if not beta.any():  # the same numbers, alpha and a one row further
+        mdh = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
+        return Described(replace(robot, mdh=mdh), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
+    links = [
+        numeric_link(theta=theta[i], d=d[i]) @ numeric_link(alpha[i], a[i], beta=beta[i]) for i in range(robot.dof)
+    ]
+    near = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
+    mdh, base, tool, _ = describe(Chain.about_z([np.eye(4), *links[:-1]], links[-1]), near)
+    return Described(replace(robot, mdh=mdh), frame_numbers(base), frame_numbers(tool))
 
 
 def _joint(cells: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
-    joint = {name: _cell(text) for name, text in cells.items() if text and name != "joint"}
+    joint = {name: _cell(ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0") if name.startswith("theta") else _cell(text)
+             for name, text in cells.items() if text}  # fmt: skip
     for unit in UNITS:
         pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
         if any(value is not None for value in pair):
@@ -267,7 +364,7 @@ def write_robot(robot: Robot, path: str | Path) -> None:
     _by_ending({".toml": _write_toml, ".json": _write_json, ".csv": _write_csv}, path)(robot, path)
 
 
-def write_robodk(robot: Robot, path: str | Path) -> None:
+def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """Write the four modified DH numbers of every joint as CSV, ``joint,alpha_deg,a_mm,theta_deg,d_mm``.
 
     For RoboDK's robot parameters, which are a modified DH table (Craig's, "DHM") in mm and degrees. Hayati's betas
@@ -282,6 +379,10 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     path
         The CSV file.
 
+    Returns
+    -------
+    A warning where axes are so nearly parallel that rounded numbers lose the robot.
+
     Raises
     ------
     InputError
@@ -291,7 +392,7 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
-    >>> ro.robot.write_robodk(ro.load("paper_arm").problem.robot, "robodk.csv")
+    >>> notes = ro.robot.write_robodk(ro.load("paper_arm").problem.robot, "robodk.csv")
     >>> print(Path("robodk.csv").read_text())
     joint,alpha_deg,a_mm,theta_deg,d_mm
     1,0.0,0.0,0.0,99.927
@@ -305,9 +406,17 @@ def write_robodk(robot: Robot, path: str | Path) -> None:
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
         raise InputError("robot", "signs or couplings of joints", "joints that count as RoboDK's", robot.name)
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
+    far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
     rows = [[number, *map(repr, row)] for number, row in enumerate(numbers.tolist(), start=1)]
     write_text(Path(path), csv_text(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())], rows))
+    if not far:
+        return []
+    lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
+    return [
+        f"Nearly parallel axes have their common normal far away ({', '.join(far)}): transfer all digits, for angles "
+        f"rounded to 0.0001 degrees miss by {lost:.2g} mm, or use a format that has beta (--mdh, --urdf)."
+    ]
 
 
 def _content(robot: Robot) -> dict[str, Any]:
@@ -326,21 +435,21 @@ def _content(robot: Robot) -> dict[str, Any]:
     return content | _gravity_keys(robot.gravity) | {"joint": joints}
 
 
-def _keys(robot: Robot, i: int) -> dict[str, Any]:
-    """Return the keys of a ``[[joint]]``, but for its sign."""
+def _keys(robot: Robot, i: int, in_si: bool = False) -> dict[str, Any]:
+    """Return the keys of a ``[[joint]]``, but for its sign; all in SI if wanted."""
     joint: dict[str, Any] = {}
     for column, value in zip(MDH, robot.mdh[i], strict=True):
         if value:
-            unit, (number,) = exact(MDH_DIMENSION[column], [value])
+            unit, (number,) = exact(MDH_DIMENSION[column], [value], in_si)
             joint[f"{column}_{unit}"] = number
     if robot.joint_types[i] != "revolute":
         joint["type"] = robot.joint_types[i]
     if np.isfinite(robot.limits[i]).any():
-        unit, pair = exact(robot.joint_dimensions[i], robot.limits[i])
+        unit, pair = exact(robot.joint_dimensions[i], robot.limits[i], in_si)
         joint[f"limits_{unit}"] = pair
     if robot.gravity.masses:
         joint["mass_kg"] = robot.gravity.masses[i]
-        joint |= _centre_keys(robot.gravity.centres[i], "centre_")
+        joint |= _centre_keys(robot.gravity.centres[i], "centre_", in_si)
     return joint
 
 
@@ -355,24 +464,24 @@ def _gravity_keys(gravity: Gravity) -> dict[str, Any]:
     return keys
 
 
-def _centre_keys(centre: tuple[float, ...], prefix: str) -> dict[str, float]:
+def _centre_keys(centre: tuple[float, ...], prefix: str, in_si: bool = False) -> dict[str, float]:
     keys = {}
     for axis, value in zip("xyz", centre, strict=True):
         if value:
-            unit, (number,) = exact("length", [value])
+            unit, (number,) = exact("length", [value], in_si)
             keys[f"{prefix}{axis}_{unit}"] = number
     return keys
 
 
-def exact(dimension: str, values: Any) -> tuple[str, list[float]]:
-    """Return values in the unit that is shown, or in SI where that would not read back the same."""
+def exact(dimension: str, values: Any, in_si: bool = False) -> tuple[str, list[float]]:
+    """Return values in the unit that is shown, or in SI where that is wanted or they would not read back the same."""
     if not np.isfinite(values).all():
         raise InputError("limits of the robot", f"{[float(v) for v in values]}", "finite numbers, or no limits")
     unit, si = display(dimension)
     numbers = [float(f"{v / si:.15g}") for v in values]
-    if all(n * si == v for n, v in zip(numbers, values, strict=True)):
+    if not in_si and all(n * si == v for n, v in zip(numbers, values, strict=True)):
         return unit, numbers
-    return {"angle": "rad", "length": "m"}[dimension], [float(v) for v in values]
+    return SI[dimension], [float(v) for v in values]
 
 
 def _write_json(robot: Robot, path: Path) -> None:
@@ -400,10 +509,14 @@ def _write_csv(robot: Robot, path: Path) -> None:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json", path)
-    rows = [_cells(joint) for joint in content["joint"]]
-    header = [f"{column}_{display(MDH_DIMENSION[column])[0]}" for column in MDH]
-    header += sorted({key for row in rows for key in row} - set(header))
-    write_text(path, csv_text(header, ([row.get(key, "") for key in header] for row in rows)))
+    units = {column: exact(MDH_DIMENSION[column], values)[0] for column, values in zip(MDH, robot.mdh.T, strict=True)}
+    in_si = any(unit != display(MDH_DIMENSION[column])[0] for column, unit in units.items())  # all numbers or none
+    rows = [_cells(_keys(robot, i, in_si) | {"sign": joint.get("sign", 1)}) for i, joint in enumerate(content["joint"])]
+    header = [f"{column}_{SI[MDH_DIMENSION[column]] if in_si else units[column]}" for column in MDH]
+    signs = {"sign"} if all(row["sign"] == 1 for row in rows) else set()
+    header += sorted({key for row in rows for key in row} - set(header) - signs)
+    table = ([*(row.get(key, 0.0 if key in header[:5] else "") for key in header), "modified"] for row in rows)
+    write_text(path, csv_text([*header, "convention"], table))
 
 
 def _cells(joint: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,107 @@
+"""DH tables in the conventions of Craig, Paul and Hayati are one robot, through the command line and exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.robot.formats.tables import read_sheet, write_robodk, write_robot
+from rpim_opt.robot.kinematics import numeric_frame, numeric_link
+from tests.simulate import ARM
+from tests.store.raw_files import HEAD, ROWS, text
+from tests.test_cli import run
+
+RNG = np.random.default_rng(4)
+ALPHA = np.radians([-90.0, 0.0, -90.0, 90.0, -90.0, 30.0])
+A = np.array([0.05, 0.44, 0.035, 0.0, 0.0, 0.02])
+THETA = np.radians([0.0, -90.0, 0.0, 0.0, 180.0, 0.0])
+D = np.array([0.33, 0.0, 0.02, 0.42, 0.0, 0.08])
+BETA = np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.0])
+
+
+def sheet(beta: np.ndarray | None = None, mark: str = ";", theta: str = "q{}{:+g}") -> str:
+    """Return the table as people write it: the standard order, German decimals, variables with their offsets."""
+    lines = [
+        mark.join(["Joint", "theta [°]", "d [mm]", "a [mm]", "alpha [°]", *(["beta [°]"] if beta is not None else [])])
+    ]
+    for i in range(6):
+        cells = [
+            f"{i + 1}",
+            theta.format(i + 1, round(np.degrees(THETA[i]), 6)),
+            f"{1e3 * D[i]:.3f}",
+            f"{1e3 * A[i]:.3f}",
+        ]
+        cells += [f"{np.degrees(ALPHA[i]):.3f}"] + ([repr(float(np.degrees(beta[i])))] if beta is not None else [])
+        lines.append(mark.join(cell.replace(".", ",") for cell in cells))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("beta", [None, BETA])
+def test_a_standard_table_reaches_the_same_poses(tmp_path: Path, beta: np.ndarray | None) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text(sheet(beta))
+    arm = read_sheet(path, "standard" if beta is None else "hayati")
+    q = RNG.uniform(-2, 2, (20, 6))
+    tilt = np.zeros(6) if beta is None else beta
+    found = numeric_frame(arm.base) @ ro.robot.forward_kinematics(arm.robot, q) @ numeric_frame(arm.tool)
+    for row, T in zip(q, found, strict=True):
+        truth = np.eye(4)
+        for i in range(6):
+            truth = truth @ numeric_link(theta=THETA[i] + row[i], d=D[i]) @ numeric_link(ALPHA[i], A[i])
+            truth = truth @ numeric_link(beta=tilt[i])
+        assert np.abs(T - truth).max() < 1e-12
+
+
+def test_a_table_that_does_not_say_its_convention_is_asked_for(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("dh.csv").write_text(sheet())
+    Path("raw.csv").write_text(text([HEAD], ROWS))
+    arguments = ["new", "cell", "--robot", "dh.csv", "--data", "raw.csv"]
+    assert run(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    assert "--dh modified" in error
+    assert "--dh standard" in error
+    assert run(monkeypatch, *arguments, "--dh", "standard") == 0
+    loaded = ro.load("cell").problem
+    assert np.abs(loaded.robot.mdh[1:, 0] - ALPHA[:-1]).max() < 1e-12
+    tool = dict(zip(loaded.parameters.names, loaded.parameters.nominal.tolist(), strict=True))
+    assert tool["tool_x"] == pytest.approx(A[-1])
+    assert tool["tool_rx"] == pytest.approx(ALPHA[-1])
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("i,alpha(i-1) [deg],a(i-1) [mm],d [mm],theta [deg]", "modified"),
+        ("i,alpha [deg],a [mm],d [mm],theta [deg]", ""),
+    ],
+)
+def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, header: str, said: str) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text(f"{header}\n1,0,0,330,0\n2,-90,50,0,-90\n")
+    if said:
+        assert read_sheet(path).robot.mdh[1, 1] == pytest.approx(0.05)
+    else:
+        with pytest.raises(ro.InputError, match="no word of it"):
+            read_sheet(path)
+
+
+def test_a_written_table_has_one_system_of_units_and_reads_back_exactly(tmp_path: Path) -> None:
+    path = tmp_path / "arm.csv"
+    mdh = ARM.mdh + 1e-4 * RNG.normal(size=(6, 5))
+    arm = ro.robot.Robot("arm", mdh)
+    write_robot(arm, path)
+    assert path.read_text().splitlines()[0] == "alpha_rad,a_m,theta_rad,d_m,beta_rad,convention"
+    assert (read_sheet(path).robot.mdh == mdh).all()
+
+
+def test_common_normals_far_away_are_warned_of(tmp_path: Path) -> None:
+    mdh = ARM.mdh.copy()
+    mdh[1, 4] = 1e-4
+    (note,) = write_robodk(ro.robot.Robot("arm", mdh), tmp_path / "robodk.csv")
+    assert "rounded to 0.0001 degrees miss by" in note
+    assert write_robodk(ARM, tmp_path / "plain.csv") == []
