@@ -173,7 +173,8 @@ def read_parquet(path: Path) -> Columns:
         if max(cells, metadata.num_rows * len(schema.names)) > MOST_CELLS or size > LARGEST_DATA:
             found = f"{metadata.num_rows} rows of {len(schema.names)} columns, {size} bytes unpacked"
             raise InputError("the table", found, f"at most {MOST_CELLS} cells and {LARGEST_DATA} bytes")
-        texts = [field.name for field in schema if str(field.type) in ("string", "large_string", "binary")]
+        kinds = ("string", "large_string", "binary", "dictionary")
+        texts = [field.name for field in schema if str(field.type).startswith(kinds)]
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that is there again once
             table = file.read()
         repeated = sum(_repeated(table.column(name)) for name in texts)
@@ -187,6 +188,8 @@ def read_parquet(path: Path) -> Columns:
 def _repeated(column: Any) -> int:
     """Return how many bytes the texts of a column have where each stands in every row that has it."""
     compute = import_module("pyarrow.compute")
+    if str(getattr(column.type, "value_type", "")) not in ("string", "large_string", "binary"):
+        return 0
     sizes = [compute.binary_length(chunk.dictionary).take(chunk.indices) for chunk in column.chunks]
     return sum(compute.sum(each).as_py() or 0 for each in sizes)
 
