@@ -30,11 +30,6 @@ INTENDED = {
     "paper_arm:parallel_axes": CONDITIONAL,
     "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
-    # rounding: unchanged code on two kinds of OpenBLAS kernels differs by 1e-8 of x, 3e-7 of a corner's weight
-    **dict.fromkeys(("mixed", "position", "scara", "seven_axis", "tracker"), ("x",)),
-    **dict.fromkeys(("paper_arm", "paper_arm:tikhonov"), ("x", "weight", "objective", "std")),
-    "paper_arm:two_step": ("expanded",),
-    "plane": ("x", "objective", "std", "expanded"),  # the same in a flat valley, by 4e-5
     "paper_arm:misprints": ("x", "weight", "objective", "std"),  # what a rule sees of a robust loss is decided anew
 }
 """What may differ by more, and why."""
