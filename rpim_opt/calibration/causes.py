@@ -13,12 +13,15 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import (
+    copied_rows,
     exchanged_rows,
+    left_out_together,
     moved,
     moved_far,
     rounded_joints,
     rows_without_values,
     shared_rows,
+    transmission,
 )
 from rpim_opt.problem.misreadings import EXACT, Better, better_reading
 from rpim_opt.problem.problem import CalibrationProblem
@@ -77,7 +80,9 @@ def likely_causes(result: Outcome) -> list[str]:
     if not result.problem.keeps_rows:
         return []
     problem = cast(CalibrationProblem, result.problem)
-    shared = list(shared_rows(problem.data, result.record.validation))
+    shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
+    if result.learned is not None:
+        shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
     distrusted = _distrusted(result)
     errors, pixels = (_but(problem.errors(result.x, of), distrusted) for of in ("length", "pixel"))
     signs = _signs(result, problem, errors, pixels)
@@ -113,6 +118,8 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
         factor = better.stated / max(better.left, EXACT)
         return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, factor))
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
+    if not found:
+        found += transmission(problem, result.x)
     if not found:
         found += rounded_joints(problem, _rms(_but(problem.errors(result.x), _distrusted(result))))
     return tuple(map(Cause, found))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -18,11 +19,11 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.identified import near_parallel
-from rpim_opt.problem.misreadings import Points, better_reading, lever_arms, misfit, placed, points_of
+from rpim_opt.problem.misreadings import better_reading, lever_arms, misfit, placed
 from rpim_opt.problem.observability import Observability, combination, observe
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import Fit
 from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.registration.points import Fit, Points, points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
@@ -249,7 +250,13 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         standing_out=tuple(far),
         repeated=repeated,
         repeatability=repeatability,
-        warnings=(*_ranges(problem), *_copies(data), *shared_rows(data, validation), *_mistakes(problem, fitted, x)),
+        warnings=(
+            *_ranges(problem),
+            *_copies(data),
+            *copied_rows(data),
+            *shared_rows(data, validation),
+            *_mistakes(problem, fitted, x),
+        ),
         proposals=tuple(proposals),
         observability=observe(problem),
         contact=tuple(contact_sentences(problem)),
@@ -390,6 +397,10 @@ FAR_MOVED = 0.005
 RARE = 1e-6
 FEWEST = 6
 MOST_PLACES = 40
+COPIES = 0.2
+"""Part of the rows that may repeat others."""
+TOGETHER = 4
+"""Excluded rows that follow each other, from which on something moved."""
 MOST_EQUATIONS = 3000
 
 
@@ -520,6 +531,83 @@ def _decimals(values: Array) -> int | None:
         if np.abs(scaled - scaled.round()).max() < 1e-6 * max(np.abs(scaled).max(), 1.0) ** 0.5:
             return decimals
     return None
+
+
+def copied_rows(data: Dataset) -> Iterator[str]:
+    """Say that rows are copies of others, joint and measured values alike: they do not count as measurements."""
+    for block in data.blocks:
+        if not block.measurement.columns or len(block.row) < FEWEST:
+            continue
+        rows = np.hstack([block.q.reshape(len(block.row), -1), block.y])
+        first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)[1:]
+        copies = len(rows) - len(first)
+        if copies >= COPIES * len(rows):
+            named = listed([data.label[block.row[i]] for i in np.sort(first[count > 1])], 3)
+            yield (
+                f"{copies} of {len(rows)} rows repeat others to the last digit (first {named}): copies are no "
+                "measurements, and make uncertainties too small; leave them out."
+            )
+
+
+def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:
+    """Say that rows that were excluded follow each other in time: what moved is the instrument, not one reading.
+
+    ``labels``: of the rows that were kept, which have to be in the order of their numbers for that to be known.
+    """
+    numbers = {label: [int(part) for part in re.findall(r"\d+", label)] for label in (*labels, *left_out)}
+    ordered = sorted(numbers, key=lambda label: numbers[label])
+    if [label for label in ordered if label not in left_out] != list(labels):
+        return
+    at = np.array([i for i, label in enumerate(ordered) if label in left_out], dtype=int)
+    for run in np.split(at, np.flatnonzero(np.diff(at) > 2) + 1):
+        if len(run) >= TOGETHER:
+            yield (
+                f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers, and follow each other: did "
+                "the instrument or the robot's foot move there? Calibrate the parts apart, or register the second anew."
+            )
+
+
+def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Say whether the residuals at x (n,) are those of a joint's gear ratio, or of a coupling to another joint.
+
+    One column, the slope of a joint's zero times the value of a joint, is added to the last linearization. It must
+    explain half of the sum of squares, more than chance does once in a million (F test, all columns counted).
+    """
+    free = problem.parameters.free
+    model = problem.linearize(x)
+    if len(model.b) > MOST_EQUATIONS:
+        return
+    z = x / free.scale
+    n = len(z)
+    Q = np.linalg.qr(np.vstack([model.A, np.eye(n)]))[0]
+    rest = np.concatenate([model.b - model.A @ z, np.zeros(n)])
+    rest = rest - Q @ (Q.T @ rest)
+    row = np.concatenate([np.repeat(block.row, len(block.measurement.components)) for block in problem.data.blocks])
+    q = problem.joint_values[row]
+    found: list[tuple[float, int, int, float]] = []
+    for i, kind in enumerate(problem.robot.joint_types):
+        name = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
+        if name not in free.names:
+            continue
+        k = free.names.index(name)
+        for j in range(q.shape[1]):
+            g = np.concatenate([model.A[:, k] * q[:, j] / free.scale[k], np.zeros(n)])
+            g = g - Q @ (Q.T @ g)
+            size = float(g @ g)
+            if size > 0:
+                found.append((float(g @ rest) ** 2 / size, i, j, float(g @ rest) / size))
+    if not found:
+        return
+    gain, i, j, factor = max(found)
+    whole = float(rest @ rest)
+    freedom = max(len(model.b) - n - 1, 1)
+    chance = fdtrc(1, freedom, gain / max((whole - gain) / freedom, 1e-300)) * len(found)
+    if gain > (1 - MOVED) * whole and chance < RARE:
+        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder says (gear ratio)"
+        if i != j:
+            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
+        left = 100 * np.sqrt(max(whole - gain, 0.0) / whole)
+        yield f"{what}: that leaves {left:.0f} % of the residuals; write it into coupling in robot.toml."
 
 
 def moved_far(problem: CalibrationProblem) -> Iterator[str]:

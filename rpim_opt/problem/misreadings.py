@@ -1,9 +1,9 @@
-"""Likely misreadings of a table (units, signs, orders, another robot), by how well nominal kinematics fit."""
+"""Likely misreadings of a table (units, orders, couplings, conventions, another robot), by how well they fit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -13,147 +13,50 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.camera import posed
-from rpim_opt.problem.registration.closed_forms import Fit, hand_eye, register_arm, transforms
+from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
+from rpim_opt.problem.registration.global_start import described, explained, rms, search
+from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
 from rpim_opt.robot.formats.tables import read_mdh
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
 
-MOST_ROWS = 300
-"""Rows that are tried, evenly spread where there are more."""
-FEWEST_ROWS = 6
-AT_ONCE = 128
-"""Readings that are fitted at once: more need memory, and are not faster."""
-LONGEST = 3.0
-"""A reflector farther from the flange [m] is none."""
-BEST = 0.75
-"""The part of the rows, the best ones, whose errors are counted."""
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """N measured points of a robot.
-
-    Joint values of the controller q (N, dof) [rad or m], positions y (N, 3) [m], numbers of the M reflectors
-    ``marker`` (N,), ``tools`` (M, 3) where these are stated in the flange frame [m], orientations ``turns`` (N, 3, 3)
-    or None, rows of the dataset (N,), and whether they are poses of a camera's views.
-    """
-
-    q: Array
-    y: Array
-    marker: np.ndarray
-    tools: Array
-    turns: Array | None
-    row: np.ndarray
-    seen: bool = False
-
-    def take(self, index: Sequence[int] | np.ndarray) -> Points:
-        """Return the points at ``index``."""
-        turns = None if self.turns is None else self.turns[index]
-        return replace(
-            self, q=self.q[index], y=self.y[index], marker=self.marker[index], turns=turns, row=self.row[index]
-        )
-
-    @property
-    def extent(self) -> float:
-        """How far the points spread [m]."""
-        return float(np.linalg.norm(self.y.std(axis=0)))
-
-
-def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
-    """Return the measured points of positions, poses and a camera's views; None where there are too few."""
-    p = problem.parameters
-    own = dict(zip(p.names, p.nominal.tolist(), strict=True))
-    try:
-        data = posed(problem.data, own)
-    except InputError:
-        return None
-    blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
-    if sum(len(block.row) for block in blocks) < FEWEST_ROWS:
-        return None
-    whole = _together(blocks, own)
-    number = {label: i for i, label in enumerate(problem.data.label)}
-    row = np.array([number[data.label[i]] for i in whole.row])
-    count = len(row)
-    evenly = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-    return replace(whole, row=row, seen=data is not problem.data).take(np.argsort(row, kind="stable")[evenly])
-
-
-def _together(blocks: Sequence[Block], own: Mapping[str, float]) -> Points:
-    """Return the points of all blocks, reflectors where the parameters' values by name put them."""
-    markers = list(dict.fromkeys(block.markers[0] for block in blocks))
-    return Points(
-        q=np.concatenate([block.q[:, 0] for block in blocks]),
-        y=np.concatenate([block.y[:, :3] for block in blocks]),
-        marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
-        tools=_reflectors(markers, own),
-        turns=_turns(blocks, markers),
-        row=np.concatenate([block.row for block in blocks]),
-    )
-
-
-def _turns(blocks: Sequence[Block], markers: Sequence[str]) -> Array | None:
-    """Return the measured orientations (N, 3, 3), where all rows are poses of one reflector."""
-    if len(markers) > 1 or any(block.measurement.name != "pose" for block in blocks):
-        return None
-    return np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
-
-
-def _reflectors(markers: Sequence[str], own: Mapping[str, float]) -> Array:
-    """Return where reflectors are stated in the flange frame (M, 3) [m]; at the flange where that is none."""
-    tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers])
-    tools[np.linalg.norm(tools, axis=1) > LONGEST] = 0.0  # where a fit to lengths in another unit put them
-    return tools
+STEPS = 16
+"""Steps of a fit of base and reflectors."""
+ZERO_STEPS = 20
+"""Steps of a fit of joint zeros, too."""
 
 
 def placed(robot: Robot, points: Points) -> Fit:
-    """Return where base and reflectors fit best, robot nominal: modelled (N, 3), errors (N,), base, reflectors."""
-    return Fit(*(each[0] for each in _fitted(robot, [points])))
+    """Return where base and reflectors fit best, robot nominal: the only candidate's fit, of poses their positions."""
+    fit = _nominal(robot, points)
+    every = 1 if points.turns is None else 4
+    return Fit(
+        fit.modelled[0, ::every], fit.error[0, ::every], fit.cost[0], fit.base[0], fit.tools[0, ::every], fit.zero[0]
+    )
 
 
-def _fitted(robot: Robot, tries: Sequence[Points]) -> Fit:
-    """Return where base and reflectors fit each of B tries of as many points best."""
-    q = np.stack([points.q for points in tries])
-    flange = forward_kinematics(robot, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
-    y, marker, tools = (np.stack([getattr(points, name) for points in tries]) for name in ("y", "marker", "tools"))
-    return register_arm(flange, y, marker, tools)
+def _nominal(robot: Robot, points: Points) -> Fit:
+    return fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
 
 
 def misfit(robot: Robot, points: Points) -> float:
-    """Return the error over the extent of the points, of poses with their angles [rad].
-
-    The error is the RMS of the best three quarters of the rows.
-    """
-    return float(misfits(robot, [points])[0])
+    """Return the error over the extent of the points, the RMS of the best three quarters; robot nominal."""
+    return float(rms(_nominal(robot, points))[0]) / points.extent
 
 
 def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
-    """Return the `misfit` of many readings of a table, (B,); those of as many rows at once."""
+    """Return the same (B,) of many readings of a table, joint zeros fitted."""
     found = np.full(len(tries), np.inf)
     sizes = np.array([len(points.row) for points in tries])
     for size in np.unique(sizes):
-        for some in np.array_split(np.flatnonzero(sizes == size), 1 + np.count_nonzero(sizes == size) // AT_ONCE):
-            chosen = [tries[i] for i in some]
-            error = np.sort(_fitted(robot, chosen).error, axis=1)[:, : int(np.ceil(BEST * size))]
-            extent = np.array([max(points.extent, 1e-12) for points in chosen])
-            found[some] = np.sqrt(np.mean(error**2, axis=1)) / extent
-    for i, points in enumerate(tries):
-        if points.turns is not None:
-            found[i] = np.hypot(found[i], _angle(robot, points))
+        some = np.flatnonzero(sizes == size)
+        chosen = [tries[i] for i in some]
+        fits = fit_arms(robot, Candidates.of(robot, chosen), ZERO_STEPS, zeros=True, robust=True)
+        found[some] = rms(fits) / [points.extent for points in chosen]
     return found
-
-
-def _angle(robot: Robot, points: Points) -> float:
-    """Return the median angle [rad] between measured and nominal orientations, base and tool fitted."""
-    measured = np.tile(np.eye(4), (len(points.q), 1, 1))
-    measured[:, :3, :3] = points.turns
-    measured[:, :3, 3] = points.y
-    angles = _angles(robot, points.q, measured)
-    return 0.0 if angles is None else float(np.median(angles))
 
 
 def _angles(robot: Robot, q: Array, measured: Array) -> Array | None:
@@ -195,7 +98,7 @@ FURTHER = 0.7
 """A second mistake is looked for behind a reading that leaves less than this part."""
 WRONG = 0.02
 """Points that are off by more than this part of their extent fit no drawing of their robot."""
-FEW = 60
+FEW = 30
 """Rows of a first try; what comes near the best is tried on more."""
 NEAR = 2.0
 SAME = 1.05
@@ -206,6 +109,16 @@ EXACT = 1e-9
 """A smaller error [m] is none."""
 BEAM = 8
 """First mistakes behind which a second one is looked for."""
+COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
+"""How much of another joint a joint may count, of a neighbour and of others."""
+LENGTHS = {
+    1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m"),
+    1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm"),
+    25.4: ("in inches, not mm", "name the columns X [in], ... and use rpim-opt new"),
+    10.0: ("in cm, not mm", "name the columns X [cm], ... and use rpim-opt new"),
+    1e-2: ("in cm, not m", "name the columns X [cm], ... and use rpim-opt new"),
+}
+"""Factors between units of lengths, what was read wrongly, and what to write."""
 
 
 class Reading(NamedTuple):
@@ -228,30 +141,33 @@ class Better(NamedTuple):
     @property
     def sentence(self) -> str:
         """Say it with the figures."""
+        alike = ""
+        if ", or " in self.what:
+            alike = " These fit alike, and differ in what the data do not show: change what the set-up confirms."
         figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
         times = three_digits(self.stated / max(self.left, EXACT))
-        return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}."
+        return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
 
 
 def joint_readings(robot: Robot) -> Iterator[Reading]:
-    """Yield readings with other joint values: units, signs, zeros, orders, couplings."""
+    """Yield readings with other joint values: units, signs, orders, couplings; zeros are fitted."""
     turning = np.array([kind == "revolute" for kind in robot.joint_types])
     n = robot.dof
     eye = np.eye(n)
 
-    def of(what: str, remedy: str, M: Array, shift: Array | float = 0.0) -> Reading:
-        return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T + shift))
+    def of(what: str, remedy: str, M: Array) -> Reading:
+        return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
-    degrees = np.diag(np.where(turning, np.pi / 180, 1))
-    yield of("joint values read as degrees, not radians", "name the columns q1_deg, ... (--units deg)", degrees)
-    radians = np.diag(np.where(turning, 180 / np.pi, 1))
-    yield of("joint values read as radians, not degrees", "name the columns q1_rad, ... (--units rad)", radians)
+    units = {
+        "as degrees, not radians": (np.pi / 180, "name the columns q1_deg, ... (--units deg)"),
+        "as radians, not degrees": (180 / np.pi, "name the columns q1_rad, ... (--units rad)"),
+        "as gon, not degrees": (0.9, "multiply the joint values by 0.9"),
+    }
+    for what, (factor, remedy) in units.items():
+        yield of(f"joint values read {what}", remedy, np.diag(np.where(turning, factor, 1)))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
-        yield of(f"joint {i + 1} counted the other way", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
-        for angle in (90, -90, 180):
-            remedy = f"add {angle} deg to theta_deg of joint {i + 1} in robot.toml"
-            yield of(f"joint {i + 1} shifted by {angle} deg", remedy, eye, np.radians(angle) * eye[i])
+        yield of(f"joint {i + 1} reversed", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
     for i, j in combinations(range(n), 2):
         if turning[i] == turning[j]:
             order = list(range(n))
@@ -266,34 +182,30 @@ def _couplings(robot: Robot, of: Callable[..., Reading]) -> Iterator[Reading]:
     n = robot.dof
     turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
     for i, j in permutations(turning, 2):
-        for sign in (1, -1):
+        for factor in COUPLINGS[abs(i - j) == 1]:
             M = np.eye(n)
-            M[i, j] = sign
+            M[i, j] = factor
             rows = ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in M)
-            word = "plus" if sign > 0 else "minus"
-            what = f"joint {i + 1} coupled to joint {j + 1} (q{i + 1} {word} q{j + 1})"
+            size = "" if abs(factor) == 1 else f"{abs(factor):g} "
+            word = "plus" if factor > 0 else "minus"
+            what = f"joint {i + 1} coupled to joint {j + 1} (q{i + 1} {word} {size}q{j + 1})"
             yield of(what, f"write coupling = [{rows}] in robot.toml", M)
 
 
 def measured_readings() -> Iterator[Reading]:
-    """Yield readings with other measured values: units, handedness, transforms the other way."""
+    """Yield readings with other measured values: units of all columns or one, handedness."""
 
     def scaled(what: str, remedy: str, factors: list[float]) -> Reading:
         return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
-    yield scaled("measured lengths a thousand times larger", "name the columns x_m, y_m, z_m", [1e3] * 3)
-    yield scaled("measured lengths a thousand times smaller", "name the columns x_mm, y_mm, z_mm", [1e-3] * 3)
-    yield scaled("measured lengths in inches, not mm", "name the columns X [in], ... and use rpim-opt new", [25.4] * 3)
+    for factor, (unit, remedy) in LENGTHS.items():
+        yield scaled(f"measured lengths {unit}", remedy, [factor] * 3)
+        for k, axis in enumerate("xyz"):
+            factors = [1.0] * 3
+            factors[k] = factor
+            yield scaled(f"column {axis} {unit}", f"multiply column {axis} by {factor:g} or name its unit", factors)
     remedy = "change the sign of one coordinate, or exchange two"
-    yield Reading("the measured frame mirrored (left-handed)", remedy, _mirrored)
-
-
-def _mirrored(points: Points) -> Points:
-    mirror = np.diag([1.0, 1.0, -1.0])
-    turns = points.turns
-    if turns is not None:
-        turns = mirror @ turns @ mirror
-    return replace(points, y=points.y * np.diag(mirror), turns=turns)
+    yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
 def pose_readings() -> Iterator[Reading]:
@@ -305,6 +217,27 @@ def pose_readings() -> Iterator[Reading]:
     )
 
     yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", _inverted)
+    for order in map("".join, permutations("xyz")):
+        for kind, axes in (("fixed", order), ("moving", order.upper())):
+            if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
+                what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
+                yield Reading(what, "convert them to roll, pitch, yaw, or to quaternions", _euler(axes))
+    for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
+        yield Reading(f"Euler angles in {unit}", "convert them to degrees", _euler("xyz", factor))
+
+
+def _euler(axes: str, factor: float = 1.0) -> Callable[[Points], Points]:
+    """Return the reading of angles rx, ry, rz, taken for roll, pitch, yaw, about other axes or in another unit."""
+
+    def changed(points: Points) -> Points:
+        if points.turns is None:
+            return points
+        angles = factor * scipy.spatial.transform.Rotation.from_matrix(points.turns).as_euler("xyz")
+        columns = ["xyz".index(axis) for axis in axes.lower()]
+        turns = scipy.spatial.transform.Rotation.from_euler(axes, angles[:, columns]).as_matrix()
+        return replace(points, turns=turns)
+
+    return changed
 
 
 def _inverted(points: Points) -> Points:
@@ -353,12 +286,24 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     points = points_of(problem)
     if points is None:
         return None
-    stated = misfit(problem.robot, points)
+    robot = problem.robot
+    mapping = None if explained(robot, points) else search(robot, points)
+    if mapping is not None:
+        words = described(robot.joint_types, mapping.sign, mapping.zero)
+        what, remedy = words, "write sign and theta_deg of these joints in robot.toml"
+        if mapping.mirrored:
+            what = f"the measured frame mirrored (left-handed), or {words}"
+            remedy = (
+                "change the sign of one coordinate (or exchange two), or write sign and theta_deg of these joints in "
+                "robot.toml; a known direction in the instrument's frame, up for instance, tells which"
+            )
+        return Better(what, remedy, mapping.nominal, mapping.left)
+    stated = misfit(robot, points)
     if not np.isfinite(stated):
         return None
-    found = _searched(problem.robot, points, stated)
+    found = _searched(robot, points, stated)
     if found is None and stated > WRONG and not points.seen:
-        found = _reordered(problem.robot, points, stated) or _other_robot(problem.robot, points, stated)
+        found = _reordered(robot, points, stated) or _other_robot(robot, points, stated)
     return found
 
 
@@ -454,7 +399,7 @@ def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Readin
     k = int(np.argmin(whole))
     same = [readings[i] for i, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
     best = readings[near[k]]
-    return best._replace(others=tuple(each for each in same if each is not best)[:2]), float(whole[k])
+    return best._replace(others=tuple(each for each in same if each is not best)[:3]), float(whole[k])
 
 
 def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
@@ -486,15 +431,23 @@ def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
 
 def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
     """Return the ready robot with as many joints that fits far better."""
-    best = stated
-    name = ""
-    for each in robots():
-        other = read_mdh(READY / f"{each}.toml")
-        if other.joint_types == robot.joint_types:
-            size = misfit(other, points)
-            if size < best:
-                best, name = size, each
-    if not best < BETTER * stated:
+    tried = [(f"the ready robot {each}", f'write robot = "{each}" in problem.toml', read_mdh(READY / f"{each}.toml"))
+             for each in robots()]  # fmt: skip
+    same = [each for each in tried if each[2].joint_types == robot.joint_types]
+    size = [misfit(other, points) for _, _, other in (*_conventions(robot), *same)]
+    what, remedy, _ = (*_conventions(robot), *same)[int(np.argmin(size))]
+    if not min(size) < BETTER * stated:
         return None
-    other = Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', lambda points: points)
-    return _compared(robot, [other], points, stated, best)
+    return _compared(robot, [Reading(what, remedy, lambda points: points)], points, stated, min(size))
+
+
+def _conventions(robot: Robot) -> Iterator[tuple[str, str, Robot]]:
+    """Yield what was mistaken, what to write, and the robot of a table in the other Denavit-Hartenberg convention."""
+    for which, shift, remedy in (
+        ("standard (distal)", 1, "move alpha and a of every row to the next row (the first row's are 0)"),
+        ("modified (proximal)", -1, "move alpha and a of every row to the row before"),
+    ):
+        mdh = robot.mdh.copy()
+        mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
+        mdh[0 if shift > 0 else -1, :2] = 0.0
+        yield f"a table in the {which} Denavit-Hartenberg convention", remedy, replace(robot, mdh=mdh)

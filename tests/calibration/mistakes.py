@@ -94,6 +94,14 @@ def coupled(i: int, j: int, factor: float) -> Change:
     return joints(change)
 
 
+def twice(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Write every row a second time."""
+    (block,) = problem.data.blocks
+    rows = np.arange(2 * COUNT)
+    again = replace(block.take(np.tile(np.arange(COUNT), 2), rows), row=rows)
+    return problem.on(ro.Dataset((again,), tuple(f"R{i}" for i in rows), rows))
+
+
 def rounded(degrees: float) -> Change:
     step = np.radians(degrees)
     return joints(lambda q: (q / step).round() * step)
@@ -153,6 +161,17 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "joint 2 from 90 degrees and joint 3 reversed": (both(shifted(1, 90), flipped(2)), MAPPED),
     "joint 3 coupled to 2": (coupled(2, 1, 1.0), "joint 3 coupled to joint 2 (q3 minus q2)"),
     "joint 3 coupled to 2 the other way": (coupled(2, 1, -1.0), "joint 3 coupled to joint 2 (q3 plus q2)"),
+    "joint 3 coupled to half of 2": (coupled(2, 1, 0.5), "q3 minus 0.5 q2"),
+    "gon as degrees": (joints(lambda q: q / 0.9), "as gon, not degrees"),
+    "centimetres as millimetres": (values(lambda y: y / 10), "in cm, not mm"),
+    "a column in centimetres": (values(lambda y: y / [1, 10, 1]), "column y in cm, not mm"),
+    "a column in centimetres, joints exchanged": (
+        both(values(lambda y: y / [1, 1, 10]), exchanged(3, 5)),
+        "joints 4 and 6 exchanged",
+    ),
+    "joint 6 coupled to an 81st of 5": (coupled(5, 4, 1 / 81), "joint 6 is coupled to joint 5"),
+    "a gear of joint 3 that is 1 % off": (joints(lambda q: q * (1 + 0.01 * (np.arange(q.shape[-1]) == 2))), "joint 3"),
+    "every row twice": (lambda problem: twice(problem), "repeat others to the last digit"),
     "joint 5 coupled to 4": (coupled(4, 3, 1.0), "joint 5 coupled to joint 4"),
     "degrees as radians": (joints(np.degrees), "degrees, not radians"),
     "radians as degrees": (joints(np.radians), "radians, not degrees"),

@@ -49,8 +49,8 @@ MISTAKES = {
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
     "metres as millimetres": ("position", {"y": lambda y: 1e-3 * y}, "a thousand times larger"),
     "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
-    "joint 3 the other way": ("seven_axis", {"q": flip(2)}, "joint 3 counted the other way"),
-    "joint 2 from another zero": ("position", {"q": shift(1)}, "joint 2 shifted by -90 deg"),
+    "joint 3 the other way": ("seven_axis", {"q": flip(2)}, "joint 3 reversed"),
+    "joint 2 from another zero": ("position", {"q": shift(1)}, "zero of joint 2 -90.0 deg"),
 }
 
 

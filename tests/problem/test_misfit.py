@@ -11,15 +11,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import (
-    FEWEST_ROWS,
-    Points,
-    lever_arms,
-    misfit,
-    misfits,
-    placed,
-    points_of,
-)
+from rpim_opt.problem.misreadings import lever_arms, misfit, placed
+from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, points_of
 from tests.simulate import ARM
 
 TOOLS = np.array([[0.05, -0.02, 0.1], [-0.04, 0.06, 0.08]])
@@ -42,9 +35,9 @@ def measured(count: int = 24, moved: float = 0.0, seed: int = 0) -> Points:
 def test_base_and_reflectors_come_back(moved: float) -> None:
     points = measured(moved=moved)
     found = placed(ARM, points)
-    assert found.error.max() < 1e-4 * (moved > 0) + 1e-9
-    assert found.base == pytest.approx(BASE, abs=1e-4 * (moved > 0) + 1e-9)
-    assert found.tools == pytest.approx(TOOLS, abs=1e-4 * (moved > 0) + 1e-9)
+    assert found.error.max() < 1e-4 * (moved > 0) + 1e-7
+    assert found.base == pytest.approx(BASE, abs=1e-4 * (moved > 0) + 1e-7)
+    assert found.tools == pytest.approx(TOOLS, abs=1e-4 * (moved > 0) + 1e-7)
     assert found.modelled == pytest.approx(points.y, abs=1e-4)
 
 
@@ -67,25 +60,14 @@ def test_the_misfit_is_of_the_best_three_quarters_over_the_extent() -> None:
     assert misfit(ARM, noisy) == pytest.approx(np.sqrt(np.mean(error**2)) / extent, rel=1e-9)
 
 
-def test_many_readings_are_judged_as_each_alone() -> None:
-    """Whatever their sizes, and whatever stands beside them."""
-    rng = np.random.default_rng(3)
-    tries = [measured(count, seed=k) for k, count in enumerate([24, 30, 24, 12, 30])]
-    tries = [replace(each, y=each.y + 1e-2 * rng.normal(size=each.y.shape)) for each in tries]
-    assert misfits(ARM, tries) == pytest.approx([misfit(ARM, each) for each in tries], rel=1e-6)
-
-
-def test_orientations_count_with_their_median_angle() -> None:
+def test_orientations_count_by_the_tips_of_their_axes() -> None:
     problem = ro.load("pose").problem
     points = points_of(problem)
     assert points is not None
     assert points.turns is not None
-    alone = misfit(problem.robot, replace(points, turns=None))
-    turned = misfit(problem.robot, points)
-    angle = np.sqrt(turned**2 - alone**2)
-    assert 0 < angle < 0.05  # of a robot as drawn
+    assert misfit(problem.robot, points) < 0.01  # of a nominal robot
     back = replace(points, turns=np.swapaxes(points.turns, 1, 2))
-    assert misfit(problem.robot, back) > 0.5
+    assert misfit(problem.robot, back) > 0.1
 
 
 def test_only_poses_of_one_reflector_have_orientations() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -15,13 +14,6 @@ Place = Sequence[float] | Array
 """A frame's six numbers, or a point's three."""
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
 """What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
-STEPS = 7
-SHORT = 1e-5
-"""Reflectors are found when they move by less [m], and where nothing fits earlier: what is off by metres stays so."""
-TRUSTED = 3.0
-"""Rows further than so many medians count less, in proportion: blunders do not decide what a table means."""
-TINY = 1e-13
-"""Keeps normal equations regular where a direction is not observed."""
 
 
 def register(source: Array, target: Array, weights: Array | None = None) -> Array:
@@ -64,87 +56,11 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
         spread = np.linalg.svd(np.sqrt(q)[:, None] * (points - q @ points / q.sum()), compute_uv=False)
         if spread[1] <= 1e-6 * spread[0]:
             raise InputError(f"{what} points", "points on a line, or all in one place", "points that span a plane")
-    return _rigid_motions(source[None], target[None], q[None])[0]
-
-
-def _rigid_motions(source: Array, target: Array, weights: Array) -> Array:
-    """Return the motions (B, 4, 4) of `register`, of B sets of points (B, N, 3)."""
-    q = weights[:, :, None]
-    p = (q * source).sum(axis=1) / q.sum(axis=1)
-    r = (q * target).sum(axis=1) / q.sum(axis=1)
-    T = np.tile(np.eye(4), (len(q), 1, 1))
-    T[:, :3, :3] = proper(np.swapaxes(target - r[:, None], 1, 2) @ (q * (source - p[:, None])))
-    T[:, :3, 3] = r - np.einsum("bij,bj->bi", T[:, :3, :3], p)
+    p, r = q @ source / q.sum(), q @ target / q.sum()
+    T = np.eye(4)
+    T[:3, :3] = proper((target - r).T @ (q[:, None] * (source - p)))
+    T[:3, 3] = r - T[:3, :3] @ p
     return T
-
-
-class Fit(NamedTuple):
-    """Where base and reflectors fit positions best: of B sets of N points, M reflectors.
-
-    Modelled points (B, N, 3) and their errors (B, N) [m], bases (B, 4, 4) in the instrument's frame, and reflectors
-    (B, M, 3) in the flange frame.
-    """
-
-    modelled: Array
-    error: Array
-    base: Array
-    tools: Array
-
-
-def register_arm(flange: Array, y: Array, marker: np.ndarray, stated: Array, robust: bool = True) -> Fit:
-    """Return base and reflectors of many sets of positions at once, robot nominal.
-
-    Minimizes sum_i w_i |y_i - R (R_i o + p_i) - t|^2 + (0.005 |o - o_stated| / 0.1)^2 over R, t and the reflectors o
-    by Gauss-Newton steps from a registration. SciPy's least_squares takes one set at a time, and hundreds are tried.
-
-    ``flange``: (B, N, 4, 4) of the nominal robot. ``y``: (B, N, 3) measured positions [m]. ``marker``: (B, N) number
-    of the reflector. ``stated``: (B, M, 3) where the reflectors are stated [m]. ``robust``: whether weights fall as 1
-    / error beyond three medians; otherwise they are one.
-    """
-    tools = stated.copy()
-    weights = np.ones(y.shape[:2])
-    fit = _modelled(flange, y, marker, tools, weights)
-    for _ in range(STEPS):
-        if robust:
-            limit = TRUSTED * np.median(fit.error, axis=1, keepdims=True) + 1e-12
-            weights = np.minimum(1.0, limit / np.maximum(fit.error, 1e-300))
-        step = _step(flange, y, marker, stated, weights, fit)
-        short = SHORT * (1 + np.median(fit.error, axis=1) / NOMINAL_ERROR)
-        if (np.abs(step).max(axis=(1, 2)) < short).all():
-            break
-        fit = _modelled(flange, y, marker, fit.tools + step, weights)
-    return fit
-
-
-def _modelled(flange: Array, y: Array, marker: np.ndarray, tools: Array, weights: Array) -> Fit:
-    which = np.arange(len(y))[:, None]
-    body = np.einsum("bnij,bnj->bni", flange[..., :3, :3], tools[which, marker]) + flange[..., :3, 3]
-    base = _rigid_motions(body, y, weights)
-    modelled = np.einsum("bij,bnj->bni", base[:, :3, :3], body) + base[:, None, :3, 3]
-    return Fit(modelled, np.linalg.norm(y - modelled, axis=2), base, tools)
-
-
-def _step(flange: Array, y: Array, marker: np.ndarray, stated: Array, weights: Array, fit: Fit) -> Array:
-    """Return the steps (B, M, 3) of the reflectors; base and reflectors move together."""
-    B, N, _ = y.shape
-    M = stated.shape[1]
-    turned = fit.base[:, None, :3, :3] @ flange[..., :3, :3]
-    away = fit.modelled - fit.modelled.mean(axis=1, keepdims=True)
-    J = np.zeros((B, N, 3, 6 + 3 * M))
-    J[..., :3] = np.eye(3)
-    J[..., 3:6] = np.cross(np.eye(3), away[..., None, :]).swapaxes(2, 3)
-    for m in range(M):
-        J[..., 6 + 3 * m : 9 + 3 * m] = turned * (marker == m)[:, :, None, None]
-    root = np.sqrt(weights)[:, :, None]
-    A = (J * root[..., None]).reshape(B, 3 * N, -1)
-    b = ((y - fit.modelled) * root).reshape(B, 3 * N)
-    ridge = np.zeros(6 + 3 * M)
-    ridge[6:] = (NOMINAL_ERROR / TOOL_ERROR) ** 2
-    normal = np.swapaxes(A, 1, 2) @ A
-    normal += np.diag(ridge) + TINY * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6 + 3 * M)
-    right = np.einsum("bki,bk->bi", A, b)
-    right[:, 6:] += ridge[6:] * (stated - fit.tools).reshape(B, 3 * M)
-    return np.linalg.solve(normal, right[..., None])[:, 6:, 0].reshape(B, M, 3)
 
 
 def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), spread: float = np.inf) -> Array:

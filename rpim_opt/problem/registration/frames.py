@@ -28,10 +28,10 @@ from rpim_opt.problem.registration.closed_forms import (
     hand_eye,
     proper,
     register,
-    register_arm,
     tool_from_distances,
     transforms,
 )
+from rpim_opt.problem.registration.points import Candidates, fit_arms
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
@@ -42,6 +42,8 @@ from rpim_opt.robot.parameters import Parameters, model_parameters
 
 ENOUGH, FEW = 2000, 300
 """Rows of a measurement that register frames, where there are more; of all together, where they are only compared."""
+QUICK_STEPS = 12
+"""Steps of a registration of base and reflectors."""
 MISFIT = 3.0
 """Nominal errors of a robot up to which positions agree with a registration in closed form."""
 FREE = 0.1
@@ -141,7 +143,10 @@ def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Loca
     register(
         np.einsum("nij,nj->ni", flange[:, :3, :3], places[marker]) + flange[:, :3, 3], y
     )  # refuses points on a line
-    fit = register_arm(flange[None], y[None], marker[None], places[None], robust=False)
+    q = np.concatenate([block.q[:, 0] for block in seen]) @ robot.joint_map.T
+    spread = np.full(len(places), TOOL_ERROR)
+    asked = Candidates(q[None], y[None], marker[None], np.zeros((1, robot.dof)), places[None], places, spread)
+    fit = fit_arms(robot, asked, QUICK_STEPS)
     if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
         return None
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}

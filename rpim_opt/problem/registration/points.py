@@ -27,8 +27,10 @@ LEVER = 0.3
 """Length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions."""
 TRUSTED = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
-REWEIGHTED = 5
+REWEIGHTED = 2
 """Steps between two computations of these weights."""
+QUIET = 5
+"""Steps in a row without a decrease that end a fit."""
 FIRST_DAMPING = 1e-2
 LARGEST_BATCH = 4_000_000
 """Entries of the Jacobians that are held at once."""
@@ -285,7 +287,7 @@ def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bo
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
         state = state.where(better, candidate)
         quiet = 0 if (before - state.cost > SHORT * before).any() else quiet + 1
-        if quiet == REWEIGHTED:
+        if quiet == QUIET:
             break
     base = np.tile(np.eye(4), (B, 1, 1))
     base[:, :3, :3] = np.swapaxes(state.base, 1, 2)
