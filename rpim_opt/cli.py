@@ -415,6 +415,7 @@ def export(
     ur_calibration: Annotated[File, Option(help="calibration.conf of a Universal Robot; corrected to --out.")] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
+    corrections: Annotated[File, Option(help="CSV file to write with the joints' transmission errors.")] = None,
     out: Annotated[File, Option(help="File to write; of several sources the folder for them.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -433,9 +434,11 @@ def export(
             geometry_alone,
             with_first_reflector,
             write_all,
+            write_joint_corrections,
         )
 
-        loaded, without = geometry_alone(loaded)
+        whole = loaded
+        loaded, without = geometry_alone(whole)
         robot = with_first_reflector(loaded, marker).robot
         options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
         corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
@@ -443,10 +446,14 @@ def export(
             (ur_kinematics, lambda target: write_ur_kinematics(ur_kinematics or "", robot, target)),
             (ur_calibration, lambda target: export_ur_calibration(loaded, ur_calibration or "", target)),
         ]
-        plain = [(mdh, partial(write_robot, robot)), (robodk, partial(write_robodk, robot))]
+        plain = [
+            (mdh, partial(write_robot, robot)),
+            (robodk, partial(write_robodk, robot)),
+            (corrections, partial(write_joint_corrections, whole)),
+        ]
         writers = [*console.corrected_files(corrected, out), *((target, write) for target, write in plain if target)]
         if not writers:
-            accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, one or several"
+            accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
             raise InputError("export", "nothing to write", accepted)
         notes = [*without, *write_all(writers)]
     written = [target for target, _ in writers]

@@ -13,6 +13,7 @@ from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Tri
 from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, suspects, unexplained
 from rpim_opt.bayes.prior_terms import Stated
+from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
 from rpim_opt.problem.source import Source
@@ -73,14 +74,25 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
     every = sampled(problem)
     estimator, whole, notes = _first(every, estimator, _begin(every, start))
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
-    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
+    curved = None
+    if model == "auto" and possible(fit.problem):
+        curved = admitted(estimator, fit, every.parameters.free.names, trials)
+    if curved is None:
+        x, fitted = fit.x, fit.laid
+        laid = problem.with_parameters(fitted.parameters).scattered(fitted.scatter)
+    else:
+        x, fitted = curved.x, curved.problem
+        laid = problem.with_transmission(fitted.robot.model.curves).with_parameters(fitted.parameters)
+        laid = laid.scattered(fitted.scatter)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
-        outliers = beyond_noise(laid, fit.x)
+        outliers = beyond_noise(laid, x)
     if outliers:
         laid = laid.without(outliers)
     worst = tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1]))
     stated = set(every.parameters.free.names)
     added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
+    if curved is not None:
+        return Found(laid, replace(curved.learned, left_out=worst, notes=notes), curved.stated, x)
     result = learned(fit, added, trials, worst, notes)
     return Found(laid, result, estimator.inside(fit.problem, fit.point), fit.x)
 
@@ -144,6 +156,9 @@ def _without_outliers(
 
 def with_extensions(problem: Source, found: Found) -> Source:
     """Return a problem with the model extensions that were selected, and all else as it was stated."""
+    if found.learned.curves is not None:
+        robots = {name: robot.model.curves for name, robot in found.problem.arms.items()}
+        problem = problem.with_transmission(robots[""])
     p = problem.parameters
     added = np.isin(p.names, found.learned.added)
     scale = np.where(added, found.problem.parameters.scale, p.scale)

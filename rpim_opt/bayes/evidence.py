@@ -409,7 +409,7 @@ class Evidence:
         found = []
         for stack in self.data.stacks:
             N, k = stack.index.shape
-            shares = np.array([_share(stack, kind) for kind in self.noise]).reshape(-1, N, k, k)
+            shares = np.array([noise_share(stack, kind) for kind in self.noise]).reshape(-1, N, k, k)
             found.append((stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None], shares))
         return found
 
@@ -509,7 +509,7 @@ def _by_noise(data: _Informed, residuals: Sequence[Array], z: Array, C: Array) -
     return gradient, f, among
 
 
-def _share(stack: Stack, kind: str) -> Array:
+def noise_share(stack: Stack, kind: str) -> Array:
     """Return what a unit of a noise adds to the covariances (N, k, k)."""
     if kind == "joint":
         return stack.joint @ stack.joint.transpose(0, 2, 1)

@@ -69,6 +69,14 @@ class LeftOut(NamedTuple):
     ratio: float
 
 
+class Transmitted(NamedTuple):
+    """Size and length scale [rad] of the joints' transmission errors, and by how much -2 ln L falls with them."""
+
+    size: Size
+    length: Size
+    gain: float
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Learned(Brief):
     """Hyperparameters that were estimated from the data.
@@ -101,6 +109,8 @@ class Learned(Brief):
         Parameters of model extensions that were added to those that were to be identified.
     notes
         Sentences on how far the marginal likelihood decides.
+    curves
+        Of the joints' transmission errors; None without them.
     """
 
     sizes: Mapping[str, Size]
@@ -115,6 +125,7 @@ class Learned(Brief):
     drift: Array
     added: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    curves: Transmitted | None = None
 
     def _short(self) -> str:
         sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.sizes.items())
@@ -233,7 +244,7 @@ class Estimator:
         if not (np.isfinite(J).all() and np.isfinite(y).all()):
             raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
         unit = free.scale * stated.scale
-        stacks = problem.stacks(joints="joint" in self.noise, at=_values(problem, x))
+        stacks = problem.stacks(joints="joint" in self.noise, at=parameter_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
         heavy = np.isin(np.arange(len(stated.names)), stated.group[stated.heavy])
         base = np.array([name == BASE for name in stated.names], dtype=bool)
@@ -310,7 +321,7 @@ class Estimator:
         p = problem.parameters
         scale = p.scale.copy()
         scale[p.identified] *= self._widths(problem, point)
-        scatter = replace(evidence.scatter(point.logs), at=_values(problem, x))
+        scatter = replace(evidence.scatter(point.logs), at=parameter_values(problem, x))
         return replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
 
 
@@ -342,7 +353,7 @@ def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
     return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
-def _values(problem: CalibrationProblem, x: Array) -> Array:
+def parameter_values(problem: CalibrationProblem, x: Array) -> Array:
     """Return the values (P,) of all parameters at deviations x (n,)."""
     p = problem.parameters
     values = p.nominal.copy()
@@ -396,10 +407,10 @@ def _growth(evidence: Evidence, point: Point) -> Array:
     """Return the slopes (s,) of ln V by the logarithms of hyperparameters, V = tr(X C X' + R) of all lengths read."""
     X = np.vstack([evidence.data.X[stack.index[_read(stack)]] for stack in evidence.data.stacks])
     scatter = evidence.scatter(point.logs)
-    noise = _noise(evidence, scatter)
+    noise = read_noise(evidence.data.stacks, scatter)
     rises = point.falls(point.C @ (X.T @ X) @ point.C)
     for i, kind in enumerate(evidence.noise, len(rises) - len(evidence.noise)):  # R is a sum of squares of the noises
-        rises[i] += 2 * (noise - _noise(evidence, replace(scatter, **{kind: 0.0})))
+        rises[i] += 2 * (noise - read_noise(evidence.data.stacks, replace(scatter, **{kind: 0.0})))
     return np.asarray(rises / (float(np.sum((X @ point.C) * X)) + noise), dtype=float)
 
 
@@ -409,9 +420,8 @@ def _read(stack: Stack) -> np.ndarray:
     return next(kind for kind in kinds if kind.any())
 
 
-def _noise(evidence: Evidence, scatter: Scatter) -> float:
+def read_noise(stacks: Sequence[Stack], scatter: Scatter) -> float:
     """Return the variance of what is read, summed over those equations."""
-    stacks = evidence.data.stacks
     return sum(float(np.sum(np.einsum("nkk->nk", stack.covariance(scatter))[_read(stack)])) for stack in stacks)
 
 

@@ -20,20 +20,17 @@ from rpim_opt.problem.source import Source
 from rpim_opt.robot.extensions import families, family_scales
 from rpim_opt.robot.parameter_names import EXPANSION, frame_of, of_session, own_name, session_prefix
 
-TURNED = 2.0
-"""Travel of a joint [rad] from which its harmonics are looked for: over less they are curve fitting."""
+FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
+TURNED = {FIRST: 2.0, SECOND: 4.0}
+"""Travel of a joint [rad] from which its harmonics are looked for: what less tells of them fails elsewhere."""
 MANY = 40
-"""Configurations from which on the last of the candidates is compared."""
-TURNING = ("first harmonic", "second harmonic")
-"""Extensions of joints that turned far enough."""
-CANDIDATES = (
-    (),
-    ("gravity",),
-    ("first harmonic",),
-    ("gravity", "first harmonic"),
-    ("gravity", "first harmonic", "second harmonic", "moments"),
-)
-"""The models of the arm that are compared."""
+"""Configurations from which on first moments and second harmonics are compared."""
+CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))
+"""The models of the arm that are compared first."""
+FURTHER = {MOMENTS: "gravity", SECOND: FIRST}
+"""Extensions that are asked for one by one beside the best of those, and what each stands beside."""
+ARM = ("gravity", FIRST, SECOND, MOMENTS)
+"""All extensions of the arm, in the order in which they are said."""
 SESSIONS = "sessions"
 """The extension by what the readings of a session have in common, which is none of the arm."""
 WARMTH = "temperature"
@@ -94,11 +91,12 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
 def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
     """Return the parameters of the extensions of one robot, of harmonics those of joints that turned far enough."""
     q = problem.alone(robot).joint_values
-    turned = {str(i) for i, travel in enumerate(np.ptp(q, axis=0), start=1) if travel > TURNED}
+    travel = np.ptp(q, axis=0)
     found = {}
     for family, names in families(problem.arms[robot]).items():
         left = names
-        if family in TURNING:
+        if family in TURNED:
+            turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[family]}
             left = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
         found[family] = [problem.parameters.called(robot, name) for name in left]
     return found
@@ -144,8 +142,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
         point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
             known[conditions] = _named(evidence, point)
-        questions = len(conditions) + (len(candidate) > len(conditions))
-        return Candidate(point.value + GAIN * questions, candidate, point)
+        return Candidate(point.value + GAIN * questions(candidate), candidate, point)
 
     found = sorted(compare_models(fit.problem, extensions, price), key=lambda each: each.price)
     trials = tuple(Trial(each.families, each.found.value) for each in found)
@@ -167,16 +164,30 @@ def compare_models(
     best one each condition is asked for.
     """
     conditions = tuple(condition for condition in CONDITIONS if condition in extensions)
-    arm = CANDIDATES
-    if len(np.unique(problem.data.configuration)) < MANY:
-        arm = CANDIDATES[:-1]
-    possible = [tuple(family for family in candidate if family in extensions) for candidate in arm]
+    possible = [tuple(family for family in candidate if family in extensions) for candidate in CANDIDATES]
     found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
-    best = min(found, key=lambda each: each.price).families
-    kept = tuple(family for family in best if family not in conditions)
+    best = min(found, key=lambda each: each.price)
+    further = FURTHER if _many(problem) else {}
+    for family, beside in further.items():
+        if family in extensions:
+            more = dict.fromkeys((*best.families, beside, family))
+            arm = [each for each in ARM if each in more and each in extensions]
+            found.append(price((*arm, *conditions)))
+            best = min(best, found[-1], key=lambda each: each.price)
+    kept = tuple(family for family in best.families if family not in conditions)
     for count in range(len(conditions)):
         found += [price((*kept, *some)) for some in combinations(conditions, count)]
     return found
+
+
+def questions(families: Sequence[str]) -> int:
+    """Return how many questions a model answers: what it has of `CANDIDATES` is one, every other extension one more."""
+    others = sum(family in FURTHER or family in CONDITIONS for family in families)
+    return others + (len(families) > others)
+
+
+def _many(problem: CalibrationProblem) -> bool:
+    return len(np.unique(problem.data.configuration)) >= MANY
 
 
 def _named(evidence: Evidence, point: Point) -> dict[str, float]:

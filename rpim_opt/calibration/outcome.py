@@ -457,7 +457,10 @@ class Outcome:
         scale[p.identified] = learned.stated
         identified = p.identified & ~np.isin(p.names, learned.added)
         bare = self.problem.scattered(None)
-        return bare.with_parameters(replace(p, scale=scale, identified=identified))
+        bare = bare.with_parameters(replace(p, scale=scale, identified=identified))
+        if learned.curves is None:
+            return bare
+        return bare.with_transmission(())
 
     # --- how the fit is, and what it rests on ------------------------------------------------------------------
 

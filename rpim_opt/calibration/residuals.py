@@ -11,7 +11,7 @@ import scipy
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
+from rpim_opt.bayes.model_selection import FIRST, OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
 from rpim_opt.bayes.prior import family_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import measured_torques, repeatable
@@ -138,7 +138,7 @@ def narrow(problem: CalibrationProblem) -> tuple[int, ...]:
         return ()
     travel = np.ptp(problem.joint_values, axis=0)
     kinds = problem.robot.joint_types
-    return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED)
+    return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED[FIRST])
 
 
 def errors_alike(compared: Comparison, model: Judged) -> Alike | None:

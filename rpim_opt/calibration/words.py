@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import html_table, joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
-from rpim_opt.bayes.prior import BASE, SESSIONS
+from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.select import disagreement
@@ -97,7 +97,7 @@ def parameter_table(result: Outcome) -> str:
 
 def _columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
     head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
-    return head, [_cells(row) for row in parameter_rows(result)]
+    return head, [_cells(row) for row in parameter_rows(result) if family_of(row["name"]) != "transmission"]
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
@@ -238,7 +238,13 @@ def _bound(result: Outcome, held: Held) -> str:
 
 def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
     """Say which hyperparameters were estimated; parameters' names (n,), and z (n,) in units of the local scales."""
-    lines = [_scales(learned), *_noise(learned), _sessions(learned, names), _expansion(learned, names, z)]
+    lines = [
+        _scales(learned),
+        _transmission(learned),
+        *_noise(learned),
+        _sessions(learned, names),
+        _expansion(learned, names, z),
+    ]
     lines += [_model(learned), *_unusual(learned, names, z), _excluded(learned)]
     return [line for line in [*lines, *learned.notes] if line]
 
@@ -265,7 +271,7 @@ def _scales(learned: Learned) -> str:
     for name, size in learned.sizes.items():
         if name in DEFLECTIONS:
             deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
-        elif name not in (*SESSIONS.values(), BASE, EXPANSION):
+        elif name not in (*SESSIONS.values(), BASE, EXPANSION, "transmission"):
             said.append(f"{name} {_figure(size, 1.0, unit)}")
             unit = "x"
     lines = []
@@ -274,6 +280,13 @@ def _scales(learned: Learned) -> str:
     if deflections:
         lines.append(f"Estimated scale of model extensions: {joined(deflections)}.")
     return " ".join(lines)
+
+
+def _transmission(learned: Learned) -> str:
+    if learned.curves is None:
+        return ""
+    size, length, _ = learned.curves
+    return f"Transmission error of joints (1 sigma): {_figure(size, 1e3, 'mrad')}, length scale {length.value:.2g} rad."
 
 
 def _noise(learned: Learned) -> list[str]:

@@ -25,7 +25,7 @@ from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Model
+from rpim_opt.robot.terms import Curve, Model
 
 ROWS = 4096
 """Rows that are weighed and reduced together, of losses that are no squares."""
@@ -179,6 +179,10 @@ class PartitionedProblem:
         What reads the parts has to read the columns that the terms see.
         """
         return self._with(self._first.with_model(model, identify))
+
+    def with_transmission(self, curves: Sequence[Curve]) -> PartitionedProblem:
+        """Return the same problem with transmission errors; arguments as for `CalibrationProblem.with_transmission`."""
+        return self._with(self._first.with_transmission(curves))
 
     @property
     def scatter(self) -> Scatter | None:

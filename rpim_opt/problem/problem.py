@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -23,7 +23,7 @@ from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters, with_terms
-from rpim_opt.robot.terms import Model
+from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -253,6 +253,26 @@ class CalibrationProblem(Tabled):
         if added.any():
             added[len(p) :] = whole.take(np.flatnonzero(added)).identify(identify).identified
         return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
+
+    def with_transmission(self, curves: Sequence[Curve]) -> CalibrationProblem:
+        """Return the same problem with these transmission errors of joints identified, and no others.
+
+        The robot's scatter, which was learned without them, is left out.
+
+        Parameters
+        ----------
+        curves
+            One a joint; none for a robot without.
+        """
+        own = [term for term in self.robot.model.terms if not isinstance(term, Transmission)]
+        former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
+        p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
+        p = replace(p, terms=tuple(name for name in p.terms if name not in former))
+        robot = replace(self.robot, model=Model(own))
+        bare = replace(self, robots=robot, parameters=p, scatter=None)
+        if not curves:
+            return bare
+        return bare.with_model(Model([transmission(curve) for curve in curves]))
 
     def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
         """Return the same problem with other noise of the robot's own, or none."""

@@ -31,7 +31,7 @@ from rpim_opt.robot.parameter_names import (
     tool_prefix,
 )
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Posture, Symbol, Term, dependencies
+from rpim_opt.robot.terms import Posture, Symbol, Term, Transmission, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -113,7 +113,7 @@ def _restored(text: str) -> ca.Function:
 
 def _is_pure(structure: Structure, measurement: Measurement) -> bool:
     """Whether the functions depend on nothing but what is asked."""
-    return measurement in _READY and not structure.terms
+    return measurement in _READY and all(isinstance(term, Transmission) for term in structure.terms)
 
 
 def asked(structure: Structure, measurement: Measurement) -> Functions:
@@ -430,7 +430,7 @@ def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
 
 
 def _sees_approach(robot: Robot, name: str) -> bool:
-    if not robot.model.terms:
+    if all(isinstance(term, Transmission) for term in robot.model.terms):
         return False
     return dependencies(robot.model, robot.joint_types, lambda other: other == name).approach
 

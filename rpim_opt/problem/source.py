@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Curve
 
 
 class Source(Protocol):
@@ -90,6 +91,10 @@ class Source(Protocol):
 
     def with_parameters(self, parameters: Parameters) -> Source:
         """Return the same problem with another table of parameters."""
+        ...
+
+    def with_transmission(self, curves: Sequence[Curve]) -> Source:
+        """Return the same problem with these transmission errors of joints identified, and no others."""
         ...
 
     @property

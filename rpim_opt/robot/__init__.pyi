@@ -22,7 +22,10 @@ from .mdh import Gravity as Gravity
 from .mdh import Robot as Robot
 from .parameters import Parameters as Parameters
 from .parameters import model_parameters as model_parameters
+from .terms import Curve as Curve
 from .terms import Joint as Joint
 from .terms import Model as Model
 from .terms import Posture as Posture
 from .terms import Term as Term
+from .terms import Transmission as Transmission
+from .terms import transmission as transmission

@@ -6,6 +6,7 @@ first moments of links are those of every arm.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -355,6 +356,71 @@ def is_zero(value: Symbol) -> bool:
     return value == 0
 
 
+class Curve(NamedTuple):
+    """Where the transmission error of a joint is a Fourier series: `transmission` is the term.
+
+    Joint (from 1), centre and period [rad] of the angles, and the number of harmonics.
+    """
+
+    joint: int
+    centre: float
+    period: float
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Transmission(Term):
+    """The term of `transmission`, with the numbers that it is made of."""
+
+    curve: Curve = field(default_factory=lambda: Curve(1, 0.0, math.tau, 1))
+
+
+@lru_cache(256)
+def transmission(curve: Curve) -> Transmission:
+    """Return the transmission error of a joint: what it turns further [rad], as a function of its own angle q.
+
+    ::
+
+        f(q) = sum_k c_k cos(k u) + s_k sin(k u),    u = 2 pi clip(q - centre, -period / 2, period / 2) / period
+
+    Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
+    that f returns to what nobody measured beyond it, and stays there.
+
+    Parameters
+    ----------
+    curve
+        The joint, the angles and the number of harmonics.
+
+    Examples
+    --------
+    >>> import math
+    >>> import rpim_opt as ro
+    >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, count=2))
+    >>> term.names(2)
+    ('transmission2_c1', 'transmission2_c2', 'transmission2_s1', 'transmission2_s2')
+    >>> float(term.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, 0.1])), 0, 0, 0, 1e-3))  # sin(4 q)
+    0.00038941834...
+    """
+    keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.count + 1)]
+    return Transmission(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), curve=curve)
+
+
+EXPECTED_WAVE = 1e-5
+"""Scale of one harmonic of a transmission error before it is estimated [rad]."""
+
+
+def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
+    half = curve.period / 2
+    u = math.pi / half * ca.fmin(ca.fmax(joint.q - curve.centre, -half), half)
+    cosine, sine = ca.cos(u), ca.sin(u)
+    c, s = 1.0, 0.0
+    total = 0.0
+    for a, b in zip(sizes[: curve.count], sizes[curve.count :], strict=True):
+        c, s = c * cosine - s * sine, s * cosine + c * sine
+        total = total + a * c + b * s
+    return total
+
+
 # Models
 
 
@@ -399,7 +465,8 @@ class Model:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(self.terms))
-        stems = [entry.stem for term in self.terms for entry in term.entries]
+        own = [term for term in self.terms if not isinstance(term, Transmission)]  # those are one a joint
+        stems = [entry.stem for term in own for entry in term.entries]
         for stem in stems:
             if stems.count(stem) > 1:
                 raise InputError("model, terms", f"parameter '{stem}' twice", "a name of its own for every parameter")
@@ -412,6 +479,11 @@ class Model:
     def columns(self) -> Mapping[str, str]:
         """Further columns of the data that its terms see, name to dimension."""
         return {name: dimension for term in self.terms for name, dimension in term.columns.items()}
+
+    @property
+    def curves(self) -> tuple[Curve, ...]:
+        """The transmission errors of joints among its terms."""
+        return tuple(term.curve for term in self.terms if isinstance(term, Transmission))
 
     def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
         """Return the names of all its parameters.
@@ -449,6 +521,8 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
         columns = {name: ca.SX.sym(name) for name in model.columns}
         moves = ca.SX(0, 1)
         for term in model.terms:
+            if isinstance(term, Transmission):
+                continue  # of its own joint's angle, and long to write down
             seen = {name: columns[name] for name in term.columns}
             posture = Posture(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)
             for i in term.places(joint_types):

@@ -42,7 +42,7 @@ from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Model
+from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
 from rpim_opt.store.serialize import digest, plain, structured
 
 FORMAT = "rpim-opt result"
@@ -219,6 +219,7 @@ class Stored:
     prices: tuple[Price, ...]
     robots: dict[str, Robot]
     terms: dict[str, list[OwnTerm]]
+    transmission: tuple[Curve, ...]
     model: Parameters
     data: dict[str, Dataset]
     scatter: Scatter | None
@@ -251,6 +252,7 @@ def content(result: Calibration) -> dict[str, Any]:
         prices=result.prices,
         robots=dict(result.problem.arms),
         terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
+        transmission=tuple(curve for robot in result.problem.arms.values() for curve in robot.model.curves),
         model=result.problem.parameters,
         data=sets(result.problem.data, result.record),
         scatter=result.problem.scatter,
@@ -330,6 +332,8 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
     """Return what a file says of a user's own terms on a robot: all but their functions."""
     terms = []
     for term in model.terms:
+        if isinstance(term, Transmission):
+            continue
         names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
         terms.append(OwnTerm(term.at, names, dict(term.columns)))
     return terms
@@ -490,7 +494,8 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
         wanted = "; ".join(map(_in_words, stated)) or "none"
         accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
         raise InputError("key terms", "; ".join(map(_in_words, given)) or "no term given", accepted)
-    return replace(robot, model=model)
+    curves = [transmission(curve) for curve in file.transmission if curve.joint <= robot.dof and not name]
+    return replace(robot, model=Model((*model.terms, *curves)))
 
 
 def _in_words(term: OwnTerm) -> str:

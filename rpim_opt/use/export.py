@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import read_bytes, refused, write_files
 from rpim_opt.basics.text import joined, listed
+from rpim_opt.bayes.transmission import Curves
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
@@ -20,6 +21,7 @@ from rpim_opt.robot.formats.universal_robots import write_ur_calibration
 from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
+from rpim_opt.robot.terms import transmission
 
 
 def identified(result: Calibration, marker: str = "") -> Described:
@@ -90,6 +92,51 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
     )
     return alone, [said]
+
+
+def write_joint_corrections(result: Calibration, target: str | Path) -> list[str]:
+    """Write the transmission errors of joints as a CSV table: a joint stands at its angle plus the correction.
+
+    Columns ``joint``, ``angle_deg`` (of the model, see `Robot`), ``correction_mrad`` and its standard deviation
+    ``std_mrad``, four rows a period of the finest harmonic. They belong to the geometry of the same result.
+
+    Parameters
+    ----------
+    result
+        A calibration with transmission errors.
+    target
+        The file.
+
+    Returns
+    -------
+    A sentence on how large they are.
+
+    Raises
+    ------
+    InputError
+        For a calibration without.
+    """
+    curves = result.problem.robot.model.curves
+    if not curves:
+        accepted = "one with transmission errors of joints (model 'auto', where the data support them)"
+        raise InputError("the calibration", "no transmission error", accepted)
+    free = result.problem.parameters.free.names
+    lines = ["joint,angle_deg,correction_mrad,std_mrad"]
+    squares = []
+    for curve in curves:
+        place = [free.index(name) for name in transmission(curve).names(curve.joint)]
+        q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.count + 1)
+        values = np.zeros((len(q), curve.joint))
+        values[:, -1] = q
+        columns = Curves((curve,)).columns(values, np.ones_like(values))
+        correction = 1e3 * columns @ result.x[place]
+        std = 1e3 * np.sqrt(np.sum((columns @ result.covariance[np.ix_(place, place)]) * columns, axis=1))
+        squares.append(np.mean(correction**2))
+        for row in zip(np.degrees(q), correction, std, strict=True):
+            lines.append(f"{curve.joint},{row[0]:.4f},{row[1]:.5f},{row[2]:.5f}")
+    write_files({Path(target): ("\n".join(lines) + "\n").encode()})
+    sizes = joined([f"joint {c.joint} {np.sqrt(square):.3f}" for c, square in zip(curves, squares, strict=True)])
+    return [f"Transmission errors (RMS, mrad): {sizes}. They belong to the geometry of this very result."]
 
 
 def export_urdf(

@@ -1,0 +1,102 @@
+"""Transmission errors of joints as curves: found where they are, unknown beyond the measured angles, kept by files."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from tests.simulate import ARM
+
+ROBOT = dataclasses.replace(
+    ARM,
+    mdh=ARM.mdh[:3],
+    joint_types=("revolute",) * 3,
+    joint_map=np.eye(3),
+    limits=np.tile([-np.inf, np.inf], (3, 1)),
+)
+SIZE, CYCLES, NOISE = 4e-4, 16, 2e-5
+"""Ripple of joints 2 and 3 [rad], in cycles a turn; noise of a reading [m]."""
+
+
+def measured(ripple, configurations=120, seed=0):
+    """Return a problem whose arm has that ripple and deviations, and other rows of the same arm."""
+    rng = np.random.default_rng(seed)
+    parameters = ro.robot.model_parameters(ROBOT, tools={"": [0.05, 0.0, 0.3, 0, 0, 0]})
+    parameters = parameters.identify(["a?", "theta?", "d?", "alpha?"])
+    q = rng.uniform(-1.0, 1.0, (2 * configurations, 3))
+    problem = ro.CalibrationProblem(ROBOT, parameters, ro.Dataset.of(q, np.zeros((len(q), 3)), NOISE))
+    stands = q + ripple * np.cos(CYCLES * q + [0.0, 0.5, 1.0]) * [0, 1, 1]
+    truth = rng.normal(size=len(parameters.free)) * 0.3 * parameters.free.scale
+    y = problem.on(ro.Dataset.of(stands, np.zeros((len(q), 3)), NOISE)).modelled(truth)[0]
+    data = ro.Dataset.of(q, y + NOISE * rng.normal(size=y.shape), NOISE)
+    rows = np.arange(configurations)
+    return problem.on(data.take(rows)), data.take(rows + configurations)
+
+
+@pytest.fixture(scope="module")
+def rippled():
+    problem, others = measured(SIZE)
+    return ro.calibrate(problem, model="auto"), others
+
+
+def rms(errors):
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def test_ripple_is_found_and_predicts_other_rows(rippled):
+    result, others = rippled
+    assert result.learned.families[-1] == "transmission error"
+    assert (
+        0.3 * SIZE < result.learned.curves.size.value < 3 * SIZE
+    )  # of a sine whose RMS is 0.58 of that over all joints
+    floor = np.sqrt(3) * NOISE
+    assert rms(result.errors(others)) < 1.4 * floor < rms(ro.calibrate(result.stated).errors(others)) / 2
+    assert 0.90 < ro.use.validate(result, others).coverage <= 0.99
+    assert "Transmission error of joints (1 sigma)" in str(result)
+    assert "transmission2_c1" not in result.parameter_table()
+
+
+def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
+    result, _ = rippled
+    inside, outside = (result.predict([[0.0, angle, 0.0]], of="mean").standard.max() for angle in (0.3, 1.6))
+    assert outside > 3 * inside
+    curve = next(term.curve for term in result.problem.robot.model.terms if term.curve.joint == 2)
+    assert curve.period > 2.5  # 2 rad were measured
+
+
+def test_a_file_holds_the_curves(rippled, tmp_path):
+    result, others = rippled
+    ro.store.save_result(result, tmp_path / "result.json")
+    again = ro.load_result(tmp_path / "result.json")
+    assert np.allclose(again.errors(others), result.errors(others), rtol=0, atol=1e-12)
+    assert again.learned.curves == result.learned.curves
+    assert again.stated.parameters.names == result.stated.parameters.names
+
+
+def test_corrections_are_a_table(rippled, tmp_path):
+    result, _ = rippled
+    said = ro.use.write_joint_corrections(result, tmp_path / "joints.csv")
+    table = np.genfromtxt(tmp_path / "joints.csv", delimiter=",", skip_header=1)
+    rows = table[(table[:, 0] == 2) & (np.abs(table[:, 1]) < 50)]
+    q = np.radians(rows[:, 1])
+    wave = 1e3 * SIZE * np.cos(CYCLES * q + 0.5)
+    slow = np.polynomial.Polynomial.fit(q, rows[:, 2] - wave, 4)  # geometry may stand for it
+    assert rms(rows[:, 2] - wave - slow(q)) < 0.2 * 1e3 * SIZE
+    assert said[0].startswith("Transmission errors (RMS, mrad): joint 1")
+    with pytest.raises(ro.InputError, match="no transmission error"):
+        ro.use.write_joint_corrections(ro.calibrate(result.stated, weight=1.0), tmp_path / "none.csv")
+
+
+def test_commands_are_corrected_for_curves(rippled):
+    result, others = rippled
+    q = others.q[:5]
+    reached = result.forward(q)[:, :3, 3]
+    without = ro.calibrate(result.stated).forward(q)[:, :3, 3]
+    assert rms(reached - without) > 0.1 * SIZE
+
+
+def test_an_arm_without_ripple_gets_no_curves():
+    problem, _ = measured(0.0, 60, seed=1)
+    assert "transmission error" not in ro.calibrate(problem, model="auto").learned.families
