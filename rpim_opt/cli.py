@@ -480,25 +480,18 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        from rpim_opt.data.measurements.pose import pose
-        from rpim_opt.data.tables.understanding import understand
         from rpim_opt.use.compensation import compensate
-        from rpim_opt.use.targets import read_targets
+        from rpim_opt.use.validation import read_commands
 
-        robot = loaded.problem.robot
-        try:
-            named = understand(targets, robot, pose, console.table_options(units, ""), targets=True)
-            read = read_targets(named.columns, robot)
-        except InputError as error:
-            raise error.within(targets) from None
+        read, left_out = read_commands(loaded, targets, units)
         say("compensating")
         found = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre,
         )  # fmt: skip
-    document = {"left_out": named.left_out, "limit_mm": limit, "written": console.written_to(out, found.csv())}
-    text = str(found) + console.left_out_line(named.left_out) + _written_or_shown(out, found.csv())
+    document = {"left_out": left_out, "limit_mm": limit, "written": console.written_to(out, found.csv())}
+    text = str(found) + console.left_out_line(left_out) + _written_or_shown(out, found.csv())
     console.show(text, {**found.content(), **document}, as_json)
     if limit is not None and 1e3 * found.position_error.max() > limit:
         raise typer.Exit(1)

@@ -468,7 +468,6 @@ BAD = {
     "no result": (["validate", "nothing", "later.csv"], ["nothing", "the file: found nothing"]),
     "not a result": (["validate", "other.json", "later.csv"], ["other.json", "no result of rpim-opt"]),
     "bad row": (["validate", *RESULT, "broken.csv", "--units", "rad,m"], ["broken.csv", "row 2", "'nan'"]),
-    "no unit of new rows": (["validate", *RESULT, "later.csv"], ["later.csv", "without a unit"]),
     "limit": (["validate", *RESULT, "later.csv", "--units", "rad,m", "--limit", "0"], ["--limit", "greater than zero"]),
     "another kind": (["validate", *RESULT, "later.csv", "--measurement", "pose"], ["'pose'", "position"]),
     "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
@@ -488,7 +487,6 @@ BAD = {
     "no reflector": (["export", *RESULT, "--mdh", "made.csv", "--marker", "B"], ["marker", "'B'"]),
     "no targets": (["compensate", *RESULT, "nothing.csv"], ["nothing.csv", "the file: found nothing"]),
     "bad tool": (["compensate", *RESULT, "joints.csv", "--units", "rad", "--tool", "1,2"], ["--tool", "six numbers"]),
-    "targets without unit": (["compensate", *RESULT, "joints.csv"], ["joints.csv", "without a unit", "such as deg"]),
 }  # fmt: skip
 
 

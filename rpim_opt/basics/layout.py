@@ -9,16 +9,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import UNIT_SIGNS, split
+from rpim_opt.basics.units import UNIT_SIGNS, UNITS, parse_units, split
 
 FULL = 0.6
 """A row belongs to the data if it has this part of the numbers of the fullest row."""
 MOSTLY = 0.8
 """A column is one of numbers if this part of its cells are."""
 LINES_OF_HEADER = 6
+DIMENSIONS = frozenset(unit.dimension for unit in UNITS.values())
 ALONE = "\0"
 """In a header's line: a cell that belongs to no group."""
 MOST_NAMED = 5
@@ -40,6 +41,10 @@ VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.
 """What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
+
+
+READING = ("encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "joints")
+"""What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,8 @@ class TableOptions:
         The column by which several files are joined; ``"row"`` for the number of the row.
     within
         Tolerance [s] where they are joined by the nearest time.
+    joints
+        What the robot's file calls its joints.
 
     Examples
     --------
@@ -87,6 +94,30 @@ class TableOptions:
     prefix: str = ""
     key: str = ""
     within: float | None = None
+    joints: tuple[str, ...] = ()
+
+    @classmethod
+    def stated(cls, texts: Mapping[str, str]) -> TableOptions:
+        """Return the options that texts state, as a problem file's ``[reading]`` has them.
+
+        >>> from rpim_opt.basics.layout import TableOptions
+        >>> TableOptions.stated({"units": "q=rad,mm", "rotation": "vector"}).units
+        {'q': 'rad', 'length': 'mm'}
+        """
+        for name in texts:
+            if name not in READING:
+                raise InputError("key reading", f"'{name}'", choices(name, READING))
+        found: dict[str, Any] = dict(texts)
+        for name in ("columns", "joints"):
+            found[name] = tuple(filter(None, texts.get(name, "").split(",")))
+        return cls(**{**found, "units": parse_units(texts.get("units", ""))})
+
+    def texts(self) -> dict[str, str]:
+        """Return what is stated, as `stated` takes it, but for how several files are joined."""
+        said = {name: getattr(self, name) for name in READING}
+        units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
+        said |= {"units": ",".join(units), "columns": ",".join(self.columns), "joints": ",".join(self.joints)}
+        return {name: text for name, text in said.items() if text}
 
 
 class Head(NamedTuple):

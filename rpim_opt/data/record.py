@@ -184,6 +184,8 @@ class Record:
         The calibrations that this one carries on (`use.update`), the last one last.
     digest
         Of the file that it was read from; empty where there is none.
+    reading
+        How the tables were read, as `TableOptions.stated` takes it: later ones are read alike.
 
     Examples
     --------
@@ -206,6 +208,7 @@ class Record:
     held_out: HeldOut | None = None
     earlier: tuple[Earlier, ...] = ()
     digest: str = ""
+    reading: Mapping[str, str] = field(default_factory=dict)
 
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""

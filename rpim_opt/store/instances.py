@@ -12,6 +12,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import inside, sha256_of
+from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.basics.text import Tabled, shortened
 from rpim_opt.basics.units import UNITS
@@ -93,6 +94,8 @@ class Instance(Tabled):
         SHA-256 of the files that were read, by name.
     excluded
         Rows that the folder leaves out, label to reason.
+    reading
+        How the tables that it was made from were read.
 
     Examples
     --------
@@ -119,6 +122,7 @@ class Instance(Tabled):
     noise: str = "robot"
     details: Mapping[str, str] = field(default_factory=dict)
     requirement: Requirement | None = None
+    reading: Mapping[str, str] = field(default_factory=dict)
 
     def _short(self) -> str:
         return f"'{shortened(self.title)}' {self.problem._short()}"
@@ -161,6 +165,7 @@ class Instance(Tabled):
             bool(self.simulation),
             details=self.details,
             requirement=self.requirement,
+            reading=self.reading,
         )
 
 
@@ -205,6 +210,7 @@ def load(
         formulation = _formulation(stated, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         details = stated_details(table.record)
+        TableOptions.stated(table.reading)
         requirement = stated_requirement(table.acceptance, problem.robot)
     except InputError as error:
         raise error.within(path) from None
@@ -225,6 +231,7 @@ def load(
         noise=table.scatter if isinstance(table.scatter, str) else "declared",
         details=details,
         requirement=requirement,
+        reading=table.reading,
     )
 
 

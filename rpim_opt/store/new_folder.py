@@ -157,7 +157,9 @@ def new_problem(
         "validation": parts.said,
     }
     try:
-        text, guessed = _problem_text(arm, kind, parts.rows, reader.noise, said)
+        text, guessed = _problem_text(
+            arm, kind, parts.rows, reader.noise, said, replace(found.options, joints=arm.names).texts()
+        )
     except InputError as error:
         raise error.within(found.file) from None
     _write(folder, text, tables, source, arm)
@@ -336,7 +338,12 @@ def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:
 
 
 def _problem_text(
-    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], said: Mapping[str, str]
+    arm: Described,
+    kind: Measurement,
+    rows: Dataset,
+    noise: Mapping[str, float],
+    said: Mapping[str, str],
+    reading: Mapping[str, str],
 ) -> tuple[str, list[str]]:
     """Return the text of ``problem.toml``, and what was guessed in sentences."""
     from jinja2 import Environment
@@ -365,6 +372,7 @@ def _problem_text(
         sessions=rows.sessions,
         temperatures=len(rows.temperatures),
         label=_key(rows.label[0]),
+        reading=[(name, toml(text)) for name, text in reading.items()],
         words=words,
     )
     return text, [how]

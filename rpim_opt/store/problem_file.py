@@ -197,6 +197,7 @@ class ProblemTable(Table):
     reference: dict[str, list[float]] = Field(default_factory=dict)
     simulation: dict[str, Any] = Field(default_factory=dict)
     record: dict[str, Any] = Field(default_factory=dict)
+    reading: dict[str, str] = Field(default_factory=dict)
     acceptance: dict[str, Any] = Field(default_factory=dict)
     variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
 

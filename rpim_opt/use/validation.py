@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,9 +25,11 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import understand
+from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.use.targets import Targets, read_targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,17 +233,56 @@ class Read(NamedTuple):
 
 def read_table(result: Calibration, source: Any, measurement: str | None, units: str) -> Read:
     """Return what a table says; arguments as for `read_measurements`."""
-    kind = _kind(result, measurement)
-    given = parse_units(units)
+    file = source if isinstance(source, str | Path) else None
+    robot = result.problem.robot
+    stated = _kind(result, measurement)
     try:
-        columns, left_out, raw = _columns(source, result.problem.robot, kind, given)
+        found = _understood(source, robot, stated, result.record.reading, units)
+        kind = stated
+        if not found.stems >= set(stated.columns):  # poses may be validated by positions
+            parts = [part for part in stated.parts if not any(found.stems >= set(form) for form, _ in stated.forms)]
+            kind = next((part for part in parts if found.stems >= set(part.columns)), stated)
+        columns = found.columns
+        if found.left_out and not columns:
+            accepted = f"joints' values and {', '.join(kind.columns)}"
+            raise InputError("the header", f"nothing that is known among {', '.join(found.left_out)}"[:200], accepted)
         board = board_of(result.problem.sample().data)
         if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
             columns = on_board(columns, board)
-        data = read_data(columns, result.problem.robot, _noise(result, kind), kind)
+        data = read_data(columns, robot, _noise(result, stated, kind), kind)
     except InputError as error:
-        raise error.within(source if isinstance(source, str | Path) else None) from None
-    return Read(data, left_out, raw)
+        raise error.within(file) from None
+    return Read(data, found.left_out, found.raw)
+
+
+def _understood(
+    source: Any, robot: Robot, kind: Measurement, reading: Mapping[str, str], units: str, targets: bool = False
+) -> Understood:
+    """Return what a table says, read as the calibration's own were; one that does not fit that, as it says itself."""
+    where = Path(source) if isinstance(source, str | Path) else RawTable(read_columns(source))
+    plain = TableOptions(units=parse_units(units))
+    if reading:
+        options = TableOptions.stated({**reading, "units": units or reading.get("units", "")})
+        try:
+            return understand(where, robot, kind, options, options.joints, targets)
+        except InputError as error:
+            with suppress(InputError):  # one that has our names already
+                return understand(where, robot, kind, plain, targets=targets)
+            raise error from None
+    found = understand(where, robot, kind, plain, targets=targets)
+    if found.doubt == "quaternion" and "qw" in kind.columns:
+        raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+    return found
+
+
+def read_commands(result: Calibration, source: str | Path, units: str = "") -> tuple[Targets, tuple[str, ...]]:
+    """Return the targets of a table that is read as the calibration's own were, and the columns that were left out."""
+    robot = result.problem.robot
+    try:
+        found = _understood(source, robot, pose, result.record.reading, units, targets=True)
+        return read_targets(found.columns, robot), found.left_out
+    except InputError as error:
+        raise error.within(source) from None
 
 
 def _kind(result: Calibration, name: str | None) -> Measurement:
@@ -254,28 +296,10 @@ def _kind(result: Calibration, name: str | None) -> Measurement:
     return next(iter(kinds.values()))
 
 
-def _columns(
-    source: Any, robot: Robot, kind: Measurement, units: Mapping[str, str]
-) -> tuple[Columns, tuple[str, ...], Columns]:
-    """Return a table's columns by our names, those left out, and all as they are; files as `rpim-opt new` has them."""
-    if isinstance(source, str | Path):
-        found = understand(Path(source), robot, kind, TableOptions(units=units))
-        if found.doubt == "quaternion" and "qw" in kind.columns:
-            raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-    else:
-        columns = read_columns(source)
-        found = understand(RawTable(columns), robot, kind, TableOptions(units=units))
-    columns, raw, left_out = found.columns, found.raw, found.left_out
-    if left_out and not columns:
-        accepted = f"joints' values and {', '.join(kind.columns)}"
-        raise InputError("the header", f"nothing that is known among {', '.join(left_out)}"[:200], accepted)
-    return columns, left_out, raw
-
-
-def _noise(result: Calibration, kind: Measurement) -> dict[str, float]:
-    """Return the typical standard deviation of every component, as a table ``[noise]`` has it."""
-    blocks = [block for block in result.problem.data.blocks if block.measurement is kind]
+def _noise(result: Calibration, stated: Measurement, kind: Measurement) -> dict[str, float]:
+    """Return the typical standard deviation of every component of a type or a part of it, as ``[noise]`` has it."""
+    blocks = [block for block in result.problem.data.blocks if block.measurement is stated]
     variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
-    si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in kind.components.values()}
-    sigma = zip(kind.components.items(), np.sqrt(variance), strict=True)
-    return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma}
+    si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in stated.components.values()}
+    sigma = zip(stated.components.items(), np.sqrt(variance), strict=True)
+    return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma if name in kind.components}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -112,3 +113,22 @@ def test_a_units_line_between_blanks_has_no_cell_for_the_label(monkeypatch, empt
     assert new(monkeypatch, "raw.txt") == 0
     data = ro.load("cell").problem.data
     assert np.abs(np.degrees(data.q) - Q).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    "name", ["rotation vectors without units", "a ROS driver's names", "joints in rad, angles in deg"]
+)
+def test_later_commands_read_the_very_table_that_new_read(monkeypatch, capsys, empty, name) -> None:
+    write, options, kind = FILES[name]
+    file = write(empty).name
+    assert new(monkeypatch, file, **options) == 0
+    assert run(monkeypatch, "calibrate", "cell", "--selector", "1", "--out", "out") in (0, 1)
+    capsys.readouterr()
+    assert run(monkeypatch, "validate", "out", file, "--json") == 0, capsys.readouterr().err
+    raw = json.loads(capsys.readouterr().out)["identified"]
+    assert run(monkeypatch, "validate", "out", "cell/identification.csv", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["identified"] == pytest.approx(raw)
+    assert run(monkeypatch, "compensate", "out", file, "--json") in (0, 1), capsys.readouterr().err
+    if kind == "pose":
+        (empty / "points.csv").write_text(text([HEAD], ROWS))
+        assert run(monkeypatch, "validate", "out", "points.csv", "--json") == 0, capsys.readouterr().err

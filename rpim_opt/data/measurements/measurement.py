@@ -99,6 +99,8 @@ class Measurement(Brief):
         Columns of names that a table of it may have besides, ``("point",)``; a touch has one of them.
     variants
         The type that it is where a table has a column of that name.
+    parts
+        Types of tables that state less and can validate it: positions of poses.
     accepted
         What a message says is accepted where a column of ``extra`` that it sees is missing, by the column's name.
     words
@@ -160,6 +162,7 @@ class Measurement(Brief):
     planar: bool = False
     names: tuple[str, ...] = ()
     variants: Mapping[str, Measurement] = field(default_factory=dict)
+    parts: tuple[Measurement, ...] = ()
     accepted: Mapping[str, str] = field(default_factory=dict)
     words: Words = REFLECTOR
     shown_by: Callable[[Sequence[Columns]], bool] | None = None

@@ -11,6 +11,7 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RowError
 from rpim_opt.data.measurements.measurement import XYZ, Measurement, origin
+from rpim_opt.data.measurements.position import position
 
 
 def quaternion(T: Any) -> Any:
@@ -109,6 +110,7 @@ pose = Measurement(
     plus=turned,
     forms=((XYZ | _TURN, from_angles), (XYZ | _MATRIX, from_matrices)),
     prepare=unit_quaternions,
+    parts=(position,),
     registers=True,
     turning=True,
 )
