@@ -127,6 +127,7 @@ def main(arguments: list[str]) -> int:
     if what == "run":
         return run("rpim-opt", *rest)
     os.chdir(ROOT)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # pytest has a process a core already
     if what == "test":
         return run("pytest", "-n", "auto", *rest)  # on all cores
     if what == "docs":

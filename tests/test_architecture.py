@@ -109,34 +109,30 @@ def test_every_module_belongs_to_a_folder() -> None:
         assert (PACKAGE / folder / "__init__.pyi").is_file(), f"{folder} has no stub to be loaded by"
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_a_module_imports_folders_before_its_own(module: str) -> None:
-    for name in ours(module):
-        assert name in MODULES, f"{module} imports rpim_opt.{name}, which is no module"
-        assert floor(name) <= floor(module), f"{module} imports {name}, of a higher floor"
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_a_module_imports_the_packages_of_its_folder(module: str) -> None:
-    folder, _, rest = module.partition(".")
-    allowed = FLOORS[folder] if rest else TOP[folder]
-    for name in imported(module):
-        top = name.partition(".")[0]
-        assert top in sys.stdlib_module_names | EVERYWHERE | allowed | {"rpim_opt"}, f"{module} imports {name}"
+def test_a_module_imports_folders_before_its_own_and_its_folders_packages() -> None:
+    for module in MODULES:
+        for name in ours(module):
+            assert name in MODULES, f"{module} imports rpim_opt.{name}, which is no module"
+            assert floor(name) <= floor(module), f"{module} imports {name}, of a higher floor"
+        folder, _, rest = module.partition(".")
+        allowed = FLOORS[folder] if rest else TOP[folder]
+        for name in imported(module):
+            top = name.partition(".")[0]
+            assert top in sys.stdlib_module_names | EVERYWHERE | allowed | {"rpim_opt"}, f"{module} imports {name}"
 
 
 def test_no_module_imports_itself_through_others() -> None:
     list(TopologicalSorter({module: ours(module) for module in MODULES}).static_order())  # raises CycleError
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_no_any_stands_for_a_type_of_ours(module: str) -> None:
-    for node in ast.walk(tree(module)):
-        if isinstance(node, ast.FunctionDef | ast.Lambda):
-            for parameter in [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]:
-                if parameter.arg in CORE and parameter.annotation is not None:
-                    name = ast.unparse(parameter.annotation)
-                    assert name not in ("Any", "object"), f"{module}, line {node.lineno}: {parameter.arg}: {name}"
+def test_no_any_stands_for_a_type_of_ours() -> None:
+    for module in MODULES:
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.FunctionDef | ast.Lambda):
+                for parameter in [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]:
+                    if parameter.arg in CORE and parameter.annotation is not None:
+                        name = ast.unparse(parameter.annotation)
+                        assert name not in ("Any", "object"), f"{module}, line {node.lineno}: {parameter.arg}: {name}"
 
 
 @pytest.mark.parametrize(

@@ -304,6 +304,7 @@ def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, 
     assert "left out: temperature." in said
 
 
+@pytest.mark.slow
 def test_new_measurements_in_another_unit_are_named(monkeypatch, capsys, cell, made, tmp_path) -> None:
     """Each in the words of what to write; no new result is made from them."""
     for units, said in (("deg,m", "name the columns q1_rad"), ("rad,mm", "name the columns x_m, y_m, z_m")):

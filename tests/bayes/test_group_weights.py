@@ -95,6 +95,7 @@ def test_a_file_holds_the_weights(tmp_path: Path) -> None:
     assert again.asked(again.problem).x == pytest.approx(result.x, abs=1e-7 * np.abs(result.x).max())
 
 
+@pytest.mark.slow
 def test_without_flagged_rows_it_is_asked_anew_and_not_weighted_twice() -> None:
     problem = ro.load("blunders").problem
     asked = {"alpha? theta?": ro.reml, "a? d?": ro.reml}

@@ -125,6 +125,7 @@ def test_the_most_likely_weights_are_those_of_a_grid(seed: int) -> None:
     assert found.interior
 
 
+@pytest.mark.slow
 def test_the_sizes_of_groups_are_found() -> None:
     logs = []
     for seed in range(20):
@@ -159,6 +160,7 @@ def test_folds_are_what_solving_without_them_predicts() -> None:
     assert held_out(grouped, parts)(t)[0] == pytest.approx(wanted, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_folds_choose_the_least_of_a_grid() -> None:
     grouped = Grouped.of(simulated(6, {"alpha? theta? beta?": 3.0, "a? d?": 0.05}, noise=30.0), KINDS)
     found = k_fold_groups(grouped)

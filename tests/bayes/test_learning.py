@@ -270,6 +270,7 @@ def bent(seed: int, size: float) -> ro.CalibrationProblem:
     return POSITION.on(measured(truth, x, seed).data)
 
 
+@pytest.mark.slow
 def test_gravity_is_found_where_it_bends_and_nowhere_else() -> None:
     for seed in range(3):
         heavy = ro.calibrate(bent(seed, 8e-6), model="auto")

@@ -28,6 +28,7 @@ def calibrated() -> tuple[ro.store.Instance, ro.calibration.Calibration]:
     return instance, instance.calibrate()
 
 
+@pytest.mark.slow
 def test_what_views_see_is_within_its_intervals() -> None:
     """The lens, what a link is long, positions elsewhere: of 20 numbers one may lie outside 95 %, and none far."""
     instance, result = calibrated()
@@ -64,6 +65,7 @@ def test_a_result_tells_reprojection_from_positions() -> None:
     assert found.before == pytest.approx(world, rel=0.2)
 
 
+@pytest.mark.slow
 def test_views_that_do_not_improve_a_robot_say_so() -> None:
     """A good robot and a camera that shakes: positions become many times worse than the drawing's, and it is said."""
     found = STUDY.run("shaking", "known", 1000)
@@ -74,6 +76,7 @@ def test_views_that_do_not_improve_a_robot_say_so() -> None:
         assert 0.4 < found[f"{method}: expected"] / found[f"{method}: as identified"] < 4
 
 
+@pytest.mark.slow
 def test_the_sentence_is_in_the_output(tmp_path: Path) -> None:
     rng = np.random.default_rng([1000, 19])
     problem, truth = STUDY._world("on the flange", True, rng, STUDY.GOOD)
@@ -219,6 +222,7 @@ def test_new_refuses_boards_that_are_none(target: str, tmp_path: Path) -> None:
     assert not (tmp_path / "cell").exists()
 
 
+@pytest.mark.slow
 def test_two_cameras_on_the_flange_are_told_apart(tmp_path: Path) -> None:
     """A column marker names the camera's frame, a column fixture its intrinsics; both start from the views alone."""
     rng = np.random.default_rng(3)

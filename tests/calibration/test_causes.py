@@ -174,6 +174,7 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_program_without_solution_says_what_is_read_wrongly(monkeypatch, capsys, tmp_path) -> None:
     wrong, said = MISTAKES["millimetres as metres"]
     made(monkeypatch, tmp_path, wrong("ur5e").problem)

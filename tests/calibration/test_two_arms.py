@@ -69,6 +69,7 @@ def base_of(problem: ro.CalibrationProblem) -> list[int]:
     return [problem.parameters.free.names.index(f"right.base_{c}") for c in FRAME]
 
 
+@pytest.mark.slow
 def test_the_base_is_found_from_nothing(cell, result) -> None:
     """It stands a metre away and was stated nowhere: within the errors of nominal robots, and then of calibrated."""
     problem, _ = cell

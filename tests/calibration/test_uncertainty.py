@@ -22,6 +22,7 @@ def covered(seeds: range) -> np.ndarray:
     return np.array(hits)
 
 
+@pytest.mark.slow
 def test_intervals_of_predicted_positions_cover() -> None:
     # 60 calibrations: the share's standard error is about 0.006
     assert 0.93 < covered(range(60)).mean() < 0.97

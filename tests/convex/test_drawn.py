@@ -90,6 +90,7 @@ def test_an_equality_is_priced_by_giving_it_a_tolerance() -> None:
     assert price.multiplier == pytest.approx((exact - loose) / 2e-5, rel=1e-3)  # one-sided: its error is the step's
 
 
+@pytest.mark.slow
 def test_ten_statements_together_have_their_own_prices() -> None:
     """Whether or not they hold: multipliers are zero where there is slack, and slack is zero where they are not."""
     texts = (*list(TIGHT)[:7], "a2 - 0.5 a3 <= -134 mm", "a4 = 70 mm", "move at most 3 mm: home")

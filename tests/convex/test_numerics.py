@@ -146,6 +146,7 @@ def test_selectors_that_disagree_are_said() -> None:
         assert "selectors disagree by" in result.weight_sentence()
 
 
+@pytest.mark.slow
 def test_baselines_agree_where_the_data_decide() -> None:
     problem, _ = simulated(("a[234]", "theta[234]", "d5"), noise=5e-5, configurations=20)
     scale = problem.parameters.free.scale

@@ -121,6 +121,7 @@ def test_sheets_that_are_larger_than_they_look(tmp_path: Path, case: str) -> Non
     refused(workbook(tmp_path / "data.xlsx", SHEETS[case], "A1:XFD1048576"))
 
 
+@pytest.mark.slow
 def test_an_archive_that_unpacks_to_300_megabytes(tmp_path: Path) -> None:
     path = workbook(tmp_path / "data.xlsx", rows(GOOD) + " " * 300_000_000)
     assert path.stat().st_size < 2_000_000

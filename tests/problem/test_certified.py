@@ -336,6 +336,7 @@ def check_study(rows: list[dict]) -> None:
     assert not any(row["certified"] for row in rows if row["scene"] == "one axis")
 
 
+@pytest.mark.slow
 def test_random_cases_are_right_where_certified() -> None:
     study = load_study(find_study("certified_start"))
     check_study([study.run(**case) for case in study.cases(quick=True)[:30]])

@@ -29,6 +29,7 @@ def test_a_design_is_near_the_best_and_better_than_chance(criterion: str) -> Non
     assert "no other set is more than" in str(found)
 
 
+@pytest.mark.slow
 def test_a_designed_set_predicts_better_than_the_best_of_two_hundred_random_ones() -> None:
     problem, truth = simulated(seed=5)
     robot = ro.robot.Robot("limited", problem.robot.mdh, limits=np.tile([-2.0, 2.0], (6, 1)))

@@ -151,6 +151,7 @@ def test_a_model_that_imitates_a_ready_one_gives_its_numbers() -> None:
     np.testing.assert_array_equal(here.b, there.b)
 
 
+@pytest.mark.slow
 def test_threads_get_the_serial_numbers() -> None:
     zero = threading.local()
     measurement = ro.data.Measurement("height", lambda T: T[2, 3] + zero.value, COLUMNS)

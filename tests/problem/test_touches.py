@@ -326,6 +326,7 @@ def test_touches_of_a_point_are_neighbours_of_each_other() -> None:
     assert len(labels) == 22
 
 
+@pytest.mark.slow
 def test_a_postures_step_is_arithmetic() -> None:
     problem = ro.load("datum_cube").problem
     place = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.2]])
@@ -338,6 +339,7 @@ def test_a_postures_step_is_arithmetic() -> None:
         ro.problem.postures_at(problem, [[5.0, 0, 0]])
 
 
+@pytest.mark.slow
 def test_designed_postures_tell_more_than_drawn_ones() -> None:
     problem = ro.load("contact").problem
     q = ro.problem.postures_at(problem, np.tile([0.6, 0.1, 0.2], (40, 1)))

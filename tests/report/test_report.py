@@ -303,6 +303,7 @@ def test_it_prints(opened: Browser, tmp_path: Path) -> None:
     assert 3 <= pages <= 12
 
 
+@pytest.mark.slow
 def test_a_robust_result_of_many_rows_is_drawn_by_its_quadratic_model(monkeypatch) -> None:
     problem = ro.load("blunders").problem
     result = ro.calibrate(problem, ro.robust, weight=1.0)
@@ -363,6 +364,7 @@ def test_both_figures_are_said_where_all_rows_were_used() -> None:
     assert "held out, from 40 rows, identified" in words
 
 
+@pytest.mark.slow
 def test_only_tolerances_that_were_kept_are_shown() -> None:
     instance = ro.load("constrained", "wrong_tolerance")
     assert np.isfinite(instance.problem.parameters.free.tolerance).any()
@@ -379,6 +381,7 @@ def test_a_histogram_says_what_is_below_its_first_bar() -> None:
     assert "The first bar" not in page(result)
 
 
+@pytest.mark.slow
 def test_a_scale_of_little_more_than_a_decade_has_more_than_one_tick() -> None:
     for low, high in ((0.05, 2.0), (0.02, 0.9), (0.4, 30.0)):
         assert len(Scale(Axis("", (low, high), log=True)).ticks()) >= 3

@@ -431,6 +431,7 @@ def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
     assert "<table>" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     from tests.test_cli import run
 

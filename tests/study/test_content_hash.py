@@ -139,6 +139,7 @@ def test_arguments_are_their_content(kind: str) -> None:
         assert one != other
 
 
+@pytest.mark.slow
 def test_other_processes_have_the_same_hashes() -> None:
     script = (
         "from tests.study.test_content_hash import KINDS, content_hash\nimport rpim_opt as ro\n"

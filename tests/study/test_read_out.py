@@ -79,6 +79,7 @@ def test_figures_have_the_digits_that_matter(value: float | None, text: str) -> 
     assert number(value) == text
 
 
+@pytest.mark.slow
 def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_path: Path) -> None:
     some = {**even(0.5), "p4": None, "p5": None}
     found = compared({"a": even(1.0), "b": even(50.0), "c": some})

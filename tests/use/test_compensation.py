@@ -260,6 +260,7 @@ def nominal_poses(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarr
     return reading(result, np.zeros_like(result.x), q)  # the simulated base is stated at the origin
 
 
+@pytest.mark.slow
 def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
     result = known()
     far = np.array([[3.0, 0.5, 1.0], [0.0, -4.0, 0.2], [0.2, 0.1, 0.4]])

@@ -197,6 +197,7 @@ def test_the_command(monkeypatch, capsys, tmp_path, crashed: Robot, first) -> No
     assert len(record.files["new.csv"]) == 64
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_sentence(monkeypatch, capsys, tmp_path, crashed: Robot, first) -> None:
     ro.store.save_result(first, tmp_path / "result.json")
     (block,) = crashed.after.blocks

@@ -1,0 +1,62 @@
+"""Which tests are run when: ``smoke`` for every commit, by default all but ``slow``."""
+
+from __future__ import annotations
+
+import pytest
+
+SMOKE = (
+    "tests/test_architecture.py",
+    "tests/test_cli.py",
+    "tests/test_locked.py",
+    "tests/basics/",
+    "tests/data/test_dataset.py",
+    "tests/data/test_measurement.py",
+    "tests/data/test_tables.py",
+    "tests/robot/test_exchange.py",
+    "tests/problem/test_refused.py",
+    "tests/convex/test_quadratic.py",
+    "tests/convex/test_constraints.py",
+    "tests/bayes/test_prior.py",
+    "tests/calibration/test_spread.py",
+    "tests/store/test_folder.py",
+    "tests/use/test_iso9283.py",
+)
+"""Files of which each holds a folder's foundations; together they take less than half a minute."""
+DEFAULT = {
+    "tests/convex/test_mechanism.py::test_storage_decides_nothing": ("reml-robust", "l_curve-sum_of_norms"),
+    "tests/calibration/test_conditional.py::test_widths_are_those_of_repeated_measurements": ("box",),
+    "tests/calibration/test_threads.py::test_two_threads_calibrate_with_one_formulation": ("CVaR + squares",),
+    "tests/calibration/test_contact.py::test_errors_of_touches_are_told_point_by_point": ("contact",),
+    "tests/calibration/test_camera.py::test_new_makes_a_folder_from_corners": ("on the flange",),
+    "tests/problem/test_camera.py::test_mistakes_are_found_in_views": ("sign",),
+    "tests/problem/test_design.py::test_a_design_is_near_the_best_and_better_than_chance": ("D",),
+    "tests/problem/test_derivatives.py::test_no_optimizer_finds_a_lower_objective": ("1.0",),
+    "tests/problem/test_parts.py::test_no_digit_depends_on_the_number_of_cores": ("9000",),
+    "tests/bayes/test_groups.py::test_the_most_likely_weights_are_those_of_a_grid": ("0",),
+    "tests/study/test_comparison.py::test_intervals_of_other_problems_cover_as_they_say": ("5",),
+}
+"""Cases that the default suite takes of a test whose every case is long; the others are slow."""
+LONG = {
+    "tests/convex/test_grid.py::test_a_calibration_ends_where_plain_cvxpy_ends": (
+        "Tikhonov, matrix inequality, rank_deficient",
+        "parameters in the loss, markers",
+        "squares and L1 + squares, seven_axis",
+    ),
+    "tests/convex/test_constraints_met.py::test_a_constraint_is_met": (
+        "matrix inequality, markers, 0.1, squared",
+        "matrix inequality, position, 1, Huber",
+        "matrix inequality, distance, 0.5, Huber",
+    ),
+}
+"""Long cases of a test whose others are short."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark each test by the lists above."""
+    for item in items:
+        test, _, case = item.nodeid.partition("[")
+        case = case.removesuffix("]")
+        if case not in DEFAULT.get(test, (case,)) or case in LONG.get(test, ()):
+            item.add_marker(pytest.mark.slow)
+        elif item.nodeid.startswith(SMOKE):
+            item.add_marker(pytest.mark.smoke)
