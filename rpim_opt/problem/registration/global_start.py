@@ -24,6 +24,8 @@ from rpim_opt.robot.parameter_names import tool_prefix
 
 UNEXPLAINED = 0.01
 """Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
+ACCEPTED = 0.02
+"""A mapping may leave this part of the extent: an arm's geometric errors are not fitted with it."""
 EXPLAINED = 3.0
 """A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""
 NEAR_ZERO = 0.2
@@ -312,7 +314,7 @@ def _judged(
     """Return the plainest mapping of the best robot class, and others that fit as well; the first fit is nominal."""
     left = rms(fits)
     least = left.min()
-    if not least <= UNEXPLAINED * points.extent or (small and EXPLAINED * least >= left[0]):
+    if not least <= ACCEPTED * points.extent or (small and EXPLAINED * least >= left[0]):
         return None
     best = int(np.argmin(left))
     kept = fits.error[best] <= GROSS * np.median(fits.error[best])
