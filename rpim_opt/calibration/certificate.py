@@ -85,8 +85,10 @@ def certified(
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
-    program = before.anew(formulation, model) if before is not None else pose(formulation, model)
-    program = program.beginning(z)  # where a minimum is looked for first proves nothing
+    if before is None:
+        program = pose(formulation, model).beginning(z)
+    else:
+        program = before.anew(formulation, model, z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
     gradient = _gradient(program, slope, z, weight)

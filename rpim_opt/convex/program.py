@@ -147,22 +147,22 @@ class Program(Brief):
         """Return the program for another model of the same shape, without asking the functions anew."""
         return Program(self.formulation, model, self._posed, self._kept)
 
-    def anew(self, formulation: Formulation, model: LinearModel) -> Program:
-        """Return the program of a formulation whose functions are asked once more.
+    def anew(self, formulation: Formulation, model: LinearModel, z: Array) -> Program:
+        """Return the program of a formulation whose functions are asked once more, to begin near z (n,).
 
-        Where they answer what they answered to this program, what CVXPY made of that serves again.
+        Where they answer what they answered to this program, what CVXPY made of that and the last minimum serve again.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("paper_arm").problem
         >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> program.anew(ro.robust, program.model).solve(1.0).status
+        >>> program.anew(ro.robust, program.model, program.solve(1.0).z).solve(1.0).status
         'optimal'
         """
         again = pose(formulation, model)
         if self.formulation == formulation and again._posed.like(self._posed):
             return self.on(model)
-        return again
+        return again.beginning(z)
 
     def without(self, out: np.ndarray) -> Program:
         """Return the program without some equations, ``out`` (m,), which become rows of zeros.
@@ -369,9 +369,17 @@ class Program(Brief):
         weight
             Of the penalty; it matters to variables of the functions' own alone.
         """
-        A, b = self.rows
-        loss, penalty = self._posed.values(z, A @ z - b, weight)
-        return loss + self.model.offset, penalty
+        key = z.tobytes(), weight if self.inner else 0.0
+        if key not in self._values:
+            A, b = self.rows
+            loss, penalty = self._posed.values(z, A @ z - b, weight)
+            self._values[key] = loss + self.model.offset, penalty
+        return self._values[key]
+
+    @cached_property
+    def _values(self) -> dict[Any, tuple[float, float]]:
+        """Values where they were asked for: a loop asks for those of one point again and again."""
+        return {}
 
     def objective(self, z: Array, weight: float) -> float:
         """Return loss(A z - b) + weight penalty(z); infinite outside their domain. Arguments as for `value`."""
@@ -591,6 +599,7 @@ class Program(Brief):
         solver: str | None = None,
         settings: Mapping[str, Any] | None = None,
         verbose: bool = False,
+        accuracy: float = 0.0,
     ) -> Estimate:
         """Return the solution at a weight.
 
@@ -606,6 +615,8 @@ class Program(Brief):
             A term that keeps the solution near a point.
         solver, settings, verbose
             Any installed solver of CVXPY with its options: then `problem` is solved by it, whatever the structure.
+        accuracy
+            Part of a loss that is a sum over rows by which a first guess may lie above the minimum.
 
         Raises
         ------
@@ -624,7 +635,7 @@ class Program(Brief):
         elif self._posed.joint:
             estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
-            estimate = self._by_structure(weight, damping)
+            estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     @one_blas_thread
@@ -865,14 +876,13 @@ class Program(Brief):
             return loss, np.zeros(len(Z))
         return loss, np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
 
-    def _by_structure(self, weight: float, damping: Damping | None) -> Estimate:
+    def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
         size, centre = (None, None) if damping is None else (damping.size, damping.centre)
         try:
             with phase("solve"):
-                found = minimum(
-                    self._posed.loss, self._rows, self._warm, weight, self._squares, size=size, centre=centre
-                )
+                loss, rows, squares = self._posed.loss, self._rows, self._squares
+                found = minimum(loss, rows, self._warm, weight, squares, size, centre, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)

@@ -20,6 +20,8 @@ from rpim_opt.convex.solvers.summands import Summands
 
 DECREASE = 1e-12
 """Newton ends where its model promises less, relative to the objective."""
+INTERIOR = 1e-10
+"""The same where an interior point solves the small program, which is no more exact."""
 STEPS = 60
 """Newton steps of one smoothing width."""
 FEW = 400
@@ -42,6 +44,8 @@ POOR = 1e-3
 """Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
 FEWER, LEAST_SECANTS = 0.1, 1e-8
 """Factor on the secants after a full step, and their least part."""
+ROUND = 32
+"""Rows that are taken as they are come in multiples of this: a program of so many is made once."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
 
@@ -127,6 +131,10 @@ class Newton:
         (n,) each: damping; None for none.
     kink
         Largest jump of the loss's slope; 0 where it is smooth.
+    exact
+        Small programs with so many rows as they are, where one serves any rows.
+    accuracy
+        Part of the loss that the search may leave undone.
     """
 
     loss: Summands
@@ -137,6 +145,8 @@ class Newton:
     size: Array | None
     centre: Array | None
     kink: float
+    exact: dict[int, Small]
+    accuracy: float = 0.0
     steps: int = 0
     x: Array = field(default_factory=lambda: np.zeros(0))
     point: Point | None = None
@@ -216,6 +226,7 @@ class Newton:
         r = self._residual(z)
         size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
         secants, t_before = 0.0, 0.0
+        tolerance = max(tolerance, self.accuracy)
         for _ in range(most):
             gradient, H = self._model(r, h)
             if secants or _poor(H):
@@ -228,6 +239,8 @@ class Newton:
             u = T @ d
             pull, bend = self._damping_along(z, d)
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
+            if self.point.iterations:  # Clarabel's accuracy
+                tolerance = max(tolerance, INTERIOR)
             if promised <= tolerance * size:
                 break
             Ad = self.rows.A @ d
@@ -299,6 +312,8 @@ class Newton:
                 self.x = x_before
                 return z_before, h
             near = self._near(self.rows.entries(self._residual(z)), 3 * h)
+            if added <= self.accuracy * size:
+                return z, h
             if len(near) <= few:
                 found = self._exact(z, near, h)
                 if found is not None:
@@ -318,19 +333,17 @@ class Newton:
         """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
         at, T, weight = self.penalty.at, self.rows.whitened[1], self.weight
         value = self._value(z, self.x)
-        sizes = self.rows.sizes
         for _ in range(8):
             if len(near) > 2 * max(NEAR * self.rows.A.shape[1], 200):
                 return None
             r = self._residual(z)
+            near = self._filled(near, r)
             gradient, H = self._model(r, 0.0, near)
             A, b = self.rows.of(near)
             small = self.small
             exact: tuple[Array, ...] = ()
             if len(near):
-                expression, own = self.loss.some(near)
-                some = Canonical(expression, [], own)
-                small = Small(self.penalty, self.small.rows, some, None if sizes is None else sizes[near])
+                small = self._with_rows(near)
                 exact = (A, b)
             try:
                 point = self._solved(z, gradient, H, small, *exact)
@@ -354,6 +367,30 @@ class Newton:
             beside = self._near(self.rows.entries(self._residual(z)), h)
             near = np.union1d(near, np.union1d(np.flatnonzero(bent), beside))
         return None
+
+    def _filled(self, near: np.ndarray, r: Array) -> np.ndarray:
+        """Return entries and the smallest others, so many that their number comes again."""
+        if not len(near) or not self._alike:
+            return near
+        count = min(-(-len(near) // ROUND) * ROUND, self.loss.variable.size)
+        order = np.argsort(np.abs(self.rows.entries(r)))
+        return np.sort(np.concatenate([near, order[~np.isin(order, near)][: count - len(near)]]))
+
+    @property
+    def _alike(self) -> bool:
+        """Whether one small program serves any entries of a number."""
+        return self.loss.uniform and (self.rows.sizes is None or np.ptp(self.rows.sizes) == 0)
+
+    def _with_rows(self, near: np.ndarray) -> Small:
+        """Return the small program with the rows of some entries as they are."""
+        if self._alike and len(near) in self.exact:
+            return self.exact[len(near)]
+        expression, own = self.loss.some(near)
+        sizes = None if self.rows.sizes is None else self.rows.sizes[near]
+        made = Small(self.penalty, self.small.rows, Canonical(expression, [], own), sizes)
+        if self._alike:
+            self.exact[len(near)] = made
+        return made
 
 
 def _poor(H: Array) -> bool:

@@ -60,6 +60,7 @@ class Warm:
     width: float = 0.0
     working: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     small: dict[int, Small] = field(default_factory=dict)
+    exact: dict[int, Small] = field(default_factory=dict)
     direct: dict[int, Small] = field(default_factory=dict)
     canonical: Canonical | None = None
     kink: float = -1.0
@@ -98,6 +99,7 @@ def minimum(
     squares: Squares | None = None,
     size: Array | None = None,
     centre: Array | None = None,
+    accuracy: float = 0.0,
 ) -> Minimum:
     """Return the minimum of a convex program; what solves it is told by the structure of the loss.
 
@@ -122,6 +124,8 @@ def minimum(
         The quadratic part of the loss.
     size, centre
         (n,) damping |size (z - centre)|^2.
+    accuracy
+        Part of the loss that a sum over rows may be above its minimum.
 
     Raises
     ------
@@ -136,7 +140,7 @@ def minimum(
             point = _coupled(loss, rows, warm, weight, squares, size, centre)
         else:
             try:
-                point = _separable(loss, rows, warm, weight, size, centre)
+                point = _separable(loss, rows, warm, weight, size, centre, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
                 point = _all_rows(loss, rows, warm, weight, None, size, centre)
         z = point.x[warm.penalty.at]
@@ -144,7 +148,9 @@ def minimum(
         return Minimum(z, point.x, point.dual, point.iterations, point.slope)
 
 
-def _separable(loss: Loss, rows: Rows, warm: Warm, weight: float, size: Array | None, centre: Array | None) -> Point:
+def _separable(
+    loss: Loss, rows: Rows, warm: Warm, weight: float, size: Array | None, centre: Array | None, accuracy: float
+) -> Point:
     summands = loss.summands
     if summands is None:
         raise OutsideDomain
@@ -158,7 +164,7 @@ def _separable(loss: Loss, rows: Rows, warm: Warm, weight: float, size: Array | 
     if z is None or x is None or not known:
         x = small.solve(rows.squares.damped(size, centre), weight).x
         z = x[warm.penalty.at]
-    search = Newton(summands, rows, warm.penalty, small, weight, size, centre, warm.kink)
+    search = Newton(summands, rows, warm.penalty, small, weight, size, centre, warm.kink, warm.exact, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
