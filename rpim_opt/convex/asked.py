@@ -74,7 +74,10 @@ class Asked:
         pairs: dict[int, int] = {}
         for mine, its in ((self.z, other.z), (self.loss_term.variable, other.loss_term.variable)):
             pairs |= {id(mine): id(its), id(its): id(mine)}
-        return alike(stated[0], stated[1], pairs)
+        try:
+            return alike(stated[0], stated[1], pairs)
+        except ValueError:  # something that has no truth value: then they may differ
+            return False
 
 
 def ask(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Asked:

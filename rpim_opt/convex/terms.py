@@ -87,14 +87,15 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
     """
     if id(stated) in instead:
         return instead[id(stated)]
-    if isinstance(stated, cp.transforms.indicator):
-        return cp.transforms.indicator([substituted(limit, instead) for limit in stated.args], stated.err_tol)
-    if isinstance(stated, cp.perspective):
+    kind = type(stated)
+    if kind.__name__ == "indicator":
+        return kind([substituted(limit, instead) for limit in stated.args], stated.err_tol)
+    if kind.__name__ == "perspective":
         parts = [stated.f, stated.args[0], stated.f_recession]
-        return cp.perspective(*(None if part is None else substituted(part, instead) for part in parts))
+        return kind(*(None if part is None else substituted(part, instead) for part in parts))
     args = [substituted(arg, instead) for arg in stated.args]
-    if type(stated).__name__ == "SuppFuncAtom":
-        return type(stated)(args[0], stated._parent)
+    if kind.__name__ == "SuppFuncAtom":
+        return kind(args[0], stated._parent)
     return stated.copy(args, instead)
 
 
@@ -104,24 +105,28 @@ def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
     ``pairs`` gets which stand for each other, by their ``id``, in both directions.
     """
     if isinstance(one, cp.Expression | cp.Constraint):
-        if type(one) is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
-            return False
-        if isinstance(one, cp.Variable):
-            paired = pairs.setdefault(id(one), id(other)) == id(other) and pairs.setdefault(id(other), id(one)) == id(
-                one
-            )
-            return paired and alike(list(one.attributes.items()), list(other.attributes.items()), pairs)
-        if isinstance(one, cp.Constant):
-            return alike(_numbers(one), _numbers(other), pairs)
-        own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
-        data = [[part for part in each.get_data() or [] if part not in own] for each in (one, other)]
-        return alike(data[0], data[1], pairs) and alike(one.args, other.args, pairs)
+        return type(one) is type(other) and _same_nodes(one, other, pairs)
     if isinstance(one, list | tuple):
         same = type(one) is type(other) and len(one) == len(other)
         return same and all(alike(a, b, pairs) for a, b in zip(one, other, strict=True))
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other)
     return bool(one == other)
+
+
+def _same_nodes(one: Any, other: Any, pairs: dict[int, int]) -> bool:
+    if one.shape != other.shape or len(one.args) != len(other.args):
+        return False
+    if isinstance(one, cp.Variable):
+        paired = pairs.setdefault(id(one), id(other)) == id(other) and pairs.setdefault(id(other), id(one)) == id(one)
+        return paired and alike(list(one.attributes.items()), list(other.attributes.items()), pairs)
+    if isinstance(one, cp.Constant):
+        return alike(_numbers(one), _numbers(other), pairs)
+    own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
+    data = [
+        [part for part in each.get_data() or [] if not (isinstance(part, int) and part in own)] for each in (one, other)
+    ]
+    return alike(data[0], data[1], pairs) and alike(one.args, other.args, pairs)
 
 
 def _numbers(constant: Any) -> list[Array]:
@@ -167,7 +172,7 @@ class Frozen:
 
 def _domain(expression: Any) -> list[Any]:
     """Return the constraints outside of which an expression is infinite; CVXPY's own forgets indicators."""
-    if isinstance(expression, cp.transforms.indicator):
+    if type(expression).__name__ == "indicator":
         return list(expression.args)
     own = expression.domain if not expression.args else expression._domain()
     return [*own, *(limit for arg in expression.args for limit in _domain(arg))]

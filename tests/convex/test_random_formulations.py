@@ -110,7 +110,7 @@ def plane(rng: Rng) -> Any:
 
 
 def equality(rng: Rng) -> Any:
-    value = float(rng.normal())
+    value = 0.1 * float(rng.normal())
     return lambda z, p: [cp.sum(z[:3]) == value, z[3] == z[4]]
 
 

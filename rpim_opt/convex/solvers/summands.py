@@ -35,7 +35,7 @@ class Summands:
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
         self.variable, self.positive = variable, positive
-        self.entries = None
+        self.entries: Any = None
         if {v.id for v in expression.variables()} == {variable.id}:
             self.entries = _summands(expression, variable)
 
