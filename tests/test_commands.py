@@ -476,7 +476,7 @@ BAD = {
     "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["the original stays"]),
     "tip that moves": (
         ["export", *RESULT, "--urdf", "bare.urdf", "--out", "made", "--tool"],
-        ["moves the tip 'link_6'", "a fixed joint"],
+        ["moves link 'link_6'", "a fixed joint"],
     ),
     "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "off by"]),
     "ending of a table": (["export", *RESULT, "--mdh", "made.txt"], ["made.txt", "ending in .toml"]),

@@ -103,10 +103,11 @@ class Curves(NamedTuple):
 
     def variances(self, length: float) -> tuple[Array, Array]:
         """Return ln s_k (c,), and its slopes by ln length."""
-        w2 = np.concatenate([np.tile(2 * np.pi / c.period * np.arange(1, c.count + 1), 2) ** 2 for c in self.each])
-        period = np.concatenate([np.full(2 * c.count, c.period) for c in self.each])
+        w2 = np.concatenate([np.tile(2 * np.pi / c.period * np.arange(1, c.harmonics + 1), 2) ** 2 for c in self.each])
+        period = np.concatenate([np.full(2 * c.harmonics, c.period) for c in self.each])
         r2 = 3 / length**2
-        return np.log(8 * r2**1.5 / period) - 2 * np.log(r2 + w2), 4 * r2 / (r2 + w2) - 3
+        logarithm = np.log(8 * r2**1.5 / period) - 2 * np.log(r2 + w2)
+        return np.asarray(logarithm, dtype=float), np.asarray(4 * r2 / (r2 + w2) - 3, dtype=float)
 
 
 class Optimum(NamedTuple):
@@ -198,6 +199,7 @@ class Restricted:
         residual = y - rows @ z
         gradient = np.zeros(len(logs))
         moved = np.zeros((len(rows), len(logs)))  # V_h P y
+        by_log = np.zeros((p - known, first))
         if first:
             by_log = np.column_stack([np.full(p - known, 2.0), growth])
             gradient[:first] = (1 - C.diagonal()[known:] - z[known:] ** 2) @ by_log
@@ -336,7 +338,8 @@ class Learner:
         )
         table = np.column_stack([np.vstack(rows), np.concatenate(right)])
         table = np.vstack([table, np.eye(c, table.shape[1])])
-        R = np.linalg.qr(table, mode="r")[c:, c:]
+        triangle: Array = np.asarray(np.linalg.qr(table, mode="r"))
+        R = triangle[c:, c:]
         m = len(R)
         every = np.ones((m, 1), dtype=bool)
         stack = Stack(np.arange(m)[:, None], np.ones((m, 1, 1)), every, ~every, np.zeros((m, 1, 0)))
@@ -408,7 +411,8 @@ def admitted(estimator: Estimator, fit: Fit, stated: Sequence[str], trials: tupl
     base = whole.with_parameters(replace(q, identified=np.isin(q.names, list(used))))
     keep = np.isin(names, list(used))
     geometry, x = geometry.restricted(keep), x[keep]
-    for _ in range(ROUNDS):  # curves take over what stood in the geometry, which moves
+    rounds = 0
+    while True:  # curves take over what stood in the geometry, which moves
         with phase("selection"):
             local = geometry.optima([best.logs])[0]
             every = np.ones(len(x), dtype=bool)
@@ -422,7 +426,8 @@ def admitted(estimator: Estimator, fit: Fit, stated: Sequence[str], trials: tupl
             solved = estimator.refit(laid, estimator.prior.penalized(tikhonov, prior), solved, ITERATIONS)
         moved = float(np.sqrt(np.mean(((solved[: len(x)] - x) / laid.parameters.free.scale[: len(x)]) ** 2)))
         x = solved[: len(x)]
-        if moved <= CLOSE:
+        rounds += 1
+        if moved <= CLOSE or rounds == ROUNDS:
             break
     q = base.parameters
     scale = q.scale.copy()
@@ -493,5 +498,5 @@ def _learned(
         covariance=block_diag(plain.covariance, covariance[first:, first:]),
         stated=np.append(plain.stated, waves),
         drift=drift,
-        curves=Transmitted(*sizes[:first], gain),
+        curves=Transmitted(sizes[0], sizes[1], gain),
     )

@@ -53,7 +53,7 @@ def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
     sizes = np.array([len(points.row) for points in tries])
     for size in np.unique(sizes):
         some = np.flatnonzero(sizes == size)
-        chosen = [tries[i] for i in some]
+        chosen = [tries[int(i)] for i in some]
         fits = fit_arms(robot, Candidates.of(robot, chosen), ZERO_STEPS, zeros=True, robust=True)
         found[some] = rms(fits) / [points.extent for points in chosen]
     return found

@@ -365,7 +365,7 @@ class Curve(NamedTuple):
     joint: int
     centre: float
     period: float
-    count: int
+    harmonics: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,13 +395,13 @@ def transmission(curve: Curve) -> Transmission:
     --------
     >>> import math
     >>> import rpim_opt as ro
-    >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, count=2))
+    >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, harmonics=2))
     >>> term.names(2)
     ('transmission2_c1', 'transmission2_c2', 'transmission2_s1', 'transmission2_s2')
     >>> float(term.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, 0.1])), 0, 0, 0, 1e-3))  # sin(4 q)
     0.00038941834...
     """
-    keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.count + 1)]
+    keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.harmonics + 1)]
     return Transmission(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), curve=curve)
 
 
@@ -415,7 +415,7 @@ def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
     cosine, sine = ca.cos(u), ca.sin(u)
     c, s = 1.0, 0.0
     total = 0.0
-    for a, b in zip(sizes[: curve.count], sizes[curve.count :], strict=True):
+    for a, b in zip(sizes[: curve.harmonics], sizes[curve.harmonics :], strict=True):
         c, s = c * cosine - s * sine, s * cosine + c * sine
         total = total + a * c + b * s
     return total

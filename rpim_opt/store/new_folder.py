@@ -359,7 +359,7 @@ def _problem_text(
         **said,
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
-        identify=toml(_patterns(identifiable("auto", arm.robot, parameters, rows), arm.robot.dof)),
+        identify=toml(_patterns(list(identifiable("auto", arm.robot, parameters, rows)), arm.robot.dof)),
         noise=list(noise.items()),
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),

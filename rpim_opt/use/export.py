@@ -125,7 +125,7 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
     squares = []
     for curve in curves:
         place = [free.index(name) for name in transmission(curve).names(curve.joint)]
-        q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.count + 1)
+        q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
         values = np.zeros((len(q), curve.joint))
         values[:, -1] = q
         columns = Curves((curve,)).columns(values, np.ones_like(values))

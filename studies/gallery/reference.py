@@ -77,7 +77,8 @@ def top_level() -> str:
         module = getattr(rpim_opt, folder)
         homes |= {id(getattr(module, each)): folder for each in module.__all__}
     rows = [("name", "what")]
-    for each in rpim_opt.__all__:
+    names: list[str] = vars(rpim_opt)["__all__"]
+    for each in names:
         value = getattr(rpim_opt, each)
         rows.append((f"{{py:obj}}`ro.{each} <rpim_opt.{homes[id(value)]}.{each}>`", _first(value)))
     folders = [("namespace", "what")]
@@ -148,6 +149,7 @@ def _keys(owner: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
     """Yield key, type and description of every field of a class."""
     for field, below in zip(owner.body, [*owner.body[1:], None], strict=True):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            described = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-            text = " ".join(str(below.value.value).split()) if described else ""
+            text = ""
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = " ".join(str(below.value.value).split())
             yield f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", text

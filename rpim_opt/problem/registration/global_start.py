@@ -255,6 +255,7 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
     count = max(FEWEST_STARTS, STARTS_PER_SIGNS * len(signs))
     pool = [_round(robot, few, *_plain_starts(n, signs, turning))]
     starts = 0
+    cost = np.zeros(0)
     for _ in range(ROUNDS):
         sign = signs[np.resize(rng.permutation(len(signs)), count)]
         zero = rng.uniform(-np.pi, np.pi, (count, n)) * turning

@@ -185,8 +185,8 @@ class Candidates(NamedTuple):
 
     def take(self, index: np.ndarray) -> Candidates:
         """Return the candidates at ``index``."""
-        each = (values[index] for values in (self.q, self.y, self.marker, self.zero, self.tools))
-        return Candidates(*each, self.stated, self.spread)
+        taken = {name: getattr(self, name)[index] for name in ("q", "y", "marker", "zero", "tools")}
+        return self._replace(**taken)
 
 
 def fit_arms(

@@ -160,9 +160,9 @@ def write_urdf(
         if taker is not None:  # the other origins stay, this one takes the whole correction
             before = _product([step.constant for step in between[:taker]])
             after = _product([step.constant for step in between[taker + 1 :]])
-            T = np.linalg.inv(before) @ new @ np.linalg.inv(after)
+            T: Array = np.linalg.inv(before) @ new @ np.linalg.inv(after)
             step = between[taker]
-            edits |= step.joint.origin_edits(urdf.data, np.linalg.inv(T) if step.up else T, size)
+            edits |= step.joint.origin_edits(urdf.data, _inverse(T) if step.up else T, size)
         elif np.abs(new - old).max() > 10 * ROUNDING * size:
             raise _inexpressible(urdf, steps, at_tip=new is tail)
     write_bytes(Path(target), spliced(urdf.data, edits))
@@ -178,7 +178,7 @@ class _Step:
     @property
     def constant(self) -> Array:
         """Transform (4, 4) of the joint's origin: before its motion, or after it where it is passed up."""
-        return np.linalg.inv(self.joint.origin) if self.up else self.joint.origin
+        return _inverse(self.joint.origin) if self.up else self.joint.origin
 
     @property
     def start(self) -> str:
@@ -187,6 +187,10 @@ class _Step:
     @property
     def end(self) -> str:
         return self.joint.parent if self.up else self.joint.child
+
+
+def _inverse(T: Array) -> Array:
+    return np.asarray(np.linalg.inv(T), dtype=float)
 
 
 def _product(transforms: Sequence[Array]) -> Array:
