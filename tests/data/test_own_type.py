@@ -1,4 +1,4 @@
-"""A measurement type of a stranger's, in one file of the package: every command knows it."""
+"""A measurement type and a table format of a stranger's, in one file of the package each: every command knows them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rpim_opt.robot.formats.tables import write_robot
 from rpim_opt.robot.kinematics import forward_kinematics
 from tests import ROOT
 from tests.simulate import ARM
+from tests.store.instrument_files import INSTRUMENTS
 from tests.store.raw_files import off_its_drawing
 
 HEIGHT = '''
@@ -32,6 +33,25 @@ height = Measurement(
 )
 TYPES = (height,)
 '''
+MELFA = '''
+"""Joint variables of Mitsubishi's MELFA, ``J1=(+10.00,-20.00,...)`` in degrees."""
+
+import re
+
+from rpim_opt.data.tables.formats.registry import TableFormat
+
+JOINTS = re.compile(r"^(J\\d+)=\\(([^)]*)\\)", re.MULTILINE)
+
+
+def read(text):
+    return [
+        {"label": name, **{f"J{i} [deg]": value for i, value in enumerate(values.split(",")[:6], start=1)}}
+        for name, values in JOINTS.findall(text)
+    ]
+
+
+FORMATS = (TableFormat("MELFA variables", (".prg",), lambda text: JOINTS.search(text) is not None, read),)
+'''
 COUNT = 80
 NOISE = 0.01
 """[mm]"""
@@ -43,6 +63,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("own")
     shutil.copytree(ROOT / "rpim_opt", place / "rpim_opt", ignore=shutil.ignore_patterns("__pycache__"))
     (place / "rpim_opt" / "data" / "measurements" / "height.py").write_text(HEIGHT)
+    (place / "rpim_opt" / "data" / "tables" / "formats" / "melfa.py").write_text(MELFA)
     write_robot(ARM, place / "robot.toml")
     rng = np.random.default_rng(3)
     q = rng.uniform(-120, 120, (COUNT, 6)).round(4)
@@ -79,3 +100,12 @@ def test_from_a_raw_table_to_a_validated_robot(place: Path) -> None:
     found = json.loads(said(place, "validate", "out", "cell/validation.csv", "--json"))
     assert found["identified"]["rms_mm"] < 3 * NOISE
     assert found["identified"]["rms_mm"] < 0.1 * found["nominal"]["rms_mm"]
+
+
+def test_a_controllers_variables_beside_a_table_of_points(place: Path) -> None:
+    write, options, _ = INSTRUMENTS["MELFA joint variables"]
+    files = [part for file in write(place) for part in ("--data", file.name)]
+    stated = [part for name, value in options.items() for part in (f"--{name}", value)]
+    found = json.loads(said(place, "new", "melfa", "--robot", "robot.toml", *files, *stated, "--json"))
+    assert found["rows"] == 36
+    assert "calib.prg: read as MELFA variables." in found["notes"]
