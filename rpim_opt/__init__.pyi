@@ -55,7 +55,5 @@ from .store import calibrate as calibrate
 from .store import load as load
 from .store import load_result as load_result
 from .study import compare as compare
-from .use import read_measurements as read_measurements
-from .use import read_targets as read_targets
 
 __version__: str

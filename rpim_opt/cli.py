@@ -71,18 +71,51 @@ def _common(
     """Take what stands before a command."""
 
 
+def _shipped(incomplete: str) -> list[str]:
+    """Complete a problem: the names that come with the package; folders are the shell's own."""
+    from rpim_opt.store.problem_file import problems_folder
+
+    return sorted(path.parent.name for path in problems_folder().glob(f"{incomplete}*/problem.toml"))
+
+
+def _formulations(incomplete: str) -> list[str]:
+    from rpim_opt.convex.formulation import FORMULATIONS
+
+    return [name for name in FORMULATIONS if name.startswith(incomplete)]
+
+
+def _selectors(incomplete: str) -> list[str]:
+    from rpim_opt.convex.select import SELECTORS
+
+    return [name for name in ("learned", *SELECTORS) if name.startswith(incomplete)]
+
+
+def _robots(incomplete: str) -> list[str]:
+    from rpim_opt.robot.library import robots
+
+    return [name for name in robots() if name.startswith(incomplete)]
+
+
+def _one_of(*words: str) -> Callable[[str], list[str]]:
+    return lambda incomplete: [word for word in words if word.startswith(incomplete)]
+
+
 Text = str | None
 Number = float | None
 File = Path | None
 Choice = bool | None
-Problem = Annotated[str, Argument(help="A problem folder, or the name of one that comes with rpim-opt.")]
+Problem = Annotated[
+    str, Argument(help="A problem folder, or the name of one that comes with rpim-opt.", autocompletion=_shipped)
+]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
 Type = Annotated[Text, Option(help="Which of the result's measurement types, if there are several.")]
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
 Largest = Annotated[Number, Option(help="Largest error that is allowed [mm]; exit code 1 above.")]
-Box = Annotated[Text, Option(help="Where: x0,x1,y0,y1,z0,z1 [mm] in the base frame; else all that was measured.")]
+Box = Annotated[
+    Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the base frame; default: the measured joint ranges.")
+]
 Marker = Annotated[Text, Option(help="Which reflector, where there are several.")]
 UrdfBase = Annotated[Text, Option(help="Link where the chain starts, if not the root: any link, a camera in the head.")]
 UrdfTip = Annotated[Text, Option(help="Link where it ends, if there are several.")]
@@ -96,13 +129,18 @@ Json = Annotated[bool, Option("--json", help="One JSON document on stdout, error
 
 @app.command()
 def new(
-    folder: Annotated[Path, Argument(help="The problem folder to make; none that is there already.")],
-    robot: Annotated[str, Option(help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.")],
+    folder: Annotated[Path, Argument(help="The problem folder to make; it must not exist.")],
+    robot: Annotated[
+        str,
+        Option(
+            help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.", autocompletion=_robots
+        ),
+    ],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
-    dry_run: Annotated[bool, Option("--dry-run", help="Say what the tables mean, and write nothing.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
     sheet: Annotated[str, Option(help="Excel sheet, by name or number.")] = "",
-    columns: Annotated[str, Option(help="Names of the columns, where there is no header: label,q1_deg,...")] = "",
+    columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = "",
     key: Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")] = "",
     time_tolerance: Annotated[Number, Option(help="Join files by the nearest time, within so many s.")] = None,
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
@@ -114,16 +152,16 @@ def new(
     measurement: Annotated[
         Text, Option(help="position, pose, cable, distance, plane, sphere, eye_in_hand, ...; guessed from columns.")
     ] = None,
-    validation: Annotated[File, Option(help="A table to keep apart for validation.")] = None,
-    hold_out: Annotated[Number, Option(help="Part of the configurations to keep apart instead, 0.25.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of the configurations that are kept apart.")] = 0,
+    validation: Annotated[File, Option(help="A table for validation.")] = None,
+    hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead, 0.25.")] = None,
+    seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: Json = False,
 ) -> None:
-    """Make a problem folder from a table and a robot: every key with a comment, and what was guessed from what."""
+    """Make a problem folder from a table and a robot; every key has a comment, every guess its reason."""
     with console.progress():
         from rpim_opt.basics.files import refused
         from rpim_opt.store.raw import understand_tables
@@ -150,7 +188,7 @@ def new(
 
 @app.command()
 def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) -> None:
-    """Look at a problem before calibrating: ranges, coverage, repeated rows, likely mistakes, what is identifiable."""
+    """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
         from rpim_opt.problem.diagnosis import inspect
@@ -160,7 +198,7 @@ def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) ->
         instance = load(problem, variant)
         say("inspecting")
         found = inspect(instance.problem, instance.validation)
-        say("looking at what a quick fit leaves")
+        say("analysing the residuals of a quick fit")
         lacking = foreseen(instance.problem)
     document = {"title": instance.title, "source": instance.source, **found.content(), "lack_of_fit": None}
     head = "\n".join(filter(None, [instance.title, instance.source]))
@@ -176,14 +214,33 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Annotated[
-        Text, Option(help="learned (scales of the prior), or one weight: reml, l_curve, gcv, k_fold, ..., a number.")
+        Text,
+        Option(
+            help="learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number.",
+            autocompletion=_selectors,
+        ),
     ] = None,
-    model: Annotated[Text, Option(help="auto: extensions by evidence (gravity, gears); geometry: none.")] = None,
+    model: Annotated[
+        Text,
+        Option(
+            help="auto: extensions by evidence (gravity, gears); geometry: none.",
+            autocompletion=_one_of("auto", "geometry"),
+        ),
+    ] = None,
     formulation: Annotated[
         Text,
-        Option(help="least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."),
+        Option(
+            help="least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso.",
+            autocompletion=_formulations,
+        ),
     ] = None,
-    noise: Annotated[Text, Option(help="Noise that is learned: robot, free, level, declared.")] = None,
+    noise: Annotated[
+        Text,
+        Option(
+            help="Variance components to estimate: robot, free, level, declared (none).",
+            autocompletion=_one_of("robot", "free", "level", "declared"),
+        ),
+    ] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[
         bool, Option("--use-validation", help="Once validated, calibrate from all rows.")
@@ -191,7 +248,7 @@ def calibrate(
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,
-    profile: Annotated[bool, Option("--profile", help="Say where the time went.")] = False,
+    profile: Annotated[bool, Option("--profile", help="Print the time of each phase.")] = False,
     as_json: Json = False,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
@@ -305,7 +362,7 @@ def accept(
     measurement: Type = None,
     as_json: Json = False,
 ) -> None:
-    """Say whether the calibrated robot keeps a limit wherever it will go, by the bound of what it may miss by.
+    """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
     Exit code 0 if it is accepted, 1 if it is rejected, 4 where that cannot be decided: then it says what is lacking.
     """
@@ -317,7 +374,7 @@ def accept(
         left_out: tuple[str, ...] = ()
         if data is not None:
             rows, left_out = read_measurements(loaded, data, measurement, units)
-        say("looking for the largest bound")
+        say("searching for the maximum uncertainty")
         found = accept(loaded, console.required(limit, box, loaded.record.requirement), rows)
     document = {**found.content(), "left_out": left_out}
     console.show(str(found) + console.left_out_line(left_out), document, as_json)
@@ -466,13 +523,13 @@ def compensate(
     result: Result,
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     units: Units = "",
-    position_only: Annotated[bool, Option("--position-only", help="Let orientations go.")] = False,
+    position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
     tool: Annotated[Text, Option(help="Tool instead of the reflector: x,y,z [mm], roll,pitch,yaw [deg].")] = None,
     marker: Marker = None,
     base: Annotated[bool, Option("--base", help="Correct for the base, too.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
     largest: Annotated[float, Option(help="Largest correction of a joint [rad or m].")] = 0.2,
-    limit: Annotated[Number, Option(help="Error that may be left [mm]; exit code 1 above.")] = None,
+    limit: Annotated[Number, Option(help="Largest residual error [mm]; exit code 1 above.")] = None,
     out: Table = None,
     as_json: Json = False,
 ) -> None:
@@ -522,7 +579,7 @@ def design(
     table: Annotated[File, Option(help="A table of candidates instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="Of a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the random candidates.")] = 0,
-    augment: Annotated[bool, Option("--augment", help="Choose what helps most beside the measured ones.")] = False,
+    augment: Annotated[bool, Option("--augment", help="Choose in addition to the measured configurations.")] = False,
     out: Table = None,
     as_json: Json = False,
 ) -> None:
@@ -588,8 +645,8 @@ def compare(
     splits: Annotated[str, Option(help="What is held out: folder, a part (0.25), a number of folds (5).")] = "folder",
     counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; all without.")] = "",
     noise: Annotated[str, Option(help="Factors on the noise of the data to fit: 1,3.")] = "1",
-    seeds: Annotated[int, Option(min=1, help="How many draws of what is drawn.")] = 1,
-    metrics: Annotated[str, Option(help="The first one is summed up: rms_mm,max_mm,...")] = "",
+    seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
+    metrics: Annotated[str, Option(help="Metrics, the first one summarized: rms_mm,max_mm,...")] = "",
     against: Annotated[Text, Option(help="Method that others are compared with: 'tikhonov, reml'.")] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,

@@ -165,41 +165,77 @@ class ProblemTable(Table):
     """The keys of ``problem.toml``."""
 
     title: str
+    """What was calibrated."""
     source: str = ""
+    """Where every figure comes from, and its licence."""
     robot: str = "robot.toml"
+    """File of the robot (.toml, .urdf, .csv, .json), or the name of a ready one."""
     urdf_base: str | None = None
+    """Link where the chain starts."""
     urdf_tip: str | None = None
+    """Link where the chain ends."""
     mounting: Mounting | None = None
+    """floor, ceiling, wall, or the direction of gravity in the base frame."""
     payload: PayloadTable | None = None
+    """Mass at the flange and its centre."""
     celsius: float | None = Field(default=None, alias="temperature_C")
+    """Temperature at which the lengths are nominal [degC]."""
     measurement: str = "position"
+    """Measurement type."""
     layout: Layout = "named"
+    """named: columns by name; robodk: RoboDK's export."""
     identification: str | None = None
+    """Table of the identification data."""
     validation: str | None = None
+    """Table of the validation data."""
     observation: list[Observation] = Field(default_factory=list)
+    """Several measurement types, a table each."""
     target: str | dict[str, Any] | None = None
+    """Board of a camera: a table, or columns, rows and spacing."""
     exclude: dict[str, str] = Field(default_factory=dict)
+    """Rows to leave out: label = reason."""
     identify: list[Name] | Literal["auto"]
+    """Patterns of the parameters to identify, or auto."""
     formulation: str = "tikhonov"
+    """Name of a ready formulation."""
     selector: str = "learned"
+    """learned (prior scales), the name of a selection rule, or a number."""
     model: Model = "geometry"
+    """auto: model extensions by evidence; geometry: none."""
     scatter: str | dict[str, Any] = "robot"
+    """Variance components to estimate (robot, free, level, declared), or the repeatability."""
     noise: dict[str, Any] = Field(default_factory=dict)
+    """Measurement noise of rows that state none."""
     scale: dict[Name, Any] = Field(default_factory=dict)
+    """Prior standard deviations, by kind, pattern or name."""
     tolerance: dict[Name, Any] = Field(default_factory=dict)
+    """Largest deviations of the formulation bounded."""
     prior: PriorTable = PriorTable()
+    """What is known besides the scales."""
     constraints: Constraints = Constraints()
+    """Constraints on parameters and positions."""
     known_distance: list[DistanceTable] = Field(default_factory=list)
+    """Known distances between touched points or planes."""
     known_angle: list[AngleTable] = Field(default_factory=list)
+    """Known angles between touched planes."""
     base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
+    """Start of the base frame, or auto (registration)."""
     tool: dict[str, Any] = Field(default_factory=dict)
+    """Start of the tool frame; of several reflectors by marker."""
     published: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """Mean errors [mm] that the source prints."""
     reference: dict[str, list[float]] = Field(default_factory=dict)
+    """Figures that a run must reproduce: [value, tolerance]."""
     simulation: dict[str, Any] = Field(default_factory=dict)
+    """How the tables were simulated."""
     record: dict[str, Any] = Field(default_factory=dict)
+    """Who measured, when, with what."""
     reading: dict[str, str] = Field(default_factory=dict)
+    """How the tables are to be read where the joints or frames need another reading."""
     acceptance: dict[str, Any] = Field(default_factory=dict)
+    """Tolerance, confidence and region of the acceptance test."""
     variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Overlays of any key, by name."""
 
 
 @dataclass(frozen=True, eq=False)

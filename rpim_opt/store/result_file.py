@@ -205,29 +205,52 @@ class Stored:
     """What everything else in a result file follows from, in SI, by its keys."""
 
     formulation: str
+    """Name of the formulation."""
     definition: dict[str, Any]
+    """Its loss, penalty and constraints."""
     forms: Forms | None
+    """Quadratic forms of a script's loss and penalty."""
     weight: float
+    """Regularization weight."""
     selection: Selection | None
+    """Choice of the weight with its evidence."""
     converged: bool
+    """Whether the certificate holds."""
     message: str
+    """How the iteration ended."""
     history: tuple[Iteration, ...]
+    """Objective, step, weight and damping of every iteration."""
     x: Array
+    """Deviations of the identified parameters [SI]."""
     certificate: Certificate
+    """Optimality gap, violation, gradient."""
     trust: Trust | None
+    """Equations that a script's loss downweighted or left out."""
     held: tuple[Held, ...]
+    """Parameters at an active bound."""
     prices: tuple[Price, ...]
+    """Multipliers of the constraints."""
     robots: dict[str, Robot]
+    """Nominal robots."""
     terms: dict[str, list[OwnTerm]]
+    """Terms of a script's own, without their functions."""
     transmission: tuple[Curve, ...]
+    """Transmission errors of the joints."""
     model: Parameters
+    """All parameters: nominal, prior scale, tolerance, identified."""
     data: dict[str, Dataset]
+    """Identification and validation data."""
     scatter: Scatter | None
+    """Repeatability of the robot."""
     learned: Learned | None
+    """Estimated prior scales and noise with their evidence."""
     record: Record
+    """Title, source, files and excluded rows."""
     rows: dict[str, list[RowErrors]]
+    """Errors of every row [mm], nominal and identified."""
     mapping: JointMapping | None = None
     digest: str = ""
+    """SHA-256 of the content."""
 
 
 def content(result: Calibration) -> dict[str, Any]:

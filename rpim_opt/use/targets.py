@@ -57,7 +57,7 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     --------
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot
-    >>> targets = ro.read_targets({"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]}, robot)
+    >>> targets = ro.use.read_targets({"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]}, robot)
     >>> targets.label, targets.q, targets.poses
     (('P1',), None, array([[0.4, 0. , 0.5]]))
     """

@@ -215,7 +215,7 @@ def read_measurements(
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
     >>> table = {f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}
     >>> table |= {"x": [826.6, 810.0], "y": [98.0, 240.0], "z": [107.0, 254.0], "note": ["", "warm"]}
-    >>> data, left_out = ro.read_measurements(result, table, units="deg,mm")
+    >>> data, left_out = ro.use.read_measurements(result, table, units="deg,mm")
     >>> len(data), left_out
     (2, ('note',))
     """

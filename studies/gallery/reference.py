@@ -20,6 +20,11 @@ FILES = {
 }  # fmt: skip
 """File, the class that reads or writes it, and what it is."""
 
+MEMBERS = {
+    "CalibrationProblem": "identify, on, without, with_parameters, with_model, scattered, residual, errors, jacobian, "
+    "linearize, modelled, robot",
+}
+"""Members of large classes that a user calls; the others serve the loop."""
 VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 
 
@@ -58,7 +63,9 @@ def _directives(name: str, values: dict[str, Any]) -> Iterator[str]:
     for kind in ("class", "function", "data"):
         for each in sorted(kinds):
             if kinds[each] == kind:
-                yield f".. auto{kind}:: rpim_opt.{name}.{each}\n" + "   :members:\n" * (kind == "class")
+                yield f".. auto{kind}:: rpim_opt.{name}.{each}\n" + f"   :members: {MEMBERS.get(each, '')}\n" * (
+                    kind == "class"
+                )
 
 
 def module(name: str) -> str:

@@ -158,7 +158,7 @@ def targets(data: bytes, folder: Path) -> None:
     """Read targets."""
     path = folder / "targets.csv"
     path.write_bytes(data)
-    read = ro.read_targets(path, TWO)
+    read = ro.use.read_targets(path, TWO)
     for values in (read.q, read.poses, read.torque, read.payload):
         require(values is None or bool(np.isfinite(values).all()), "finite targets")
 

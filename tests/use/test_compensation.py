@@ -403,12 +403,12 @@ def test_tables_of_targets_in_and_of_commands_out(tmp_path: Path, orientation: s
     write(tmp_path / "both.csv", head, np.hstack([q / unit, 1e3 * poses[:, :3], turn]))
     write(tmp_path / "joints.csv", ["label", *names], q / unit)
     write(tmp_path / "poses.csv", ["label", *head[5:]], np.hstack([1e3 * poses[:, :3], turn]))
-    targets = ro.read_targets(tmp_path / "both.csv", SCARA)
+    targets = ro.use.read_targets(tmp_path / "both.csv", SCARA)
     assert targets.label == tuple("ABCDEF")
     assert targets.q == pytest.approx(q)
     assert targets.poses == pytest.approx(poses[:, : 7 if orientation else 3], abs=1e-12)
-    assert ro.read_targets(tmp_path / "joints.csv", SCARA).poses is None
-    assert ro.read_targets(tmp_path / "poses.csv", SCARA).q is None
+    assert ro.use.read_targets(tmp_path / "joints.csv", SCARA).poses is None
+    assert ro.use.read_targets(tmp_path / "poses.csv", SCARA).q is None
     out = tmp_path / "out" / "commands.csv"
     found = ro.use.compensate_file(result, tmp_path / "joints.csv", out)
     with out.open() as stream:

@@ -154,7 +154,7 @@ def test_targets_state_payloads_and_no_sides(tmp_path: Path) -> None:
     assert np.abs(without.q - found.q).max() > 1e-5
     sides = {f"approach{i}": [1] * 5 for i in range(1, 7)}
     with pytest.raises(ro.InputError, match="column approach1"):
-        ro.read_targets(columns | sides, ARM)
+        ro.use.read_targets(columns | sides, ARM)
 
 
 def test_a_payload_that_cannot_count_is_refused() -> None:
