@@ -30,8 +30,8 @@ HELP = """Robot calibration by convex optimization.
 
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
-Exit codes: 0 done; 1 a limit or gate failed, a calibration did not converge, or a mistake is likely; 2 unusable input;
-3 no solution found; 4 whether a limit is kept cannot be decided.
+Exit codes: 0 done; 1 a limit or gate failed, or a robot is not delivered; 2 unusable input; 3 no solution found; 4
+whether a limit is kept cannot be decided.
 """
 
 
@@ -124,6 +124,7 @@ Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute 
 Resume = Annotated[Choice, Option(help="Go on where an interrupted run was, or begin anew in spite of it.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
 Folder = Annotated[File, Option(help="Folder for result.json.")]
+Despite = Annotated[bool, Option("--despite-verdict", help="Also where the robot is not delivered, with a note.")]
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout, errors as JSON on stderr.")]
 
 
@@ -253,12 +254,10 @@ def calibrate(
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if it did not converge, a likely mistake is named, or a limit is not kept; 4 where that cannot be
-    decided.
+    Exit code 1 if the robot is not delivered or a limit is not kept; 4 where that cannot be decided.
     """
     with console.progress() as say:
         from rpim_opt.basics.threads import clock
-        from rpim_opt.calibration.causes import named
         from rpim_opt.report.summary import describe, describe_times, summary
         from rpim_opt.store.instances import load
 
@@ -291,7 +290,7 @@ def calibrate(
     for file in written:
         text += f"\n\nWritten: {file}"
     console.show(text, {**found, "refitted_without": without, "written": written}, as_json)
-    if named(found["likely_causes"]) or not result.converged:
+    if not result.verdict.delivered:
         raise typer.Exit(1)
     _end_by(found["acceptance"])
 
@@ -328,7 +327,8 @@ def validate(
 ) -> None:
     """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
 
-    Exit code 1 if an error is above the limit, or a mistake in the measurements is likely.
+    Exit code 1 if an error is above the limit, the errors are larger than the nominal robot's, or a mistake in the
+    measurements is likely.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
@@ -348,7 +348,7 @@ def validate(
         "within_limit": kept,
     }
     console.show(text + console.written_line(out), {**found.content(), **document}, as_json)
-    if kept is False or found.mistake:
+    if kept is False or found.mistake or found.worse:
         raise typer.Exit(1)
 
 
@@ -422,7 +422,7 @@ def update(
 ) -> None:
     """Recalibrate with the previous result as prior: say whether the robot changed, and which parameters did.
 
-    Exit code 1 if nothing explains what the new measurements miss, or it did not converge.
+    Exit code 1 if nothing explains what the new measurements miss, or the robot is not delivered.
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import sha256_of
@@ -435,7 +435,7 @@ def update(
         updated = found.result
         updated = replace(updated, record=replace(updated.record, files={data.name: sha256_of(data)}))
     _tell(found, left_out, _saved(updated, out), as_json)
-    if not (found.explained and updated.converged):
+    if not (found.explained and updated.verdict.delivered):
         raise typer.Exit(1)
 
 
@@ -479,9 +479,13 @@ def export(
     base: Annotated[bool | None, Option(help="Make the URDF's root the instrument's frame; default: if near.")] = None,
     tool: Annotated[Choice, Option(help="Make its tip the reflector; by default if it is near.")] = None,
     marker: Marker = None,
+    despite_verdict: Despite = False,
     as_json: Json = False,
 ) -> None:
-    """Write the identified robot for other tools: all files that are asked for, or none."""
+    """Write the identified robot for other tools: all files that are asked for, or none.
+
+    Exit code 1 if the robot is not delivered.
+    """
     with _loaded(result) as (loaded, _):
         from rpim_opt.robot.formats.tables import write_robodk, write_robot
         from rpim_opt.robot.formats.universal_robots import write_ur_kinematics
@@ -496,6 +500,7 @@ def export(
 
         whole = loaded
         loaded, without = geometry_alone(whole)
+        note = _forced(loaded, despite_verdict)
         robot = with_first_reflector(loaded, marker).robot
         options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
         corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
@@ -512,7 +517,7 @@ def export(
         if not writers:
             accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
             raise InputError("export", "nothing to write", accepted)
-        notes = [*without, *write_all(writers)]
+        notes = [*filter(None, [note]), *without, *write_all(writers, note)]
     written = [target for target, _ in writers]
     text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
     console.show(text, {"written": written, "notes": notes}, as_json)
@@ -531,13 +536,19 @@ def compensate(
     largest: Annotated[float, Option(help="Largest correction of a joint [rad or m].")] = 0.2,
     limit: Annotated[Number, Option(help="Largest residual error [mm]; exit code 1 above.")] = None,
     out: Table = None,
+    despite_verdict: Despite = False,
     as_json: Json = False,
 ) -> None:
-    """Correct joint commands so that the real robot goes where the nominal one would."""
+    """Correct joint commands so that the real robot goes where the nominal one would.
+
+    Exit code 1 if the robot is not delivered.
+    """
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
+        note = _forced(loaded, despite_verdict)
         from rpim_opt.use.compensation import compensate
+        from rpim_opt.use.export import noted
         from rpim_opt.use.validation import read_commands
 
         read, left_out = read_commands(loaded, targets, units)
@@ -547,8 +558,9 @@ def compensate(
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre,
         )  # fmt: skip
-    document = {"left_out": left_out, "limit_mm": limit, "written": console.written_to(out, found.csv())}
-    text = str(found) + console.left_out_line(left_out) + _written_or_shown(out, found.csv())
+    rows = noted(found.csv(), ".csv", note)
+    document = {"left_out": left_out, "limit_mm": limit, "written": console.written_to(out, rows), "note": note}
+    text = str(found) + console.left_out_line(left_out) + _written_or_shown(out, rows)
     console.show(text, {**found.content(), **document}, as_json)
     if limit is not None and 1e3 * found.position_error.max() > limit:
         raise typer.Exit(1)
@@ -737,15 +749,24 @@ def _calibrated(
 def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFound:
     """Return the error of a program without solution; where data are likely read wrongly, it says how."""
     from rpim_opt.calibration.asking import calibrate
-    from rpim_opt.calibration.causes import likely_causes, named
+    from rpim_opt.calibration.causes import likely_causes, mistakes
     from rpim_opt.convex.formulation import tikhonov
 
     if error.conflict is not None:
         return error
     causes = likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))
-    if not named(causes):
+    if not mistakes(causes):
         return error
     return NoSolutionFound(error.formulation, error.weight, error.status, advice=" ".join(causes).rstrip("."))
+
+
+def _forced(result: "Calibration", forced: bool) -> str:
+    """Return the note on a robot that is used in spite of its verdict, or end where it is not delivered."""
+    try:
+        return result.verdict.require(forced)
+    except InputError as error:
+        console.fail(str(error), 1)
+        raise
 
 
 def _saved(result: "Calibration", out: Path | None) -> list[Path]:

@@ -14,3 +14,4 @@ from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo
+from .verdict import Verdict as Verdict

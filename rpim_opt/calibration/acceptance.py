@@ -178,12 +178,14 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     try:
         found = reaching(result, region, q, requirement.confidence)
     except InputError as error:
-        return Acceptance(requirement, "undecided", (*lacking, f"No bound: {error}"), len(q), checked=seen)
+        verdict = "undecided" if result.verdict.delivered else "rejected"
+        reasons = (*result.verdict.reasons, *lacking, f"No bound: {error}")
+        return Acceptance(requirement, verdict, reasons, len(q), checked=seen)
     bound = partial(_bound, result, region, requirement.confidence)
     worst = region.largest(q, found.bound, bound)
     at = reaching(result, region, worst[None], requirement.confidence)
     made = share(result, region, worst, requirement.confidence)
-    verdict, reasons = _verdict(requirement, float(at.bound[0]), made, seen, lacking)
+    verdict, reasons = _verdict(result, requirement, float(at.bound[0]), made, seen, lacking)
     return Acceptance(
         requirement,
         verdict,
@@ -204,9 +206,14 @@ def _bound(result: Calibration, region: Region, confidence: float, q: Array) -> 
 
 
 def _verdict(
-    requirement: Requirement, bound: float, made: Share, seen: Checked | None, lacking: list[str]
+    result: Calibration,
+    requirement: Requirement,
+    bound: float,
+    made: Share,
+    seen: Checked | None,
+    lacking: list[str],
 ) -> tuple[Verdict, tuple[str, ...]]:
-    against = _against(requirement, made, seen)
+    against = [*result.verdict.reasons, *_against(requirement, made, seen)]
     if against:
         return "rejected", tuple(against)
     reasons = [*lacking, *_wide(requirement.limit, bound, made)]
@@ -253,8 +260,6 @@ def _against(requirement: Requirement, made: Share, seen: Checked | None) -> lis
 def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[str]:
     """Return what keeps a bound from being believed."""
     lines: list[str] = []
-    if not result.converged:
-        lines.append(f"Lacking: a calibration that converged. {result.message}")
     lacking = judged(result)
     if lacking is not None and lacking.alarming:
         lines.append(f"Lacking: a model that fits. {lacking}")

@@ -11,6 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.verdict import NOISY, kept_rows, noise_ratio, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import (
     copied_rows,
@@ -26,8 +27,7 @@ from rpim_opt.problem.diagnosis import (
 from rpim_opt.problem.misreadings import EXACT, Better, better_reading
 from rpim_opt.problem.problem import CalibrationProblem
 
-NOISY = 3.0
-"""Residuals beyond so many times what the instrument is stated to have are looked into."""
+BAD = "The fit is bad"
 HOPELESS = 20.0
 """Beyond so many times something is said even if nothing explains them."""
 SCALES = 10.0
@@ -83,15 +83,15 @@ def likely_causes(result: Outcome) -> list[str]:
     shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
     if result.learned is not None:
         shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
-    distrusted = _distrusted(result)
-    errors, pixels = (_but(problem.errors(result.x, of), distrusted) for of in ("length", "pixel"))
+    kept = kept_rows(result)
+    errors, pixels = (np.where(kept, problem.errors(result.x, of), np.nan) for of in ("length", "pixel"))
     signs = _signs(result, problem, errors, pixels)
     head: list[str] = []
     causes: tuple[Cause, ...] = ()
     if signs:
-        head = [f"The fit is bad: {'; '.join(signs)}."]
+        head = [f"{BAD}: {'; '.join(signs)}."]
         causes = find_causes(result)
-    elif distrusted.any():
+    elif not kept.all():
         causes = tuple(map(Cause, _of_rows(problem)))
     if result.mapping is not None:
         shared += result.mapping.doubts
@@ -121,7 +121,7 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
     if not found:
         found += transmission(problem, result.x)
     if not found:
-        found += rounded_joints(problem, _rms(_but(problem.errors(result.x), _distrusted(result))))
+        found += rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)]))
     return tuple(map(Cause, found))
 
 
@@ -162,29 +162,14 @@ def misread(result: Outcome, data: Dataset) -> str:
     return f"Likely: {better.sentence}"
 
 
-def named(causes: Sequence[str]) -> bool:
-    """Whether `likely_causes` found a mistake, and not only that a fit is bad.
+def mistakes(causes: Sequence[str]) -> list[str]:
+    """Return the mistakes among `likely_causes`, without how a fit is bad.
 
-    >>> from rpim_opt.calibration.causes import NOTHING, named
-    >>> named(["The fit is bad: ...", NOTHING]), named(["The fit is bad: ...", "Likely: ..."]), named([])
-    (False, True, False)
+    >>> from rpim_opt.calibration.causes import NOTHING, mistakes
+    >>> mistakes(["The fit is bad: ...", NOTHING]), mistakes(["The fit is bad: ...", "Likely: ..."]), mistakes([])
+    ([], ['Likely: ...'], [])
     """
-    return bool(causes) and causes[-1] != NOTHING
-
-
-def _distrusted(result: Outcome) -> np.ndarray:
-    """Return which rows (N,) the fit left out, or a robust loss lets go: they are named, and do not make a fit bad."""
-    labels: set[str] = set()
-    if result.learned is not None:
-        labels |= {row.label for row in result.learned.left_out}
-    if not result.squared_loss:
-        labels |= {flag.label for flag in result.flagged} - set(result.kept_together)
-    return np.isin(result.problem.labels, list(labels))
-
-
-def _but(errors: Array, rows: np.ndarray) -> Array:
-    """Return errors (N,) without those of some rows."""
-    return np.where(rows, np.nan, errors)
+    return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
 
 
 def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
@@ -199,10 +184,10 @@ def _signs(result: Outcome, problem: CalibrationProblem, errors: Array, pixels: 
     signs = []
     ratio = noise_ratio(problem, errors)
     if ratio > NOISY:
-        signs.append(_large_errors(f"{three_digits(1e3 * _rms(errors))} mm", ratio))
+        signs.append(_large_errors(f"{three_digits(1e3 * rms(errors))} mm", ratio))
     ratio = noise_ratio(problem, pixels, "pixel")
     if ratio > NOISY:
-        signs.append(_large_errors(f"{three_digits(_rms(pixels))} px", ratio))
+        signs.append(_large_errors(f"{three_digits(rms(pixels))} px", ratio))
     if not result.converged:
         signs.append("it did not converge")
     signs += _large(result, problem)
@@ -211,22 +196,6 @@ def _signs(result: Outcome, problem: CalibrationProblem, errors: Array, pixels: 
 
 def _large_errors(rms: str, ratio: float) -> str:
     return f"its errors have an RMS of {rms}, {three_digits(ratio)} times the stated noise"
-
-
-def noise_ratio(problem: CalibrationProblem, errors: Array, dimension: str = "length") -> float:
-    """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 where none of the dimension was measured."""
-    squares = np.zeros(len(errors))
-    for block in problem.data.blocks:
-        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == dimension]
-        squares[block.row] = np.einsum("nii->ni", block.covariance)[:, lengths].sum(axis=1)
-    of = np.isfinite(errors) & (squares > 0)
-    if not of.any():
-        return 0.0
-    return float(np.sqrt(np.mean(errors[of] ** 2) / np.mean(squares[of])))
-
-
-def _rms(errors: Array) -> float:
-    return float(np.sqrt(np.nanmean(errors**2)))
 
 
 def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:

@@ -156,6 +156,7 @@ class Outcome:
     kept: Kept | None = None
     learned: Learned | None = None
     mapping: JointMapping | None = None
+    known_causes: tuple[str, ...] | None = None
 
     @property
     def z(self) -> Array:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.calibration import words
+from rpim_opt.calibration.causes import likely_causes, mistakes
 from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
+from rpim_opt.calibration.verdict import Verdict, judge
 
 __all__ = ["Calibration", "Iteration", "Kept", "Prediction"]
 
@@ -42,6 +45,8 @@ class Calibration(Outcome):
         Signs and zeros of the joints that were found from the data; None where the nominal ones explain them.
     kept
         What functions said that a file cannot hold; None where they can be asked.
+    known_causes
+        Likely causes of a bad fit, where they were found before; None where they are looked for.
 
     Examples
     --------
@@ -59,6 +64,28 @@ class Calibration(Outcome):
     >>> print(result.parameter_table().splitlines()[0])
      parameter   unit    nominal   identified   deviation      std
     """
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether this robot is delivered, and if not, why: exports, exit codes and reports follow it.
+
+        >>> import rpim_opt as ro
+        >>> print(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).verdict)
+        Delivered.
+        """
+        return judge(self, mistakes(self.causes))
+
+    @cached_property
+    def causes(self) -> tuple[str, ...]:
+        """What a bad fit likely comes from, a sentence each (`likely_causes`).
+
+        >>> import rpim_opt as ro
+        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).causes
+        ()
+        """
+        if self.known_causes is not None:
+            return self.known_causes
+        return tuple(likely_causes(self))
 
     @property
     def selector(self) -> str:
@@ -135,7 +162,7 @@ class Calibration(Outcome):
 
     def __str__(self) -> str:
         """Return the parameters and errors as a person reads them."""
-        return words.as_text(self)
+        return words.as_text(self, self.verdict)
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -143,4 +170,4 @@ class Calibration(Outcome):
 
     def _repr_html_(self) -> str:
         """Return the same as the text for a notebook."""
-        return words.as_html(self)
+        return words.as_html(self, self.verdict)

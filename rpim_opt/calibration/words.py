@@ -15,6 +15,7 @@ from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.verdict import Verdict
 from rpim_opt.convex.select import disagreement
 from rpim_opt.data.record import Earlier
 from rpim_opt.robot.extensions import EXPECTED
@@ -108,14 +109,14 @@ def _cells(row: dict[str, Any]) -> list[str]:
     return [row["name"], row["unit"], *figures]
 
 
-def as_text(result: Outcome) -> str:
+def as_text(result: Outcome, verdict: Verdict) -> str:
     """Return the parameters and errors as a person reads them."""
-    return "\n".join([parameter_table(result), "", *_sentences(result)])
+    return "\n".join([parameter_table(result), "", *_sentences(result, verdict)])
 
 
-def as_html(result: Outcome) -> str:
+def as_html(result: Outcome, verdict: Verdict) -> str:
     """Return the same for a notebook."""
-    return html_table(*_columns(result), notes=_sentences(result), title=in_short(result).strip("<>"))
+    return html_table(*_columns(result), notes=_sentences(result, verdict), title=in_short(result).strip("<>"))
 
 
 def in_short(result: Outcome) -> str:
@@ -126,11 +127,12 @@ def in_short(result: Outcome) -> str:
     )
 
 
-def _sentences(result: Outcome) -> list[str]:
+def _sentences(result: Outcome, verdict: Verdict) -> list[str]:
     before = 1e3 * np.nanmean(result.nominal_errors())
     after = 1e3 * np.nanmean(result.errors())
     errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
-    return [errors, *weight_lines(result), *noise_sentence(result), *remarks(result)]
+    reasons = [text for text in verdict.reasons if text != result.message]
+    return [errors, *reasons, *weight_lines(result), *noise_sentence(result), *remarks(result)]
 
 
 def noise_sentence(result: Outcome) -> list[str]:

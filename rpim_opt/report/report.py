@@ -17,7 +17,6 @@ from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import Acceptance
-from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.held_out_rows import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.remarks import HEADER, scatter, scatter_rows
@@ -87,7 +86,6 @@ def page(result: Calibration) -> str:
     heading = record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     accepted = summary.acceptance(result)
     map_ = summary.workspace(result)
-    causes = likely_causes(result)
     lacking = judged(result)
     # an effect that the model lacks is said at the top; otherwise what the residuals consist of is a diagnosis
     alarming = lacking is not None and lacking.alarming
@@ -101,8 +99,8 @@ def page(result: Calibration) -> str:
         details=[(FIELDS.get(key, key), text) for key, text in record.details.items()],
         verdict=_verdict(accepted),
         headline=summary.headline(result),
-        alarm=bool(causes) or not result.converged,
-        causes=causes,
+        alarm=not result.verdict.delivered,
+        causes=list(dict.fromkeys([*result.verdict.reasons, *result.causes])),
         cards=_cards(result, map_, accepted),
         warnings=[*([" ".join(composition)] if alarming else []), *summary.warnings(result)],
         acceptance=_acceptance(result, accepted),

@@ -10,7 +10,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, percent, table
-from rpim_opt.calibration.causes import likely_causes
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.remarks import camera_remarks, contact_remarks, known_points
 from rpim_opt.calibration.result import Calibration
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from rpim_opt.calibration.acceptance import Acceptance
     from rpim_opt.calibration.region import Region
 
-KEYS = ("weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
+KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
 Unit = Literal["mm", "mrad"]
 ANYWHERE = Requirement(limit=1.0)
@@ -179,8 +178,8 @@ def headline(result: Calibration) -> str:
     if ratio <= 1:
         falls, times = falls.replace("falls", "rises"), ""
     sentence = f"{where} the mean {what} {falls}{times}."
-    if not result.converged:
-        return f"This calibration did not converge and should not be used. {sentence}"
+    if not result.verdict.delivered:
+        return f"Not delivered: this robot should not be used. {sentence}"
     held = result.record.held_out
     if held is not None:
         sentence += (
@@ -202,7 +201,7 @@ def identifiability(result: Calibration) -> str:
 
 def warnings(result: Calibration) -> list[str]:
     """Say what a reader must know besides the figures, the worst first."""
-    lines = [line for line in result.remarks() if line != result.message or not result.converged]
+    lines = [line for line in result.remarks() if line != result.message]
     validation = result.record.validation
     if validation is not None:
         lines += known_points(result.problem.sample(), validation)
@@ -247,7 +246,6 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
     accepted = acceptance(result)
-    causes = likely_causes(result)
     uncertainty = workspace(result)
     remarks = [
         *([] if uncertainty is None else [uncertainty.sentence()]),
@@ -269,8 +267,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "errors": errors,
         "orientation": orientation_rows(result),
         "prices": [price._asdict() for price in result.prices],
-        "remarks": [*remarks, *causes],
-        "likely_causes": causes,
+        "remarks": [*remarks, *(text for text in result.causes if text not in result.verdict.reasons)],
+        "likely_causes": list(result.causes),
         "lack_of_fit": lacking and lacking.content(),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
@@ -281,6 +279,7 @@ def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     """Return a `summary` as text: headline, verdict, what was estimated, warnings, and the tables."""
     stated = [f"{FIELDS[key]}: {text}" for key, text in document["details"].items()]
     lines = [*filter(None, [document["title"], document["source"]]), *stated, "", document["headline"]]
+    lines += document["verdict"]["reasons"]
     if document["acceptance"]:
         lines += document["acceptance"]["text"]
     lines += ["", *document["remarks"]]

@@ -246,9 +246,12 @@ class Stored:
     """Estimated prior scales and noise with their evidence."""
     record: Record
     """Title, source, files and excluded rows."""
+    causes: tuple[str, ...]
+    """Likely mistakes in the data."""
     rows: dict[str, list[RowErrors]]
     """Errors of every row [mm], nominal and identified."""
     mapping: JointMapping | None = None
+    """Signs and offsets of joints that the global start found."""
     digest: str = ""
     """SHA-256 of the content."""
 
@@ -257,7 +260,7 @@ def content(result: Calibration) -> dict[str, Any]:
     """Return what a file says of a calibration: its figures [mm, deg], what they follow from [SI], and a digest."""
     from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
 
-    result = replace(result, record=result.record.dated())
+    result = replace(result, record=result.record.dated(), known_causes=result.causes)
     solvable = is_defined(result.formulation)
     stored = Stored(
         formulation=result.formulation.name,
@@ -281,6 +284,7 @@ def content(result: Calibration) -> dict[str, Any]:
         scatter=result.problem.scatter,
         learned=result.learned,
         record=result.record,
+        causes=result.causes,
         rows=_rows(result),
         mapping=result.mapping,
     )
@@ -303,6 +307,7 @@ def figures(result: Calibration) -> dict[str, Any]:
         before, after = statistics(held_out.nominal), statistics(held_out.error)
         held_out = {"nominal": before, "identified": after, "used": held_out.used}
     return {
+        "verdict": {"delivered": result.verdict.delivered, "reasons": list(result.verdict.reasons)},
         "identification": statistics(result.errors()),
         "validation": None if validation is None else statistics(result.errors(validation)),
         "held_out": held_out,
@@ -491,6 +496,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         kept=None if formulation.solvable else _kept(file, program),
         learned=file.learned,
         mapping=file.mapping,
+        known_causes=file.causes,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import read_bytes, refused, write_files
+from rpim_opt.basics.files import json_text, read_bytes, refused, write_files
+from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.transmission import Curves
 from rpim_opt.calibration.asking import calibrate
@@ -234,13 +237,43 @@ def with_first_reflector(result: Calibration, marker: str | None = None) -> Desc
     return identified(result, reflectors(result.problem.parameters.names)[0] if marker is None else marker)
 
 
-def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]]) -> list[str]:
+def noted(text: str, ending: str, note: str) -> str:
+    r"""Return the text of a file with a note: as a comment, of CSV as a column, of JSON in the key ``source``.
+
+    >>> from rpim_opt.use.export import noted
+    >>> noted("a: 1\n", ".yaml", "Not delivered.").splitlines()
+    ['# Not delivered.', 'a: 1']
+    """
+    if not note:
+        return text
+    if ending == ".json":
+        content = json.loads(text)
+        return json_text({**content, "source": f"{note} {content.get('source', '')}".strip()})
+    if ending == ".csv":
+        header, *rows = csv.reader(text.splitlines())
+        cells = [note, *[""] * len(rows)]
+        return csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
+    if ending not in (".urdf", ".xml", ".xacro"):
+        return f"# {note}\n{text}"
+    declaration, mark, rest = text.rpartition("?>")
+    return f"{declaration}{mark}\n<!-- {note.replace('--', '-')} -->\n{rest.lstrip()}".lstrip()
+
+
+def _with_note(path: Path, note: str) -> bytes:
+    if not note:
+        return read_bytes(path)
+    return noted(read_bytes(path).decode(), path.suffix.lower(), note).encode()
+
+
+def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]], note: str = "") -> list[str]:
     """Write several files, or none of them if one cannot be written; return the notes of their writers.
 
     Parameters
     ----------
     writers
         Targets, each with a function that writes to the path it is given.
+    note
+        Stands in every file.
     """
     targets = [target for target, _ in writers]
     for target in targets:
@@ -259,5 +292,5 @@ def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | Non
                 file = target if error.file == path else error.file
                 raise InputError(error.where, error.found, error.accepted, file) from None
         with refused(", ".join(str(target) for target in written)):
-            write_files({target: path.read_bytes() for target, path in written.items()})
+            write_files({target: _with_note(path, note) for target, path in written.items()})
     return notes

@@ -21,6 +21,7 @@ from rpim_opt.calibration.held_out_rows import judged
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.remarks import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
@@ -92,6 +93,11 @@ class Validation:
         return float(np.nanmax(self.error))
 
     @property
+    def worse(self) -> bool:
+        """Whether the errors are larger than the nominal robot's, beyond chance."""
+        return worse_than_nominal(self.nominal, self.error)
+
+    @property
     def beyond(self) -> tuple[int, ...]:
         """Rows beyond what the prediction's uncertainty allows, the worst first."""
         order = np.argsort(-np.nan_to_num(self.sigmas / self.allowed))
@@ -112,6 +118,7 @@ class Validation:
             "touched": [each.content() for each in self.touched],
             "remarks": self.remarks,
             "mistake": self.mistake,
+            "worse": self.worse,
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
         }
@@ -134,7 +141,8 @@ class Validation:
         tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
         if self.touched:
             tables.append(table(HEADER, scatter_rows(self.touched)))
-        sentences = [self._verdict(), *self.outside.sentences(), *self.remarks, self.mistake]
+        worse = [worse_sentence(self.nominal, self.error)] if self.worse else []
+        sentences = [*worse, self._verdict(), *self.outside.sentences(), *self.remarks, self.mistake]
         return "\n".join([*tables, *filter(None, sentences)])
 
     def _verdict(self) -> str:

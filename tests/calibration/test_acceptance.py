@@ -153,7 +153,6 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
     ("change", "said"),
     [
         (lambda r: replace(r, record=ro.data.Record()), "rows that the calibration did not see"),
-        (lambda r: replace(r, converged=False), "a calibration that converged"),
         (
             lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
             "at least 5 rows",

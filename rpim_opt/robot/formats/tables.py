@@ -313,7 +313,7 @@ def _from_standard(robot: Robot) -> Described:
 def _joint(cells: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
     joint = {name: _cell(ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0") if name.startswith("theta") else _cell(text)
-             for name, text in cells.items() if text}  # fmt: skip
+             for name, text in cells.items() if text and name != "note"}  # fmt: skip
     for unit in UNITS:
         pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
         if any(value is not None for value in pair):

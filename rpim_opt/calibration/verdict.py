@@ -1,0 +1,288 @@
+"""The verdict on a calibration: whether its robot is delivered, and if not, why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import three_digits
+from rpim_opt.robot.parameter_names import own_name
+
+if TYPE_CHECKING:
+    from rpim_opt.calibration.outcome import Outcome
+    from rpim_opt.problem.source import Source
+
+NOISY = 3.0
+"""Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
+REACH = 0.003
+"""Residual RMS over the length of the arm that a robot's own effects stay below."""
+REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 5e-3), "joint": ("mrad", 5e-3)}
+"""Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise."""
+ANGULAR = 0.02
+"""Residual RMS of orientations [rad] that a robot's own effects stay below."""
+MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
+"""Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
+EXCLUDED = 0.25
+"""Share of the rows that may be outliers."""
+COMPUTED, COMPUTED_RMS = 0.05, 2e-5
+"""Nominal RMS over the stated noise, and itself [m], below which positions were computed and not measured."""
+SPARE = 2.0
+"""Equations per parameter of the frames below which nominal errors may vanish by themselves."""
+WORSE = 3.0
+"""Standard errors by which squared errors on held-out rows are above those of the nominal robot."""
+ROWS = 3
+"""Held-out rows below which errors have no standard error, and only those twice the nominal ones count."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the robot of a calibration is delivered.
+
+    Exit codes, exports, compensation and the report follow it.
+
+    Parameters
+    ----------
+    reasons
+        Why it is not delivered, a sentence each; empty where it is.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> ro.calibrate(ro.load("position").problem).verdict.delivered
+    True
+    >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
+    Not delivered. Not converged: 1 pass was not enough; give more (max_iterations).
+    """
+
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def delivered(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.reasons
+
+    def __str__(self) -> str:
+        """Return the verdict with its reasons."""
+        return " ".join(["Delivered." if self.delivered else "Not delivered.", *self.reasons])
+
+    def require(self, forced: bool = False) -> str:
+        """Return the note that goes with a robot that is used in spite of its verdict; empty where it is delivered.
+
+        Raises
+        ------
+        InputError
+            With the reasons, unless ``forced``.
+        """
+        if self.delivered:
+            return ""
+        if not forced:
+            found = f"not delivered: {' '.join(self.reasons)}".rstrip(".")
+            raise InputError("the calibration", found, "a delivered one, or --despite-verdict")
+        return f"Written in spite of the verdict. {self}"
+
+
+def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
+    """Return the verdict on a calibration.
+
+    Not delivered is a robot whose fit did not converge; whose kept rows have residuals beyond 3 times the stated noise
+    and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors on
+    held-out rows are larger than the nominal robot's; whose data were computed; and one with a likely mistake.
+
+    The limits come from good and bad data of 40 robots; none is a limit on joint zeros, which 180 degrees may be.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    causes
+        Likely mistakes in its data, a sentence each.
+    """
+    reasons = [] if result.converged else [result.message]
+    reasons += [*_residuals(result), *_repeatability(result), *_deviations(result), *_excluded(result)]
+    reasons += [*_held_out(result), *_computed(result), *causes]
+    return Verdict(tuple(dict.fromkeys(reasons)))
+
+
+def kept_rows(result: Outcome) -> np.ndarray:
+    """Return which rows (N,) are no outliers: neither excluded before the fit nor let go by a robust loss."""
+    labels: set[str] = set()
+    if result.learned is not None:
+        labels |= {row.label for row in result.learned.left_out}
+    if not result.squared_loss:
+        labels |= {flag.label for flag in result.flagged} - set(result.kept_together)
+    return ~np.isin(result.problem.labels, list(labels))
+
+
+def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> float:
+    """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 where none of the dimension was measured."""
+    variance = stated_variance(problem, dimension)
+    of = np.isfinite(errors) & (variance > 0)
+    if not of.any():
+        return 0.0
+    return rms(errors[of]) / float(np.sqrt(np.mean(variance[of])))
+
+
+def stated_variance(problem: Source, dimension: str) -> Array:
+    """Return the variance of the stated noise of every row (N,) [SI], zero where it measures none of the dimension."""
+    variance = np.zeros(len(problem.labels))
+    start = 0
+    for part in problem.rows():
+        for block in part.data.blocks:
+            of = [i for i, each in enumerate(block.measurement.components.values()) if each == dimension]
+            variance[start + block.row] = np.einsum("nii->ni", block.covariance)[:, of].sum(axis=1)
+        start += len(part.data)
+    return variance
+
+
+def rms(errors: Array) -> float:
+    """Return the root mean square of errors that are numbers; 0 where there is none."""
+    finite = errors[np.isfinite(errors)]
+    if not len(finite):
+        return 0.0
+    return float(np.sqrt(np.mean(finite**2)))
+
+
+def worse_than_nominal(nominal: Array, identified: Array) -> bool:
+    """Whether errors (N,) of the identified robot are larger than those of the nominal one, beyond chance.
+
+    By the mean difference of the squares, row by row, over its standard error.
+    """
+    both = np.isfinite(nominal) & np.isfinite(identified)
+    difference = identified[both] ** 2 - nominal[both] ** 2
+    rows = len(difference)
+    if not rows:
+        return False
+    if rows < ROWS:
+        return rms(identified[both]) > 2 * rms(nominal[both])
+    return bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(rows))
+
+
+# --- reasons ------------------------------------------------------------------------------------------------------
+
+
+def _residuals(result: Outcome) -> Iterator[str]:
+    """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
+    problem = result.problem
+    kept = kept_rows(result)
+    lengths, angles, pixels = (
+        np.where(kept, result.errors(dimension=each), np.nan) for each in ("length", "angle", "pixel")
+    )
+    ratio = max(noise_ratio(problem, lengths), noise_ratio(problem, pixels, "pixel"))
+    share = rms(lengths) / _length(problem)
+    if ratio > NOISY and share > REACH:
+        yield (
+            f"Residual RMS {three_digits(1e3 * rms(lengths))} mm: {three_digits(ratio)} times the stated noise and "
+            f"{100 * share:.2g} % of the arm's length; a robot's own effects stay below {100 * REACH:g} %."
+        )
+    ratio = noise_ratio(problem, angles, "angle")
+    if ratio > NOISY and rms(angles) > ANGULAR:
+        yield (
+            f"Residual RMS {three_digits(1e3 * rms(angles))} mrad: {three_digits(ratio)} times the stated noise; a "
+            f"robot's own effects stay below {1e3 * ANGULAR:g} mrad."
+        )
+
+
+def _length(problem: Source) -> float:
+    """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
+    longest = 0.0
+    for robot in problem.arms.values():
+        sliding = np.array([kind == "prismatic" for kind in robot.joint_types])
+        stroke = np.zeros(robot.dof)
+        for part in problem.rows():
+            for block in part.data.blocks:
+                if sliding.any() and block.q.shape[-1] == robot.dof:
+                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
+        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
+    return longest
+
+
+def _repeatability(result: Outcome) -> Iterator[str]:
+    """Say that what was taken for the robot's repeatability is beyond that of any robot."""
+    if result.learned is None:
+        return
+    for kind, size in result.learned.noise.items():
+        if kind not in REPEATABILITY:
+            continue
+        unit, largest = REPEATABILITY[kind]
+        dimension = "length" if kind == "position" else "angle"
+        variance = stated_variance(result.problem, dimension)
+        measured = variance[variance > 0]
+        if len(measured) and kind != "joint":  # the stated noise is of all components together
+            largest = max(largest, NOISY * float(np.sqrt(measured.mean() / 3)))
+        if size.value > largest:
+            yield (
+                f"Estimated robot repeatability {three_digits(1e3 * size.value)} {unit} ({kind}): no robot is worse "
+                f"than {1e3 * largest:.3g} {unit}."
+            )
+
+
+def _deviations(result: Outcome) -> Iterator[str]:
+    """Say which machined parameter deviates most, where no robot is machined so."""
+    worst = (1.0, "")
+    for name, x in zip(result.problem.parameters.free.names, result.x, strict=True):
+        kind = own_name(name).rstrip("0123456789")
+        joint = own_name(name).removeprefix(kind)
+        if kind not in MACHINED or not joint or (kind == "d" and _slides(result.problem, name, int(joint))):
+            continue
+        unit, largest = MACHINED[kind]
+        said = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
+        said = f"{said}: no robot is machined worse than {1e3 * largest:g} {unit}."
+        worst = max(worst, (float(abs(x)) / largest, said))
+    if worst[1]:
+        yield worst[1]
+
+
+def _slides(problem: Source, name: str, joint: int) -> bool:
+    """Whether a length d is the zero of a prismatic joint."""
+    return problem.arms[name.rpartition(".")[0]].joint_types[joint - 1] == "prismatic"
+
+
+def _excluded(result: Outcome) -> Iterator[str]:
+    kept = kept_rows(result)
+    if np.mean(~kept) > EXCLUDED:
+        yield f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}."
+
+
+def _held_out(result: Outcome) -> Iterator[str]:
+    """Say that the robot misses held-out rows by more than the nominal one."""
+    held = result.record.held_out
+    if held is not None:
+        nominal, identified = held.nominal, held.error
+    elif result.record.validation is not None:
+        nominal = result.nominal_errors(result.record.validation)
+        identified = result.errors(result.record.validation)
+    else:
+        return
+    if worse_than_nominal(nominal, identified):
+        yield worse_sentence(nominal, identified)
+
+
+def worse_sentence(nominal: Array, identified: Array) -> str:
+    """Say by how much errors (N,) [m] on held-out rows are larger than the nominal robot's."""
+    return (
+        f"Errors on {len(nominal)} held-out rows are larger than the nominal robot's: RMS "
+        f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
+    )
+
+
+def _computed(result: Outcome) -> Iterator[str]:
+    """Say that the nominal robot explains the data to rounding: they were computed with it."""
+    problem = result.problem
+    frames = int((problem.parameters.placed & problem.parameters.identified).sum())
+    if result.equations < SPARE * frames + 1:
+        return
+    errors = result.nominal_errors()
+    measured = stated_variance(problem, "length") > 0
+    if not measured.any():
+        return
+    nominal = rms(errors[measured])
+    if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
+        yield (
+            f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, far below the stated noise: they look "
+            "computed from it, not measured."
+        )
