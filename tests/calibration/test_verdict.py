@@ -1,0 +1,121 @@
+"""Whether a robot is delivered is decided once, and everything that is done with it follows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.calibration.verdict import worse_than_nominal
+from rpim_opt.store import load_result, save_result
+from tests.calibration.mistakes import IN_TABLES, both, coupled, flipped, joints, shifted, simulated_arm, values
+from tests.test_cli import run
+
+
+def halved(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Lose one reading halfway: every later value is that of the row before."""
+
+    def change(y: np.ndarray) -> np.ndarray:
+        y[20:] = y[19:-1]
+        return y
+
+    return values(change)(problem)
+
+
+WRONG = {
+    "one reading lost halfway": halved,
+    "coupled to half of joint 2": coupled(2, 1, -0.5),
+    "gon read as degrees": joints(lambda q: q / 0.9),
+    "a frozen joint": joints(lambda q: np.where(np.arange(6) == 4, 0.3, q)),
+    "z of another column": values(lambda y: np.where(np.arange(3) == 2, 0.02, y)),
+    "three joints reversed": flipped(0, 3, 5),
+    "joint 3 reversed, joint 2 from 45 degrees": both(flipped(2), shifted(1, 45)),
+    "joints 2 and 3 exchanged": IN_TABLES["joints 2 and 3 exchanged"][0],
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_wrong_robot_is_not_delivered(mistake: str) -> None:
+    verdict = ro.calibrate(WRONG[mistake](simulated_arm("ur5e"))).verdict
+    assert not verdict.delivered
+    with pytest.raises(ro.InputError, match="not delivered"):
+        verdict.require()
+    assert verdict.reasons[0] in verdict.require(forced=True)
+
+
+def test_a_good_one_is_delivered_with_outliers_and_few_rows() -> None:
+    problem = simulated_arm("irb120", seed=5)
+    far = values(lambda y: y + 0.03 * (np.arange(len(y)) % 9 == 1)[:, None])(problem)
+    for each in (problem, problem.on(problem.data.take(range(10))), far):
+        assert ro.calibrate(each).verdict == ro.calibration.Verdict()
+
+
+def test_joint_zeros_are_not_limited() -> None:
+    """An arm whose zeros are 45 mrad off is as good as another."""
+    problem = simulated_arm("irb120")
+    off = joints(lambda q: q + np.array([0.0, 0.045, -0.03, 0.04, 0.0, 0.0]))(problem)
+    assert ro.calibrate(off).verdict.delivered
+
+
+def test_computed_positions_are_no_measurements() -> None:
+    problem = simulated_arm("ur5e")
+    y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
+    (reason,) = ro.calibrate(values(lambda _: y)(problem)).verdict.reasons
+    assert "computed" in reason
+
+
+def test_a_robot_worse_than_the_nominal_one_is_not_delivered() -> None:
+    """Beyond chance: where both err by noise alone, either may be ahead."""
+    instance = ro.load("position")
+    result = instance.calibrate()
+    assert result.verdict.delivered
+    off = replace(result, x=result.x + 20 * instance.problem.parameters.free.scale)
+    assert any("larger than the nominal robot's" in text for text in off.verdict.reasons)
+    rng = np.random.default_rng(3)
+    noise = np.abs(rng.normal(size=(2, 400, 20)))
+    assert sum(worse_than_nominal(a, b) for a, b in noise.transpose(1, 0, 2)) <= 4
+
+
+def test_files_hold_the_verdict(tmp_path: Path) -> None:
+    result = ro.calibrate(WRONG["joints 2 and 3 exchanged"](simulated_arm("ur5e")))
+    save_result(result, tmp_path / "result.json")
+    again = load_result(tmp_path)
+    assert again.verdict == result.verdict
+    assert again.causes == result.causes
+    stored = json.loads((tmp_path / "result.json").read_text())
+    assert stored["verdict"] == {"delivered": False, "reasons": list(result.verdict.reasons)}
+    stored["verdict"] = {"delivered": True, "reasons": []}
+    (tmp_path / "result.json").write_text(json.dumps(stored))
+    with pytest.raises(ro.InputError, match="key verdict"):
+        load_result(tmp_path)
+
+
+def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
+    result = ro.calibrate(WRONG["a frozen joint"](simulated_arm("ur5e")), "tikhonov", 1.0)
+    folder = str(tmp_path)
+    save_result(result, tmp_path / "result.json")
+    (tmp_path / "targets.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n10,-80,60,20,30,0\n")
+    forms = {"mdh": "csv", "robodk": "csv"}
+    for key, ending in forms.items():
+        target = tmp_path / f"{key}.{ending}"
+        assert run(monkeypatch, "export", folder, f"--{key}", str(target)) == 1
+        assert not target.exists()
+        assert "not delivered" in capsys.readouterr().err
+        assert run(monkeypatch, "export", folder, f"--{key}", str(target), "--despite-verdict") == 0
+        assert "in spite of the verdict" in target.read_text()
+    for ending in ("toml", "json", "csv"):
+        target = tmp_path / f"arm.{ending}"
+        assert run(monkeypatch, "export", folder, "--mdh", str(target), "--despite-verdict") == 0
+        assert "in spite of the verdict" in target.read_text()
+        np.testing.assert_array_equal(ro.read_mdh(target).mdh, result.robot.mdh)
+    compensate = ["compensate", folder, str(tmp_path / "targets.csv"), "--position-only"]
+    assert run(monkeypatch, *compensate) == 1
+    assert run(monkeypatch, *compensate, "--despite-verdict") == 0
+    assert "in spite of the verdict" in capsys.readouterr().out
+    assert run(monkeypatch, "accept", folder, "--limit", "500") == 1
+    assert run(monkeypatch, "report", folder) == 0
+    assert "should not be used" in (tmp_path / "report.html").read_text(encoding="utf-8")
