@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.verdict import worse_than_nominal
 from rpim_opt.store import load_result, save_result
-from tests.calibration.mistakes import IN_TABLES, both, coupled, flipped, joints, shifted, simulated_arm, values
+from tests.calibration.mistakes import IN_TABLES, coupled, joints, simulated_arm, values
 from tests.test_cli import run
 
 
@@ -32,8 +32,6 @@ WRONG = {
     "gon read as degrees": joints(lambda q: q / 0.9),
     "a frozen joint": joints(lambda q: np.where(np.arange(6) == 4, 0.3, q)),
     "z of another column": values(lambda y: np.where(np.arange(3) == 2, 0.02, y)),
-    "three joints reversed": flipped(0, 3, 5),
-    "joint 3 reversed, joint 2 from 45 degrees": both(flipped(2), shifted(1, 45)),
     "joints 2 and 3 exchanged": IN_TABLES["joints 2 and 3 exchanged"][0],
 }
 
