@@ -274,7 +274,7 @@ def _computed(result: Outcome) -> Iterator[str]:
     """Say that the nominal robot explains the data to rounding: they were computed with it."""
     problem = result.problem
     frames = int((problem.parameters.placed & problem.parameters.identified).sum())
-    if result.equations < SPARE * frames + 1:
+    if result.program.model.equations < SPARE * frames + 1:
         return
     errors = result.nominal_errors()
     measured = stated_variance(problem, "length") > 0

@@ -143,7 +143,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     stopped = ro.load("position")
     result = ro.calibrate(stopped.problem, ro.tikhonov, 1.0, max_iterations=1)
     text = page(result)
-    assert "This calibration did not converge and should not be used." in text
+    assert "Not delivered: this robot should not be used." in text
     assert "40 validation rows repeat" in page(replace(result, record=ro.data.Record(validation=result.problem.data)))
     assert "(there are no validation data)" in text
     assert "Without validation data" in text
