@@ -36,6 +36,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", WRONG)
 def test_a_wrong_robot_is_not_delivered(mistake: str) -> None:
     verdict = ro.calibrate(WRONG[mistake](simulated_arm("ur5e"))).verdict
@@ -79,7 +80,8 @@ def test_a_robot_worse_than_the_nominal_one_is_not_delivered() -> None:
 
 
 def test_files_hold_the_verdict(tmp_path: Path) -> None:
-    result = ro.calibrate(WRONG["joints 2 and 3 exchanged"](simulated_arm("ur5e")))
+    result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0, max_iterations=1)
+    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
     save_result(result, tmp_path / "result.json")
     again = load_result(tmp_path)
     assert again.verdict == result.verdict
@@ -93,7 +95,8 @@ def test_files_hold_the_verdict(tmp_path: Path) -> None:
 
 
 def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
-    result = ro.calibrate(WRONG["a frozen joint"](simulated_arm("ur5e")), "tikhonov", 1.0)
+    result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0)
+    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
     folder = str(tmp_path)
     save_result(result, tmp_path / "result.json")
     (tmp_path / "targets.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n10,-80,60,20,30,0\n")
