@@ -47,8 +47,6 @@ from .report import plot as plot
 from .robot import Model as Model
 from .robot import read_mdh as read_mdh
 from .robot import read_robot as read_robot
-from .robot import read_ur_calibration as read_ur_calibration
-from .robot import read_ur_kinematics as read_ur_kinematics
 from .robot import read_urdf as read_urdf
 from .robot import robots as robots
 from .store import calibrate as calibrate

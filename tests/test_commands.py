@@ -383,7 +383,10 @@ def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
     assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
                "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
     assert "alpha1 and a1" in capsys.readouterr().out
-    read, q = ro.read_ur_calibration(tmp_path / "new.conf", nominal), np.random.default_rng(0).uniform(-2, 2, (9, 6))
+    read, q = (
+        ro.robot.read_ur_calibration(tmp_path / "new.conf", nominal),
+        np.random.default_rng(0).uniform(-2, 2, (9, 6)),
+    )
     mdh = result.robot.mdh.copy()
     mdh[0, :2] = nominal.mdh[0, :2]  # where the base is, not how the robot is
     there = ro.robot.forward_kinematics(replace(nominal, mdh=mdh), q)

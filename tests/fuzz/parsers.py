@@ -178,9 +178,9 @@ def kinematics(data: bytes, folder: Path) -> None:
     path = folder / "kinematics.yaml"
     target = folder / "again.yaml"
     path.write_bytes(data)
-    arm = ro.read_ur_kinematics(path)
+    arm = ro.robot.read_ur_kinematics(path)
     ro.robot.write_ur_kinematics(path, arm.robot, target)
-    again = ro.read_ur_kinematics(target)
+    again = ro.robot.read_ur_kinematics(target)
     require(close(arm.robot.mdh, again.robot.mdh), "the same robot")
 
 
@@ -198,7 +198,7 @@ def calibration_conf(data: bytes, folder: Path) -> None:
     """Read calibration.conf."""
     path = folder / "calibration.conf"
     path.write_bytes(data)
-    arm = ro.read_ur_calibration(path, _ur())
+    arm = ro.robot.read_ur_calibration(path, _ur())
     require(bool(np.isfinite(arm.robot.mdh).all()), "finite numbers")
 
 

@@ -466,7 +466,7 @@ def test_our_ur10_is_the_drivers() -> None:
 def test_a_controllers_deltas_give_a_robot_near_nominal(tmp_path: Path, conf: str) -> None:
     path = tmp_path / "calibration.conf"
     path.write_text(conf)
-    arm = ro.read_ur_calibration(path, UR10)
+    arm = ro.robot.read_ur_calibration(path, UR10)
     q = configurations(6)
     # d of 92 m: rounding of 1e-14 there
     assert np.abs(reach(arm, q) - standard_dh(conf, q)).max() < 1e-11
@@ -480,12 +480,12 @@ def test_a_controllers_deltas_give_a_robot_near_nominal(tmp_path: Path, conf: st
 def test_deltas_written_read_as_the_same_robot(tmp_path: Path, conf: str) -> None:
     path, target = tmp_path / "calibration.conf", tmp_path / "new.conf"
     path.write_text(conf)
-    arm = ro.read_ur_calibration(path, UR10)
+    arm = ro.robot.read_ur_calibration(path, UR10)
     change = 1e-4 * np.random.default_rng(0).normal(size=(6, 5))
     change[0, :2], change[5, 4] = 0, 0
     better = replace(arm.robot, mdh=arm.robot.mdh + change)
     ro.robot.write_ur_calibration(path, better, UR10, target)
-    again = ro.read_ur_calibration(target, UR10)
+    again = ro.robot.read_ur_calibration(target, UR10)
     q = configurations(6)
     assert np.abs(reach(again, q) - ro.robot.forward_kinematics(better, q)).max() < 1e-9
     lists = re.compile(r"(?<=delta_)(\w+ = \[).*(?=\])")
@@ -529,7 +529,7 @@ def test_bad_deltas(tmp_path: Path, old: str, new: str, found: str) -> None:
     path = tmp_path / "calibration.conf"
     path.write_text(CONF.replace(old, new, 1))
     with pytest.raises(ro.InputError, match=found):
-        ro.read_ur_calibration(path, UR10)
+        ro.robot.read_ur_calibration(path, UR10)
 
 
 YAML = """kinematics:
@@ -590,7 +590,7 @@ def yaml_kinematics(content: str, q: np.ndarray) -> np.ndarray:
 def test_ros_kinematics_in_and_out(tmp_path: Path) -> None:
     path, target = tmp_path / "kinematics.yaml", tmp_path / "new.yaml"
     path.write_text(YAML_PLAIN)
-    arm = ro.read_ur_kinematics(path)
+    arm = ro.robot.read_ur_kinematics(path)
     q = configurations(6)
     assert np.abs(reach(arm, q) - yaml_kinematics(YAML_PLAIN, q)).max() < EXACT
     assert not arm.base.any()
@@ -627,7 +627,7 @@ def test_bad_ros_kinematics(tmp_path: Path, content: str, found: str) -> None:
     path = tmp_path / "kinematics.yaml"
     path.write_text(content)
     with pytest.raises(ro.InputError, match=found):
-        ro.read_ur_kinematics(path)
+        ro.robot.read_ur_kinematics(path)
 
 
 # Plain tables --------------------------------------------------------------------------------------------------------

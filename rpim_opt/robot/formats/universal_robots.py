@@ -76,7 +76,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     >>> import rpim_opt as ro
     >>> from rpim_opt.robot.library import find_robot
     >>> nominal = ro.read_robot(find_robot("ur10"))
-    >>> arm = ro.read_ur_calibration("calibration.conf", nominal)
+    >>> arm = ro.robot.read_ur_calibration("calibration.conf", nominal)
     >>> (1e3 * (arm.robot.mdh - nominal.mdh)[:, 3]).round(2)  # deviations of d [mm]
     array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])
     """
@@ -120,9 +120,9 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     >>> import rpim_opt as ro
     >>> from rpim_opt.robot.library import find_robot
     >>> nominal = ro.read_robot(find_robot("ur10"))
-    >>> robot = ro.read_ur_calibration("calibration.conf", nominal).robot  # or an identified one
+    >>> robot = ro.robot.read_ur_calibration("calibration.conf", nominal).robot  # or an identified one
     >>> ro.robot.write_ur_calibration("calibration.conf", robot, nominal, "identified.conf")
-    >>> again = ro.read_ur_calibration("identified.conf", nominal).robot
+    >>> again = ro.robot.read_ur_calibration("identified.conf", nominal).robot
     >>> bool(np.allclose(again.mdh, robot.mdh, atol=1e-9))
     True
     """
@@ -191,7 +191,7 @@ def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Describ
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> arm = ro.read_ur_kinematics("kinematics.yaml")
+    >>> arm = ro.robot.read_ur_kinematics("kinematics.yaml")
     >>> arm.names[:2], arm.robot.mdh[2:4, 1].round(3)  # a3 and a4 [m]
     (('shoulder', 'upper_arm'), array([-0.425, -0.392]))
     """
@@ -226,11 +226,11 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     --------
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
-    >>> robot = ro.read_ur_kinematics("kinematics.yaml").robot
+    >>> robot = ro.robot.read_ur_kinematics("kinematics.yaml").robot
     >>> mdh = robot.mdh.copy()
     >>> mdh[2, 1] -= 0.0005  # as if identified: the upper arm is half a millimetre longer
     >>> ro.robot.write_ur_kinematics("kinematics.yaml", replace(robot, mdh=mdh), "identified.yaml")
-    >>> (1e3 * (ro.read_ur_kinematics("identified.yaml").robot.mdh - robot.mdh)[2:4, 1]).round(6) + 0.0  # [mm]
+    >>> (1e3 * (ro.robot.read_ur_kinematics("identified.yaml").robot.mdh - robot.mdh)[2:4, 1]).round(6) + 0.0  # [mm]
     array([-0.5,  0. ])
     """
     path = Path(source)
