@@ -1,6 +1,7 @@
 """Set up and run, on a machine with only Python: ``python3 dev.py run ...``, ``test``, ``check``, ``docs`` and so on.
 
-Every command first makes ``.venv`` with the tested versions of ``constraints.txt``, if it is not there yet. That
+Every command first makes ``.venv``, if it is not there yet: ``run`` with the tested versions of ``requirements.txt``,
+which are what a calibration needs, the others with those of ``constraints.txt``, with all tools besides. That
 file has the hashes of all that may be downloaded, and is made by ``uv pip compile --universal --python-version 3.11
 --generate-hashes --no-header --no-annotate --all-extras pyproject.toml -o constraints.txt``. ``requirements.txt``, for
 an installation without tools, is the same without ``--all-extras`` and with ``-c constraints.txt``; so is
@@ -34,19 +35,31 @@ CHECKS = {
 }
 
 
-def environment(folder: Path = ENVIRONMENT, locked: Path = ROOT / "constraints.txt") -> None:
-    """Make an environment, or bring it up to date with what is locked."""
-    wanted = hashlib.sha256((ROOT / "pyproject.toml").read_bytes() + locked.read_bytes())
+def environment(tools: bool = True, folder: Path = ENVIRONMENT, locked: Path = ROOT / "constraints.txt") -> None:
+    """Make an environment, or bring it up to date: with what a calibration needs, or with all tools besides."""
+    project = (ROOT / "pyproject.toml").read_bytes()
+    plain = ROOT / "requirements.txt"
+    states = {lock: hashlib.sha256(project + lock.read_bytes()).hexdigest() for lock in (plain, locked)}
     stamp = folder / "requirements.sha256"
-    if stamp.is_file() and stamp.read_text() == wanted.hexdigest():
+    found = stamp.read_text() if stamp.is_file() else ""
+    if found == states[locked] or (not tools and found == states[plain]):
         return
     print(f"Setting up {folder.name} (once, about a minute) ...", file=sys.stderr, flush=True)
-    venv.create(folder, with_pip=True, clear=folder.exists())
+    if found != states[plain]:
+        venv.create(folder, with_pip=True, clear=folder.exists())
+    wanted = locked if tools else plain
     pip = [folder / PROGRAMS / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
     # what is downloaded must have the hashes that were tested; the build backend comes from there, too
-    subprocess.run([*pip, "--require-hashes", "-r", locked], check=True)
-    subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", ROOT], check=True)
-    stamp.write_text(wanted.hexdigest())
+    subprocess.run([*pip, "--require-hashes", "-r", wanted], check=True)
+    if tools:
+        subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", ROOT], check=True)
+    stamp.write_text(states[wanted])
+
+
+def command_line(*arguments: str) -> int:
+    """Run rpim-opt from this checkout, which needs no build, in the caller's folder."""
+    code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); sys.argv[0] = 'rpim-opt'; from rpim_opt.cli import main; main()"
+    return run("python", "-c", code, *arguments)
 
 
 def run(*command: str | Path) -> int:
@@ -65,7 +78,7 @@ def docs(folder: str = "docs") -> int:
 
 def notebooks(folder: str = "notebooks", *pages: str) -> int:
     """Write README and gallery, or some pages, as notebooks that Jupyter has executed, and as HTML."""
-    environment(JUPYTER, GALLERY / "notebooks.txt")
+    environment(folder=JUPYTER, locked=GALLERY / "notebooks.txt")
     command = [JUPYTER / PROGRAMS / "python", GALLERY / "notebooks.py", Path(folder).resolve(), *pages]
     return subprocess.run(command, check=False).returncode
 
@@ -123,9 +136,9 @@ def main(arguments: list[str]) -> int:
         return notebooks(*rest)
     if what == "versions":
         return versions(*rest)
-    environment()
+    environment(tools=what != "run")
     if what == "run":
-        return run("rpim-opt", *rest)
+        return command_line(*rest)
     os.chdir(ROOT)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # pytest has a process a core already
     if what == "test":
