@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
+from importlib import metadata
 from importlib.util import find_spec
 from io import StringIO
 from typing import Any
@@ -243,3 +244,10 @@ def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress
     with progress.Progress(*columns, console=console, transient=True, disable=not visible) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, every: bar.update(task, completed=done, total=every)
+
+
+def version_of(package: str) -> str:
+    """Return the version of an installed package; this one need not be installed, a checkout will do."""
+    import rpim_opt
+
+    return rpim_opt.__version__ if package == "rpim-opt" else metadata.version(package)

@@ -6,13 +6,13 @@ import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import version_of
 from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
@@ -214,5 +214,5 @@ class Record:
         """Return the record with today's date and versions, unless it has some."""
         if self.made:
             return self
-        versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+        versions = {"python": platform.python_version(), **{name: version_of(name) for name in PACKAGES}}
         return replace(self, made=datetime.now(UTC).isoformat(timespec="seconds"), versions=versions)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
+from rpim_opt.basics.text import version_of
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import believed
 from rpim_opt.calibration.asking import calibrate, mapped_as
@@ -632,7 +632,7 @@ def _require_errors(file: Stored, result: Calibration) -> None:
 
 def _same_version(file: Stored) -> bool:
     """Whether this version wrote the file; a later one may define a figure differently, and must still read it."""
-    return file.record.versions.get("rpim-opt", version("rpim-opt")) == version("rpim-opt")
+    return file.record.versions.get("rpim-opt", version_of("rpim-opt")) == version_of("rpim-opt")
 
 
 def require_agreement(stated: Any, found: Any, where: str) -> None:

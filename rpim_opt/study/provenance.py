@@ -8,9 +8,9 @@ import sys
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 
+from rpim_opt.basics.text import version_of
 from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.problem_file import problems_folder
 
@@ -40,7 +40,7 @@ def files_digest(folder: Path, files: Iterable[Path]) -> str:
 
 def versions() -> str:
     """Return the versions of what computes."""
-    packages = ", ".join(f"{package} {version(package)}" for package in PACKAGES)
+    packages = ", ".join(f"{package} {version_of(package)}" for package in PACKAGES)
     return f"{platform.python_implementation()} {platform.python_version()}, {packages}"
 
 
@@ -51,7 +51,7 @@ def file_state(path: Path) -> str:
 
 def package_state() -> str:
     """Say which version of the package computes: its number, its digest, and its commit where there is one."""
-    said = f"rpim-opt {version('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]}"
+    said = f"rpim-opt {version_of('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]}"
     if PACKAGE.parent.joinpath("pyproject.toml").is_file():
         return f"{said} ({commit(PACKAGE.parent, PACKAGE, problems_folder())})"
     return f"{said} (installed)"
