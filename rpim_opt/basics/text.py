@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -248,6 +249,6 @@ def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress
 
 def version_of(package: str) -> str:
     """Return the version of an installed package; this one need not be installed, a checkout will do."""
-    import rpim_opt
-
-    return rpim_opt.__version__ if package == "rpim-opt" else metadata.version(package)
+    if package == "rpim-opt":
+        return str(sys.modules["rpim_opt"].__version__)
+    return metadata.version(package)
