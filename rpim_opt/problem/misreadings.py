@@ -324,6 +324,9 @@ def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
         pair = _pair(robot, points)
         if pair is not None and pair[1] < min(best, BETTER * stated):
             chain, best = pair
+    if len(chain) > 1 and best > WRONG:  # of many pairs one always fits somewhat better
+        chain = chain[:1]
+        best = float(_tried(robot, points, chain)[0])
     if not best < BETTER * stated:
         return None
     return _compared(robot, chain, points, stated, best)
