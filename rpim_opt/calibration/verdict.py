@@ -93,7 +93,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors on
     held-out rows are larger than the nominal robot's; whose data were computed; and one with a likely mistake.
 
-    The limits come from good and bad data of 40 robots; none is a limit on joint zeros, which 180 degrees may be.
+    The limits were set on 48 tables with mistakes and 36 good folders; none is a limit on joint zeros, which may be off
+    by 180 degrees.
 
     Parameters
     ----------
