@@ -152,7 +152,7 @@ ELSEWHERE = {
     "rpim_opt.calibration.group_weights",
     "rpim_opt.convex.conflict",
     "rpim_opt.bayes.population",
-    "rpim_opt.convex.sentence",
+    "rpim_opt.convex.tolerances",
     "rpim_opt.robot.formats.urdf",
     "cattrs",
 }

@@ -163,7 +163,7 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
 
 def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
     """Return the statement that a combination of parameters has a value; arguments as for `Prior.known`."""
-    from rpim_opt.convex.combination import combination  # texts are read where there are any
+    from rpim_opt.convex.tolerances import combination  # texts are read where there are any
 
     said = combination(text)
     if said.sd is not None:

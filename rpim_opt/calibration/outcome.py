@@ -31,7 +31,7 @@ from rpim_opt.calibration.intervals import (
 )
 from rpim_opt.calibration.prices import Price, prices
 from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
-from rpim_opt.convex.drawn import Drawn
+from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
@@ -723,6 +723,6 @@ class Outcome:
         names = [held.name for held in self.held]
         holding = {price.text for price in self.prices if price.holds}
         for constraint in self.formulation.constraints:
-            if isinstance(constraint, Drawn) and constraint.text in holding:
+            if isinstance(constraint, Parsed) and constraint.text in holding:
                 names += constraint.names(self.program.model.parameters)
         return tuple(dict.fromkeys(names))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.drawn import Drawn
+from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.program import Program
 
 NEAR = 1e-6
@@ -52,7 +52,7 @@ class Price(NamedTuple):
 
 def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
     """Return what the statements among a program's constraints cost at its solution z (n,)."""
-    drawn = [constraint for constraint in program.formulation.constraints if isinstance(constraint, Drawn)]
+    drawn = [constraint for constraint in program.formulation.constraints if isinstance(constraint, Parsed)]
     if not drawn:
         return ()
     duals = dict(zip(map(id, program.formulation.constraints), program.beginning(z).solve(weight).duals, strict=True))
@@ -60,10 +60,10 @@ def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
     return tuple(_price(each, program, z, misfit, duals[id(each)]) for each in drawn)
 
 
-def _price(drawn: Drawn, program: Program, z: Array, misfit: float, multipliers: Array) -> Price:
+def _price(drawn: Parsed, program: Program, z: Array, misfit: float, multipliers: Array) -> Price:
     parameters = program.model.parameters
     unit, si = drawn.unit
-    slack = drawn.room(z, parameters)
+    slack = drawn.slack(z, parameters)
     scale = drawn.scale(parameters)
     multiplier = drawn.price(multipliers, parameters)
     # an interior point leaves small multipliers where nothing holds

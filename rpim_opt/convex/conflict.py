@@ -13,8 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import Conflict
 from rpim_opt.convex.asked import norms
 from rpim_opt.convex.atoms import cp
-from rpim_opt.convex.constraints import Box, spoken
-from rpim_opt.convex.drawn import Drawn
+from rpim_opt.convex.constraints import Box, Parsed, spoken
 from rpim_opt.convex.posed import Posed
 from rpim_opt.convex.terms import substituted
 from rpim_opt.problem.linear import LinearModel
@@ -79,7 +78,7 @@ def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated
             units.append(_bounds(function, posed, z))
             continue
         demands = [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
-        if isinstance(function, Drawn):
+        if isinstance(function, Parsed):
             units.append([Stated(function.name, tuple(demands))])
             continue
         name = name_of(function, k)
@@ -151,14 +150,14 @@ def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
 def _of_drawings(posed: Posed) -> dict[str, float]:
     """Return by how much [SI] statements would have to give way, in sum of scales the least; empty where that fails."""
     z = cp.Variable(posed.n)
-    drawn = [function for function in posed.formulation.constraints if isinstance(function, Drawn)]
+    drawn = [function for function in posed.formulation.constraints if isinstance(function, Parsed)]
     if not drawn:
         return {}
     slack = cp.Variable(len(drawn), nonneg=True)
     units = [function.scale(posed.parameters) for function in drawn]
     demands: list[Any] = []
     for k, function in enumerate(posed.formulation.constraints):
-        if isinstance(function, Drawn):
+        if isinstance(function, Parsed):
             place = drawn.index(function)
             demands += function.loosened(z, posed.parameters, units[place] * slack[place])
         else:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import display, fits
+from rpim_opt.basics.units import UNITS, display, fits
 from rpim_opt.convex.atoms import cp
-from rpim_opt.convex.drawn import parse
+from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
 from rpim_opt.convex.structure import Quadratic
+from rpim_opt.problem.workspace import within_box, within_ranges
 from rpim_opt.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from rpim_opt.convex.tolerances import Sentence, Sum
 
 __all__ = [
     "Box",
@@ -32,6 +36,11 @@ __all__ = [
 
 Constraint = Callable[[Any, Parameters], Any]
 """From z and the identified parameters to a CVXPY constraint, or several."""
+
+WORKSPACE, BOX = "workspace", ("x", "y", "z")
+"""The place that every robot has, all its joint ranges; and what a box is given by."""
+FAR = 100.0
+"""Prior scales by which the nominal robot may miss a statement: beyond, its unit or its meaning is wrong."""
 
 Limits = Callable[[Parameters], tuple[Array, Array]]
 """From the identified parameters to lower and upper bounds (n,) of z."""
@@ -355,3 +364,270 @@ def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     [[1 0 0 0 0 0 0 0]]
     """
     return _Differences(patterns)
+
+
+# --- statements in words ---------------------------------------------------------------------------------------
+
+
+class Place(NamedTuple):
+    """Named joint values (N, dof) [rad or m], or a box (3, 2) [m] in the robot's base frame."""
+
+    name: str
+    is_box: bool
+    numbers: tuple[tuple[float, ...], ...]
+
+
+class _Affine(NamedTuple):
+    """E z + f (k,) [SI], and the norms of the rows of E (k, n); of `move` E is (3 k, n)."""
+
+    E: Array
+    f: Array
+    size: Array
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """A constraint that `parse` read from a text, at places that it names."""
+
+    text: str
+    demanded: Sentence
+    where: tuple[Place, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What errors and reports call it."""
+        return f"'{self.text}'"
+
+    @property
+    def stated(self) -> list[Any]:
+        """The maker's name and its arguments, as a file holds them."""
+        if not self.where:
+            return ["parse", self.text]
+        where: dict[str, Any] = {}
+        for name, is_box, numbers in self.where:
+            rows = [list(row) for row in numbers]
+            where[name] = dict(zip(BOX, rows, strict=True)) if is_box else rows
+        return ["parse", self.text, where]
+
+    @property
+    def unit(self) -> tuple[str, float]:
+        """The unit in which it was written, and its size [SI]."""
+        name = self.demanded.unit
+        if not name:
+            return "SI", 1.0
+        return name, UNITS[name].si
+
+    @property
+    def step(self) -> float:
+        """A small loosening [SI]: a tenth of its limit, or a hundredth of its unit."""
+        if self.demanded.limit:
+            return 0.1 * self.demanded.limit
+        return 0.01 * self.unit[1]
+
+    def __call__(self, z: Any, parameters: Parameters) -> list[Any]:
+        """Return the CVXPY constraints."""
+        return self.loosened(z, parameters)
+
+    def loosened(self, z: Any, parameters: Parameters, by: Any = None) -> list[Any]:
+        """Return the CVXPY constraints with limits that are larger by a number or expression [SI]."""
+        made = self._affine(given(z, parameters))
+        size, kind = made.size, self.demanded.kind
+        by_row = np.repeat(size, 3) if kind == "move" else size
+        value = (made.E / by_row[:, None]) @ z + made.f / by_row
+        if by is None and kind == "equal":
+            return [value == 0]
+        limit = self.demanded.limit / size
+        if by is not None:
+            limit = limit + by / size
+        if kind == "move":
+            return [cp.norm(cp.reshape(value, (len(size), 3), order="C"), 2, axis=1) <= limit]
+        if kind == "norm":
+            return [cp.norm(value) <= limit]
+        if kind == "most":
+            return [value <= limit]
+        return [value <= limit, -value <= limit]
+
+    def price(self, multipliers: Array, parameters: Parameters) -> float:
+        """Return by how much the objective falls for every unit [1 / SI] by which all limits are loosened."""
+        size = self._affine(given(None, parameters)).size
+        share = 1 / np.tile(size, len(multipliers) // len(size))
+        return float(np.abs(multipliers) @ share)
+
+    def slack(self, z: Array, parameters: Parameters) -> float:
+        """Return how far z (n,) is from the limit [SI]; zero for an equality."""
+        made = self._affine(given(None, parameters))
+        value = made.E @ z + made.f
+        limit, kind = self.demanded.limit, self.demanded.kind
+        if kind == "equal":
+            return 0.0
+        if kind == "most":
+            return float(-np.max(value))
+        if kind == "within":
+            return limit - float(np.max(np.abs(value)))
+        return limit - float(np.max(np.linalg.norm(value.reshape(len(made.size), -1), axis=1)))
+
+    def scale(self, parameters: Parameters) -> float:
+        """Return by how much [SI] deviations of the prior scale change what is demanded."""
+        return float(np.max(self._affine(given(None, parameters)).size))
+
+    def names(self, parameters: Parameters) -> list[str]:
+        """Return the identified parameters that it speaks of."""
+        E = self._affine(given(None, parameters)).E
+        return [name for i, name in enumerate(parameters.names) if E[:, i].any()]
+
+    def require_near(self, parameters: Parameters) -> None:
+        """Refuse a statement that the nominal robot misses by far more than the prior scales."""
+        made = self._affine(given(None, parameters))
+        missed = -self.slack(np.zeros(len(parameters)), parameters)
+        if self.demanded.kind == "equal":
+            missed = float(np.max(np.abs(made.f)))
+        if missed > FAR * float(np.max(made.size)):
+            unit, si = self.unit
+            accepted = "one near it; 'nominal' where the nominal value is meant"
+            raise self._wrong(f"a demand that nominal misses by {missed / si:.4g} {unit}", accepted)
+
+    def _wrong(self, found: str, accepted: str) -> InputError:
+        return InputError(f"constraint {self.name}", found, accepted)
+
+    def _affine(self, p: Given) -> _Affine:
+        """Return what is demanded to be small, of these parameters."""
+        if self.demanded.kind == "move":
+            found = every_movement(p, self._configurations(p))
+            size = np.linalg.norm(found.slope, axis=(1, 2))
+            if not size.any():
+                raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
+            moving = size > 0
+            E = found.slope[moving].reshape(-1, len(p))
+            return _Affine(E, found.position[moving].ravel(), size[moving])
+        rows = [self._row(one, p) for each in self.demanded.sums for one in self._expanded(each, p)]
+        E = np.array([row for row, _ in rows])
+        size = np.linalg.norm(E, axis=1)
+        if self.demanded.kind == "norm":
+            size = np.array([np.max(size)])
+        if not (size > 0).all():
+            raise self._wrong("no identified parameter", "identified parameters: " + ", ".join(p.names[:24]))
+        return _Affine(E, np.array([constant for _, constant in rows]), size)
+
+    def _expanded(self, found: Sum, p: Given) -> list[Sum]:
+        """Return a sum for every identified parameter that its pattern matches."""
+        names = whole(p).names
+        patterns = [name for name in found.names if name not in names]
+        if not patterns:
+            return [found]
+        matched = [names[i] for i in places(names, patterns[0], f"constraint {self.name}")]
+        if len(patterns) > 1:
+            raise self._wrong(f"patterns {' and '.join(patterns)}", "one pattern in a sum")
+        known = [name for name in matched if name in p.names]
+        if not known:
+            raise self._wrong(f"'{patterns[0]}'", "identified parameters: " + choices(patterns[0], p.names))
+        place = found.names.index(patterns[0])
+        return [replace(found, names=(*found.names[:place], name, *found.names[place + 1 :])) for name in known]
+
+    def _row(self, found: Sum, p: Given) -> tuple[Array, float]:
+        """Return one sum as a row (n,) and a number [SI]; parameters that are not identified are nominal."""
+        table = whole(p)
+        index = [table.names.index(name) for name in found.names]
+        dimensions = sorted({table.dimensions[i] for i in index})
+        if len(dimensions) > 1:
+            raise self._wrong(f"a sum of {' and '.join(dimensions)}", "parameters of one dimension")
+        unit = self.demanded.unit
+        if unit and UNITS[unit].dimension != dimensions[0]:
+            raise self._wrong(f"unit {unit} for what is no {UNITS[unit].dimension}", f"a unit of {dimensions[0]}")
+        row = np.zeros(len(p))
+        constant = found.constant
+        for name, i, factor in zip(found.names, index, found.factors, strict=True):
+            if name in p.names:
+                row[p.names.index(name)] += factor * p.scale[p.names.index(name)]
+            if found.nominal:
+                continue
+            if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # its deviations are rotations
+                what = f"the value of '{name}', an angle of a turned frame"
+                raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
+            constant += factor * table.nominal[i]
+        return row, constant
+
+    def _configurations(self, p: Given) -> Array:
+        """Return the joint values (N, dof) at which movements are bounded."""
+        known = {place.name: place for place in self.where}
+        q: list[Array] = []
+        for name in self.demanded.places:
+            if name in known:
+                numbers = np.array(known[name].numbers)
+                is_box = known[name].is_box
+                q.append(within_box(machine_of(p), numbers[:, 0], numbers[:, 1]) if is_box else numbers)
+            elif name == WORKSPACE:
+                q.append(within_ranges(machine_of(p)))
+            else:
+                raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
+        return np.concatenate(q)
+
+
+def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
+    """Return a constraint in words: values of parameters with units, or how far the robot may move.
+
+    ::
+
+        d2 + d3 = 850.00 +- 0.05 mm       |d2 + d3 - 850 mm| <= 0.05 mm; = without +- is an equality
+        |a2 - a3| <= 0.1 mm               |a? - nominal| <= 0.2 mm, one for every a
+        alpha2 >= 89.9 deg                89.9 deg <= alpha2 <= 90.1 deg
+        d5 = nominal +- 0.1 mm            of the deviation
+        norm(tool_x - 10 mm, tool_y) <= 0.05 mm
+        move at most 5 mm: workspace      |p(q; x) - p(q; 0)| at every q of a place
+
+    Parameters that are not identified are nominal. A movement is that of the robot's own parameters, not of frames,
+    at 64 configurations of a box or of all joint ranges (``workspace``); to first order about the solution.
+
+    Parameters
+    ----------
+    text
+        The statement: it is parsed, and never evaluated.
+    where
+        Places by name: joint values (dof,) or (N, dof) [rad or m], or a box ``{"x": (low, high), "y": ..., "z": ...}``
+        [m] in the robot's base frame.
+
+    Raises
+    ------
+    InputError
+        For anything else, units that do not fit, demands that are not convex; when it is posed, for names that the
+        problem has not.
+
+    Examples
+    --------
+    >>> import cvxpy as cp
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> statements = ("a3 + a4 = 824.0 +- 0.5 mm", "|theta4| <= 1 mrad", "move at most 2 mm: home")
+    >>> demands = [ro.constraints.parse(text, {"home": np.zeros(6)}) for text in statements]
+    >>> stated = ro.Formulation("as stated", penalty=cp.sum_squares, constraints=demands)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
+    >>> for price in result.prices:
+    ...     print(f"{price.text}: {price.multiplier:.2f} a {price.unit}")
+    a3 + a4 = 824.0 +- 0.5 mm: 68.85 a mm
+    |theta4| <= 1 mrad: 2.88 a mrad
+    move at most 2 mm: home: 131.04 a mm
+    """
+    from rpim_opt.convex.tolerances import sentence  # texts are parsed where there are any
+
+    if where is not None and not isinstance(where, Mapping):
+        raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")
+    demanded = sentence(text)
+    named = tuple(_place(name, stated) for name, stated in (where or {}).items() if name in demanded.places)
+    return Parsed(text.strip(), demanded, named)
+
+
+def _place(name: str, stated: Any) -> Place:
+    accepted = "joint values (N, dof) [rad or m], or a box {'x': (low, high), 'y': ..., 'z': ...} [m]"
+    is_box = isinstance(stated, Mapping)
+    if is_box:
+        if set(stated) != set(BOX):
+            raise InputError(f"place '{name}'", f"a box of {', '.join(map(str, stated))}", accepted)
+        stated = [stated[axis] for axis in BOX]
+    try:
+        numbers = np.atleast_2d(np.asarray(stated, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"place '{name}'", repr(stated)[:60], accepted) from None
+    if numbers.ndim != 2 or not np.isfinite(numbers).all():
+        raise InputError(f"place '{name}'", "numbers that are not finite, or of another shape", accepted)
+    if is_box and (numbers.shape != (3, 2) or (numbers[:, 0] >= numbers[:, 1]).any()):
+        raise InputError(f"place '{name}'", "a box whose sides are not (low, high)", accepted)
+    return Place(name, is_box, tuple(map(tuple, numbers.tolist())))

@@ -19,8 +19,7 @@ from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import asking
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.constraints import Box, Constraint
-from rpim_opt.convex.drawn import Drawn
+from rpim_opt.convex.constraints import Box, Constraint, Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.rules.selection import Selector
@@ -296,7 +295,7 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
         else:
             _require_fit(constraint, parameters)
     for demand in demands:
-        if isinstance(demand, Drawn):
+        if isinstance(demand, Parsed):
             demand.require_near(parameters)
     return formulation
 

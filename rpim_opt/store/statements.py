@@ -14,8 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.schema import Name, Table
 from rpim_opt.basics.units import number, quantities
-from rpim_opt.convex.constraints import Constraint, at_nominal, equal, parse, signed
-from rpim_opt.convex.drawn import BOX, WORKSPACE
+from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.record import CONFIDENCE, Requirement, Side

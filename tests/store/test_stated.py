@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.cli import app
-from rpim_opt.convex.drawn import Drawn
+from rpim_opt.convex.constraints import Parsed
 from tests import ROOT
 
 
@@ -72,7 +72,7 @@ four = { x_mm = [400, 500], y_m = [-0.3, 0.3], z_mm = [-200, 200] }
     )
     instance = ro.load(folder, "places")
     (demand,) = instance.formulation.constraints
-    assert isinstance(demand, Drawn)
+    assert isinstance(demand, Parsed)
     where = {place.name: np.array(place.numbers) for place in demand.where}
     assert np.allclose(where["one"], np.radians([[0, 0, 90, 0, 90, 0], [0, 0, 90, 0, 80, 0]]))
     assert np.allclose(where["two"], where["one"][:1])

@@ -1,0 +1,335 @@
+"""Statements about parameters, ``d2 + d3 = 850.00 +- 0.05 mm``: parsed token by token, and never evaluated."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.units import LARGEST, SMALLEST, UNITS
+
+ACCEPTED = {
+    "constraint": "'d2 + d3 = 850.00 +- 0.05 mm', '|a2 - a3| <= 0.1 mm', 'alpha2 >= 89.9 deg', "
+    "'d5 = nominal +- 0.1 mm', 'norm(tool_x - 10 mm, tool_y) <= 0.05 mm', or 'move at most 5 mm: workspace'",
+    "prior": "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'",
+}
+LONGEST = 20_000
+"""Characters of a statement: some thousand parameters."""
+DIMENSIONS = ("length", "angle", "ratio", "compliance")
+"""Dimensions that parameters have."""
+Kind = Literal["equal", "most", "within", "norm", "move"]
+_NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"  # possessive: read in linear time
+_PARAMETER = re.compile(r"[\w.]+")
+_NAME = r"[A-Za-z_](?:[\w.*?]|\[[^\]]*\])*"
+_TOKEN = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{_NAME})|(?P<sign>\+-|±|<=|>=|≤|≥|==|[-+*=|(),]))")
+_MOVE = re.compile(r"\s*move\b(?:\s+at\s+most\b)?([^:]*)(?::(.*))?")
+_SIGNS = {"±": "+-", "≤": "<=", "≥": ">=", "==": "="}
+
+
+@dataclass(frozen=True)
+class Sum:
+    """A sum of factors times parameters' values and a constant [SI].
+
+    ``nominal`` is not zero where the parameters count from their nominal values; names may be patterns.
+    """
+
+    names: tuple[str, ...] = ()
+    factors: tuple[float, ...] = ()
+    constant: float = 0.0
+    nominal: int = 0
+
+    def plus(self, other: Sum, sign: int = 1) -> Sum:
+        """Return the sum of both, or with sign -1 their difference."""
+        names = (*self.names, *other.names)
+        factors = (*self.factors, *(sign * factor for factor in other.factors))
+        return Sum(names, factors, self.constant + sign * other.constant, self.nominal + sign * other.nominal)
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """A constraint in words.
+
+    ``kind`` is ``equal`` (every sum is zero), ``most`` (none is above zero), ``within`` (none is larger than the
+    limit), ``norm`` (all together are not) or ``move`` (no predicted movement at ``places`` is). ``limit`` is in SI,
+    ``unit`` as written, empty where no number had one.
+    """
+
+    kind: Kind
+    sums: tuple[Sum, ...] = ()
+    limit: float = 0.0
+    unit: str = ""
+    places: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A linear combination of parameters: its value or its deviation from nominal, and its standard deviation [SI].
+
+    ``value`` is None where ``deviation`` says it, ``sd`` where the text says none; ``dimension`` is that of the unit.
+    """
+
+    names: tuple[str, ...]
+    factors: tuple[float, ...]
+    value: float | None = None
+    deviation: float = 0.0
+    sd: float | None = None
+    dimension: str = ""
+
+
+def sentence(text: str) -> Sentence:
+    """Return the constraint that a text states.
+
+    InputError for other words and signs, numbers without a unit, units of different dimensions, and demands that are
+    not convex.
+
+    >>> from rpim_opt.convex.tolerances import sentence
+    >>> found = sentence("d2 + d3 = 850.00 +- 0.05 mm")
+    >>> found.kind, found.limit, found.sums
+    ('within', 5e-05, (Sum(names=('d2', 'd3'), factors=(1.0, 1.0), constant=-0.85, nominal=0),))
+    """
+    moving = _MOVE.fullmatch(text) if isinstance(text, str) and len(text) <= LONGEST else None
+    if moving is None:
+        return _Reader(text, "constraint").sentence()
+    return _Reader(text, "constraint", moving[1]).movement(moving[2] or "")
+
+
+def combination(text: str) -> Combination:
+    """Return the prior statement of a text: a sum of parameters, its value or deviation, its standard deviation.
+
+    InputError for numbers without a unit, and for a standard deviation that is not above zero.
+
+    >>> from rpim_opt.convex.tolerances import combination
+    >>> known = combination("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
+    >>> known.names, known.factors, known.deviation, known.sd
+    (('a2', 'a3'), (1.0, -0.5), 0.0002, 5e-05)
+    """
+    return _Reader(text, "prior").combination()
+
+
+def units() -> list[str]:
+    """Return the units that parameters have."""
+    return [name for name, unit in UNITS.items() if unit.dimension in DIMENSIONS]
+
+
+class _Reader:
+    """Tokens of a statement, and where among them it is."""
+
+    def __init__(self, text: str, what: str, part: str | None = None):
+        self.text, self.what = str(text), what
+        if not isinstance(text, str):
+            where = "key stated" if what == "constraint" else what
+            raise InputError(where, repr(text)[:60], f"a statement like {ACCEPTED[what]}")
+        if len(text) > LONGEST:
+            raise InputError(f"statement '{text[:60]}...'", f"{len(text)} characters", f"at most {LONGEST}")
+        self._tokens = list(self._split(text if part is None else part))
+        self._at = 0
+        self.unit = self._unit()
+
+    def _wrong(self, found: str, accepted: str = "") -> InputError:
+        accepted = accepted or f"a statement like {ACCEPTED[self.what]}"
+        return InputError(f"{self.what} '{self.text.strip()}'", found, accepted)
+
+    def _split(self, part: str) -> Iterator[tuple[str, str]]:
+        place = 0
+        end = len(part.rstrip())
+        while place < end:
+            token = _TOKEN.match(part, place)
+            if token is None:
+                raise self._wrong(f"'{part[place:].strip()}'")
+            kind = str(token.lastgroup)
+            yield kind, _SIGNS.get(token[kind], token[kind])
+            place = token.end()
+
+    def _unit(self) -> str:
+        """Return the unit of numbers that have none of their own: the last one."""
+        said = [word for kind, word in self._tokens if kind == "name" and word in UNITS]
+        for each in said:
+            if UNITS[each].dimension not in DIMENSIONS:
+                raise self._wrong(f"unit '{each}'", choices(each, units()))
+        if len({UNITS[each].dimension for each in said}) > 1:
+            raise self._wrong(f"units {' and '.join(said)}", "units of one dimension")
+        return said[-1] if said else ""
+
+    def _next(self, *words: str) -> str:
+        """Return the next token and pass it, where it is one of these words or kinds; empty otherwise."""
+        if self._at < len(self._tokens):
+            kind, word = self._tokens[self._at]
+            if word in words or (kind in words and not (kind == "name" and word in UNITS)):
+                self._at += 1
+                return word
+        return ""
+
+    def _require_end(self) -> None:
+        if self._at < len(self._tokens):
+            raise self._wrong(f"'{' '.join(word for _, word in self._tokens[self._at :])}'")
+
+    # --- statements --------------------------------------------------------------------------------------------
+
+    def movement(self, where: str) -> Sentence:
+        limit = self._constant(self._sum())
+        self._require_end()
+        if UNITS[self.unit or "mm"].dimension != "length":
+            raise self._wrong(f"a movement in {self.unit}", "a length: 'move at most 5 mm'")
+        if not limit > 0:
+            raise self._wrong(f"a movement of {limit:g}", "one above zero; at_nominal keeps parameters")
+        places = tuple(place.strip() for place in (where.strip() or "workspace").split(","))
+        return Sentence("move", limit=limit, unit=self.unit, places=places)
+
+    def combination(self) -> Combination:
+        known = self._sum()
+        equals = self._next("=")
+        if equals:
+            right = self._sum()
+            if right.names:
+                raise self._wrong(f"'{right.names[0]}' where a number should stand")
+            known = self._difference(known, right)
+        spread = self._next("+-")
+        sd = self._constant(self._sum()) if spread else 0.0
+        self._require_end()
+        self._checked(known)
+        patterns = [name for name in known.names if not _PARAMETER.fullmatch(name)]
+        if patterns:
+            raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
+        if not spread:
+            if equals:
+                raise self._wrong("no standard deviation")
+            return Combination(known.names, known.factors)
+        if not self.unit:
+            raise self._wrong("no unit", f"one of {', '.join(units())} at the end")
+        if not sd >= SMALLEST:
+            raise self._wrong(f"a standard deviation of {sd:g}", "one above zero; [constraints] fixes parameters")
+        dimension = UNITS[self.unit].dimension
+        if equals and not known.nominal:
+            return Combination(known.names, known.factors, -known.constant, 0.0, sd, dimension)
+        return Combination(known.names, known.factors, None, -known.constant, sd, dimension)
+
+    def sentence(self) -> Sentence:
+        sides = [self._side()]
+        relations: list[str] = []
+        while relation := self._next("=", "<=", ">="):
+            relations.append(relation)
+            sides.append(self._side())
+        tolerance = None
+        if self._next("+-"):
+            tolerance = self._constant(self._sum())
+        self._require_end()
+        if not relations:
+            if tolerance is None:
+                raise self._wrong("no =, <= or >=")
+            relations = ["="]
+            sides.append(("", (Sum(nominal=1),)))  # 'd5 +- 0.1 mm'
+        made = self._related(sides, relations, tolerance)
+        for each in made.sums:
+            self._checked(each)
+        return replace(made, unit=self.unit)
+
+    def _related(
+        self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str], tolerance: float | None
+    ) -> Sentence:
+        if tolerance is not None and relations != ["="]:
+            raise self._wrong("a tolerance without =", "'= 850.00 +- 0.05 mm'")
+        if relations[0] == ">=":
+            sides = sides[::-1]
+        if any(kind for kind, _ in sides):
+            return self._sized(sides, relations)
+        sums = [each for _, (each,) in sides]
+        if relations == ["="]:
+            difference = self._difference(*sums)
+            if not tolerance:
+                return Sentence("equal", (difference,))
+            if tolerance < 0:
+                raise self._wrong("a tolerance below zero", "one above zero")
+            return Sentence("within", (difference,), tolerance)
+        if "=" in relations or len(set(relations)) > 1 or len(relations) > 2:
+            raise self._wrong(" and ".join(relations), "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'")
+        return Sentence("most", tuple(self._difference(low, high) for low, high in pairwise(sums)))
+
+    def _sized(self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str]) -> Sentence:
+        """Return the demand that an absolute value or norm is at most a number."""
+        if len(relations) > 1:
+            raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
+        (kind, sums), (other, large) = sides
+        if relations[0] == "=" or not kind or other:
+            raise self._wrong("a demand that is not convex", "an absolute value or norm <= a number")
+        limit = self._constant(large[0])
+        if not limit > 0:
+            raise self._wrong(f"a limit of {limit:g}", "one above zero; '=' where nothing may differ")
+        return Sentence("within" if kind == "|" and len(sums) == 1 else "norm", sums, limit)
+
+    def _side(self) -> tuple[str, tuple[Sum, ...]]:
+        """Return a sum, or with the sign of what they stand in, sums between bars or in ``norm(...)``."""
+        opening = self._next("|", "norm")
+        if not opening:
+            return "", (self._sum(),)
+        if opening == "norm" and not self._next("("):
+            raise self._wrong("norm without (", "norm(tool_x - 10 mm, tool_y)")
+        found = [self._sum()]
+        while self._next(","):
+            found.append(self._sum())
+        end = "|" if opening == "|" else ")"
+        if not self._next(end):
+            raise self._wrong(f"no {end} at the end of a size")
+        return opening, tuple(found)
+
+    # --- sums ------------------------------------------------------------------------------------------------
+
+    def _sum(self) -> Sum:
+        found = self._item(self._next("+", "-"))
+        while sign := self._next("+", "-"):
+            found = found.plus(self._item(sign))
+        if found.nominal not in (0, -1 if found.names else 1):
+            raise self._wrong("nominal where it means nothing", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
+        return found
+
+    def _item(self, sign: str) -> Sum:
+        factor = -1.0 if sign == "-" else 1.0
+        number = self._next("number")
+        times = ""
+        if number:
+            factor *= float(number)
+            if not abs(factor) <= LARGEST:
+                raise self._wrong(f"{number}", f"numbers of at most {LARGEST:g}")
+            times = self._next("*")
+            unit = self._next(*UNITS)
+            if unit and not times:
+                return Sum(constant=factor * UNITS[unit].si)
+        name = self._next("name")
+        if name == "nominal":
+            if number:
+                raise self._wrong(f"{number} nominal", "nominal")
+            return Sum(nominal=int(factor))
+        if name:
+            if factor == 0:
+                raise self._wrong(f"'{number} {name}'", "factors other than zero")
+            return Sum((name,), (factor,))
+        if not number or times:
+            word = f"'{self._tokens[self._at][1]}'" if self._at < len(self._tokens) else "an end"
+            raise self._wrong(f"{word} where a parameter or a number should stand")
+        if factor == 0:
+            return Sum()
+        if not self.unit:
+            raise self._wrong("no unit", f"one of {', '.join(units())}")
+        return Sum(constant=factor * UNITS[self.unit].si)
+
+    def _constant(self, found: Sum) -> float:
+        """Return the number [SI] that a sum is."""
+        if found.names or found.nominal:
+            raise self._wrong("parameters where a number should stand", "a number with a unit: " + ", ".join(units()))
+        return found.constant
+
+    def _checked(self, found: Sum) -> None:
+        """Refuse a sum without parameters, or with one of them twice."""
+        if not found.names:
+            raise self._wrong("no parameter", "parameters' names")
+        twice = [name for name, times in Counter(found.names).items() if times > 1]
+        if twice:
+            raise self._wrong(f"'{twice[0]}' twice", "every parameter once")
+
+    def _difference(self, left: Sum, right: Sum) -> Sum:
+        if left.nominal and right.nominal:
+            raise self._wrong("nominal on both sides", "on one of them")
+        return left.plus(right, -1)
