@@ -52,21 +52,11 @@ class Described:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Joints about axes of their own frames: O_1 J_1(q_1) O_2 J_2(q_2) ... O_n J_n(q_n) tail.
+    """Joints about axes of their own frames: O_1 J_1(q_1) O_2 J_2(q_2) ... O_n J_n(q_n) tail."""
 
-    Parameters
-    ----------
-    origins
-        (n, 4, 4) transforms O_i from the frame of joint i-1 to that of joint i at rest.
-    axes
-        (n, 3) unit vectors that the joints turn about or move along.
-    tail
-        (4, 4) transform from the last joint's frame to the tip.
-    """
-
-    origins: Array
-    axes: Array
-    tail: Array
+    origins: Array  # (n, 4, 4) from the frame of joint i-1 to that of joint i at rest
+    axes: Array  # (n, 3) unit vectors that the joints turn about or move along
+    tail: Array  # (4, 4) from the last joint's frame to the tip
 
     @classmethod
     def about_z(cls, origins: Sequence[Array], tail: Array) -> Chain:
@@ -100,19 +90,9 @@ def describe(
 
     The base has the first axis as z and is where that axis is nearest to the chain's start; it is the identity
     where that axis is the start's z. The last MDH frame is the last joint's own, turned so that its axis is z.
-
-    Parameters
-    ----------
-    chain
-        The joints.
-    near
-        (n, 5) table whose theta (up to half a turn) and, where axes are parallel, d are wanted instead of zero.
-    parallel
-        Angle [rad] below which axes count as near parallel.
-
-    Returns
-    -------
-    The fourth, G (n, 4, 4), is constant: frame of joint i = MDH frame i before its Rot(y, beta_i), times G_i.
+    Of ``near`` (n, 5) theta (up to half a turn) and, where axes are parallel, d are wanted instead of zero; axes count
+    as near parallel below ``parallel`` [rad]. The fourth result, G (n, 4, 4), is constant: frame of joint i = MDH
+    frame i before its Rot(y, beta_i), times G_i.
     """
     n = len(chain.axes)
     near = np.zeros((n, 5)) if near is None else near
@@ -169,32 +149,14 @@ def without_beta(robot: Robot) -> Robot:
     """Return the same arm in four numbers a joint: every Hayati parameter zero, common normals throughout.
 
     Where axes are nearly parallel the common normal, and with it d of both joints, may be hundreds of metres away.
-
-    Raises
-    ------
-    InputError
-        For a beta after the last joint, which belongs to the tool, or axes so nearly parallel that the
-        four numbers lose more than 1e-9 m or rad.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> mdh = [[0, 0, 0, 0, 0.001], [0, 0.4, 0, 0, 0]]  # the second axis is tilted by a milliradian
-    >>> arm = ro.robot.Robot("two links", np.array(mdh))
-    >>> plain = ro.robot.without_beta(arm)
-    >>> plain.mdh[:, 3].round(3)  # d [m]: the common normal is far away
-    array([-400.,  400.])
-    >>> q = np.array([[0.3, -0.5]])
-    >>> bool(np.allclose(ro.robot.forward_kinematics(plain, q), ro.robot.forward_kinematics(arm, q)))
-    True
+    Refused are a beta after the last joint, and axes so parallel that the four numbers lose more than 1e-9 m or rad.
     """
     table = robot.mdh
     n = robot.dof
     if table[-1, 4]:
         raise InputError("robot", f"beta{n} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint")
-    before = [np.eye(4), *(numeric_link(beta=row[4]) for row in table[:-1])]
-    origins = [b @ numeric_link(*row[:4]) for b, row in zip(before, table, strict=True)]
+    before = np.append(0.0, table[:-1, 4])
+    origins = [numeric_link(beta=b) @ numeric_link(*row[:4]) for b, row in zip(before, table, strict=True)]
     origins[0] = numeric_link(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
     plain = describe(Chain.about_z(origins, np.eye(4)), table, 1e-10)[0]
     plain[0, :2] = table[0, :2]
@@ -209,10 +171,10 @@ def without_beta(robot: Robot) -> Robot:
 
 def _to_axis(axis: Array) -> Array:
     """Return the smallest turn (4, 4) that takes z to a unit vector."""
-    T = np.eye(4)
     v = np.cross([0.0, 0.0, 1.0], axis)
     s = float(np.linalg.norm(v))
     turn = v / s if s > 0 else np.array([1.0, 0.0, 0.0])  # to -z: about x
+    T = np.eye(4)
     T[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(np.arctan2(s, axis[2]) * turn).as_matrix()
     return T
 
@@ -263,19 +225,13 @@ def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:
 
 
 def reach(table: Array, *frames: Array) -> float:
-    """Return the length of an arm stretched out [m], at least one, with the frames (4, 4) at its ends.
-
-    Places on it are rounded in proportion.
-    """
+    """Return the length of an arm stretched out [m], at least one, with the frames (4, 4) at its ends."""
     ends = sum(float(np.linalg.norm(T[:3, 3])) for T in frames)
     return max(float(np.abs(table[:, 1::2]).sum()) + ends, 1.0)
 
 
 def origin_numbers(T: Array, old: Array, size: float) -> tuple[str | None, str | None]:
-    """Return an origin's new xyz and rpy as texts that read back exactly; None for what is as it was.
-
-    ``size`` is the arm's `reach` [m].
-    """
+    """Return an origin's new xyz and rpy as texts that read back exactly; None for what is as it was."""
     six = frame_numbers(T) + 0.0  # no negative zeros
     texts = [" ".join(repr(float(v)) for v in part) for part in (six[:3], six[3:])]
     moved = np.abs(T[:3, 3] - old[:3, 3]).max() > ROUNDING * size

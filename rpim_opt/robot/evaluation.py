@@ -31,21 +31,7 @@ PAYS = 2_000
 
 
 def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
-    """Evaluate a CasADi function on every row of a table, many in one call, without copies.
-
-    Parameters
-    ----------
-    function
-        Inputs: one column for each of ``shared``, then one column that changes with the row.
-    shared
-        Inputs that are the same for all rows.
-    rows
-        (N, k), one input column a row.
-
-    Returns
-    -------
-    For every output of shape (r, c) an array (N, c, r): CasADi counts columns first.
-    """
+    """Evaluate a CasADi function on every row of a table, many in one call, without copies."""
     results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
 
@@ -76,10 +62,7 @@ def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
 
 
 def evaluate_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
-    """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows.
-
-    Of many rows the values of every number stand side by side in memory: (N, c, r) arrays whose first axis is dense.
-    """
+    """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows."""
     vectorized = _quickest(function, len(shared), len(rows))
     if vectorized is None:
         return call_rows(function, shared, rows)
@@ -91,17 +74,7 @@ def evaluate_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -
 def write_rows(
     function: ca.Function, shared: Sequence[Array], rows: Array, results: Sequence[Array], factors: Array
 ) -> None:
-    """Write what `evaluate_rows` returns, times factors, into arrays.
-
-    Parameters
-    ----------
-    function, shared, rows
-        As `call_rows` has them.
-    results
-        An array (c, r, N) for every output (r, c).
-    factors
-        Of all outputs' numbers, one output after the other.
-    """
+    """Write what `evaluate_rows` returns, times factors, into arrays."""
     vectorized = _quickest(function, len(shared), len(rows))
     if vectorized is not None:
         _evaluate(vectorized, shared, rows, results, factors)
@@ -119,10 +92,7 @@ def _split(numbers: Array, results: Sequence[Array]) -> list[Array]:
 
 
 class _Vectorized(NamedTuple):
-    """A function of rows in two: ``common`` (shared inputs) and ``rows`` (that, rows (width, k)) -> (width, numbers).
-
-    ``shapes`` are those of the function's outputs.
-    """
+    """A function in two: ``common`` of shared inputs, ``rows`` of that and a table (width, k) -> (width, numbers)."""
 
     common: ca.Function
     rows: ca.Function
@@ -155,10 +125,7 @@ def _quickest(function: ca.Function, shared: int, rows: int) -> _Vectorized | No
 
 @lru_cache(maxsize=256)
 def _vectorize(function: ca.Function, shared: int, width: int) -> _Vectorized | None:
-    """Return a function of scalar operations at ``width`` rows; None for one that calls others.
-
-    The first ``shared`` inputs are the same for all rows, the last one changes.
-    """
+    """Return a function of scalar operations at ``width`` rows; None for one that calls others."""
     if not function.is_a("SXFunction"):
         return None
     with SYMBOLS:
@@ -210,10 +177,7 @@ def _dense(values: ca.MX, width: int) -> ca.MX:
 
 
 class _Memory:
-    """Inputs and outputs of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width).
-
-    They are set once: CasADi takes longer to set them than to evaluate.
-    """
+    """Inputs and outputs of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width)."""
 
     def __init__(self, vectorized: _Vectorized):
         common, rows = vectorized.common, vectorized.rows

@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.robot.evaluation import call_rows
-from rpim_opt.robot.kinematics import transforms
+from rpim_opt.robot.kinematics import table_symbols, transforms
 from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
 from rpim_opt.robot.terms import Posture, Symbol, Weight, term_of
 
@@ -25,35 +25,21 @@ SAME = 1e-2
 
 
 class Statics(Weight):
-    """What gravity does to an arm of nominal geometry in one configuration; nothing is made before it is asked for.
-
-    Parameters
-    ----------
-    joint_types
-        Of the arm.
-    q
-        Joint values of the model [rad or m].
-    nominal
-        Gives the numbers of the table, ``nominal("alpha2")``.
-    gravity
-        Where it points and what it pulls at.
-    payload
-        Mass of the payload [kg] instead of that of ``gravity``.
-    """
+    """What gravity does to an arm of nominal geometry in one configuration; nothing is made before it is asked for."""
 
     def __init__(
         self,
         joint_types: Sequence[str],
-        q: Sequence[Symbol],
-        nominal: Callable[[str], Symbol],
+        q: Sequence[Symbol],  # of the model
+        nominal: Callable[[str], Symbol],  # numbers of the table, nominal("alpha2")
         gravity: Gravity,
-        payload: Symbol | None = None,
+        payload: Symbol | None = None,  # [kg], instead of that of ``gravity``
     ) -> None:
+        super().__init__(gravity.payload if payload is None else payload)
         self.joint_types = joint_types
         self.q = q
         self.nominal = nominal
         self.gravity = gravity
-        self.payload = gravity.payload if payload is None else payload
         self.direction = ca.DM(gravity.direction)
 
     def torque(self, i: int) -> Symbol:
@@ -77,13 +63,10 @@ class Statics(Weight):
 
     @cached_property
     def _frames(self) -> list[ca.SX]:
-        """The transforms after every joint, as the table alone has them."""
-        return transforms(self.joint_types, Posture(self.q), self._of_table)
+        def value(name: str) -> Symbol:
+            return self.nominal(name) if name.rstrip("0123456789") in MDH else 0.0
 
-    def _of_table(self, name: str) -> Symbol:
-        if name.rstrip("0123456789") in MDH:
-            return self.nominal(name)
-        return 0.0
+        return transforms(self.joint_types, Posture(self.q), value)
 
     def _axis(self, i: int) -> ca.SX:
         """Return the unit vector about which joint i turns: z before the link's Rot(y, beta)."""
@@ -99,23 +82,20 @@ class Statics(Weight):
             links = list(zip(range(1, dof + 1), gravity.centres, gravity.masses, strict=True))
         else:
             links = [(min(k or dof, dof), (0.0, 0.0, 0.0), mass) for mass, k in GUESS]
-        carried = [*links, (dof, gravity.payload_centre, self.payload)]
-        return [(k, self._place(k, centre), mass) for k, centre, mass in carried]
-
-    def _place(self, k: int, centre: Sequence[float]) -> ca.SX:
-        T = self._frames[k - 1]
-        return T[:3, 3] + T[:3, :3] @ ca.DM(centre)
+        found = []
+        for k, centre, mass in [*links, (dof, gravity.payload_centre, self.payload)]:
+            T = self._frames[k - 1]
+            found.append((k, T[:3, 3] + T[:3, :3] @ ca.DM(centre), mass))
+        return found
 
 
 @lru_cache(maxsize=64)
 def _function(joint_types: tuple[str, ...], gravity: Gravity) -> ca.Function:
     """Build torques and slopes from the table, row by row, and from a row of joint values and payload."""
     dof = len(joint_types)
-    table = ca.SX.sym("mdh", dof * len(MDH))
+    table, value = table_symbols(dof)
     q = ca.SX.sym("q", dof)
     payload = ca.SX.sym("payload")
-    names = [f"{column}{i}" for i in range(1, dof + 1) for column in MDH]
-    value = dict(zip(names, ca.vertsplit(table), strict=True))
     statics = Statics(joint_types, ca.vertsplit(q), value.__getitem__, gravity, payload)
     joints = range(1, dof + 1)
     torques = ca.vertcat(*(statics.torque(i) for i in joints))
@@ -167,28 +147,10 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
 
 
 def moment_slopes(robot: Robot, q: Array) -> Array:
-    """Return what first moments of links mean to the joints: z_i . (R_k e_a x g_hat) of the nominal arm.
+    """Return what first moments of links mean to joints (N, dof, dof, 3), by joint i, link k and axis a.
 
+    z_i . (R_k e_a x g_hat) of the nominal arm at q (N, dof) of the controller; zero for k < i and for prismatic joints.
     A joint's deflection is the sum of these times the parameters ``bend{i}_{k}{a}`` [rad].
-
-    Parameters
-    ----------
-    robot
-        Its `Gravity` says where gravity points.
-    q
-        (N, dof) joint values of the controller [rad or m].
-
-    Returns
-    -------
-    (N, dof, dof, 3) without unit, by joint i, link k and axis a; zero for k < i and for prismatic joints.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.robot.Robot("pendulum", np.array([[np.pi / 2, 0, 0, 0, 0]]))
-    >>> ro.robot.moment_slopes(arm, np.array([[0.0]])).round(3)[0, 0, 0] + 0.0  # x is horizontal
-    array([-1.,  0.,  0.])
     """
     return _evaluated(robot, q, None)[1].reshape(-1, robot.dof, robot.dof, 3)
 
@@ -212,19 +174,6 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
     Over random joint values, those whose slope (`moment_slopes`) is neither constant nor, but for a factor and a
     constant, that of an earlier one of the same joint. With constants they say all that masses of links can do to
     an arm of revolute joints.
-
-    Parameters
-    ----------
-    robot
-        The nominal robot.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> mdh = np.array([[np.pi / 2, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]])  # both axes are horizontal
-    >>> ro.robot.bend_names(ro.robot.Robot("two links", mdh))
-    ('bend1_1x', 'bend1_1y', 'bend1_2x', 'bend1_2y', 'bend2_2x', 'bend2_2y')
     """
     return _bend_names(robot.mdh.tobytes(), robot.joint_types, robot.joint_map.tobytes(), robot.gravity)
 
@@ -243,25 +192,17 @@ def _bend_names(mdh: bytes, joint_types: tuple[str, ...], joint_map: bytes, grav
                 v = slopes[:, i, k, a] - slopes[:, i, k, a].mean()
                 size = float(np.linalg.norm(v))
                 # slopes are of size 1: this is a share of that
-                if size < SAME * np.sqrt(DRAWS) or any(_parallel(v / size, u) for u in known):
+                if size < SAME * np.sqrt(DRAWS):
                     continue
-                known.append(v / size)
-                names.append(f"bend{i + 1}_{k + 1}{axis}")
+                v = v / size
+                if all(min(np.linalg.norm(v - u), np.linalg.norm(v + u)) >= SAME for u in known):
+                    known.append(v)
+                    names.append(f"bend{i + 1}_{k + 1}{axis}")
     return tuple(names)
 
 
-def _parallel(v: Array, u: Array) -> bool:
-    """Return whether two unit vectors differ by less than `SAME`, but for their sign."""
-    return min(float(np.linalg.norm(v - u)), float(np.linalg.norm(v + u))) < SAME
-
-
 def bending_joints(robot: Robot) -> list[int]:
-    """Return the joints (from 1) whose torque of gravity changes with the configuration.
-
-    >>> import rpim_opt as ro
-    >>> ro.robot.bending_joints(ro.load("paper_arm").problem.robot)  # nothing turns about a vertical axis
-    [2, 3, 4, 5]
-    """
+    """Return the joints (from 1) whose torque of gravity changes with the configuration."""
     spread = np.ptp(gravity_torques(robot, _draws(robot)), axis=0)
     return [i for i, each in enumerate(spread, start=1) if each > SAME * spread.max()]
 
@@ -284,15 +225,12 @@ def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     {'gravity': 4, 'first harmonic': 12, 'second harmonic': 12, 'moments': 30}
     """
     revolute = [i for i, kind in enumerate(robot.joint_types, start=1) if kind == "revolute"]
-    waves = {name: tuple(f"{ecc}_{wave}{i}" for i in revolute for wave in ("cos", "sin")) for name, ecc in _WAVES}
     return {
         "gravity": tuple(f"compliance{i}" for i in bending_joints(robot)),
-        **waves,
+        "first harmonic": tuple(f"ecc_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
+        "second harmonic": tuple(f"ecc2_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
         "moments": bend_names(robot),
     }
-
-
-_WAVES = (("first harmonic", "ecc"), ("second harmonic", "ecc2"))
 
 
 def family_scales(robot: Robot, names: Iterable[str]) -> Array:
@@ -300,25 +238,6 @@ def family_scales(robot: Robot, names: Iterable[str]) -> Array:
 
     Largest over random joint values, not over measured ones: what a family may do does not depend on the data. One
     that moves nothing, the compliance of a vertical axis for instance, has the usual size of its kind.
-
-    Parameters
-    ----------
-    robot
-        The nominal robot.
-    names
-        Of terms of joints: compliances, eccentricities, second harmonics, backlash, bends, ratios.
-
-    Raises
-    ------
-    InputError
-        For another parameter.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> robot = ro.load("paper_arm").problem.robot
-    >>> ro.robot.family_scales(robot, ["compliance2", "ecc_cos3"])  # [rad/Nm], [rad]
-    array([8.18405444e-07, 1.00000000e-04])
     """
     q = _draws(robot)
     torques = np.abs(gravity_torques(robot, q)).max(axis=0)

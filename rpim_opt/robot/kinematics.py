@@ -7,6 +7,7 @@ Every function takes and returns CasADi ``SX`` (numbers are welcome) and builds 
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, reduce
 
@@ -16,7 +17,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.robot.evaluation import call_rows
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import Posture, Symbol, Term, displacement, motion
+from rpim_opt.robot.terms import Place, Posture, Symbol, Term, displacement, motion
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -56,11 +57,7 @@ def _rows(*rows: Sequence[Symbol]) -> ca.SX:
 
 
 def product(factors: Sequence[ca.SX]) -> ca.SX:
-    """Return the product of transforms, from the right.
-
-    Every column is then carried through the factors by itself: a position needs no rotation of the frames before it,
-    and its derivatives take a third of the operations that those of a product from the left do.
-    """
+    """Return the product of transforms, from the right: a position needs no rotation of the frames before it."""
     return reduce(lambda T, factor: factor @ T, reversed(factors))
 
 
@@ -80,17 +77,9 @@ def _link() -> ca.Function:
     return ca.Function("link", numbers, [ca.densify(product(link(*numbers)))])
 
 
-def _turns(rx: Symbol, ry: Symbol, rz: Symbol) -> list[ca.SX]:
-    """Return Rz(rz), Ry(ry) and Rx(rx), whose product has roll, pitch, yaw about fixed axes, as in URDF."""
-    return [rotation_z(rz), rotation_y(ry), rotation_x(rx)]
-
-
 def roll_pitch_yaw(R: Array) -> Array:
-    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx.
-
-    Roll is read off what yaw leaves, so that the three give R back near a pitch of 90 degrees too, where they lose
-    their meaning one by one.
-    """
+    """Return (rx, ry, rz) [rad] with R = Rz Ry Rx."""
+    # roll is read off what yaw leaves: at a pitch of 90 degrees the three give R back, too
     yaw = np.arctan2(R[1, 0], R[0, 0]) if np.hypot(R[1, 0], R[0, 0]) > 1e-12 else np.arctan2(-R[0, 1], R[1, 1])
     c, s = np.cos(yaw), np.sin(yaw)
     roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
@@ -103,18 +92,17 @@ def frame(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> 
 
 
 def placed(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) -> list[ca.SX]:
-    """Return the factors of a frame that is displaced from its nominal place.
+    """Return the factors of a frame that is displaced from its nominal place, along and about the parent's axes.
 
-    The deviation (x, y, z, rx, ry, rz) is along and about the axes of the *parent* frame::
+    ::
 
-        origin = nominal origin + (x, y, z)
-        R      = R(rx, ry, rz) R(nominal)
+        origin = nominal origin + (x, y, z),    R = R(rx, ry, rz) R(nominal)
 
-    so that it is regular wherever the nominal frame points: adding to roll, pitch and yaw
-    instead would be singular at a nominal pitch of 90 degrees.
+    which is regular wherever the nominal frame points: adding to roll, pitch and yaw would be singular at 90 degrees.
     """
     origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
-    return [translation(*origin), *_turns(*deviation[3:]), *_turns(*nominal[3:])]
+    turns = [(rotation_z(rz), rotation_y(ry), rotation_x(rx)) for rx, ry, rz in (deviation[3:], nominal[3:])]
+    return [translation(*origin), *turns[0], *turns[1]]
 
 
 def numeric_frame(place: Sequence[float] | Array) -> Array:
@@ -136,34 +124,24 @@ def frame_numbers(T: Array) -> Array:
 def transforms(
     joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
-    """Return the transforms from the robot's base to the frame after every joint; the last is the flange's.
-
-    ``value("alpha2")`` gives the parameters; joints move by `motion`, and ``terms`` may displace base and links.
-    """
-    T = ca.SX.eye(4)
-    after = []
-    for factors in _by_joint(joint_types, posture, value, terms):
-        T = T @ product(factors)
-        after.append(T)
-    return after
+    """Return the transforms from the robot's base to the frame after every joint; the last is the flange's."""
+    products = [product(factors) for factors in _by_joint(joint_types, posture, value, terms)]
+    return list(itertools.accumulate(products, operator.matmul))
 
 
 def chain(
     joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
-    """Return the factors of the transform from the robot's base to its flange; arguments as for `transforms`.
-
-    Where a term displaces the tool, that is part of it.
-    """
+    """Return the factors of the transform from the robot's base to its flange; arguments as for `transforms`."""
     factors = list(itertools.chain.from_iterable(_by_joint(joint_types, posture, value, terms)))
-    return factors + _displaced(displacement("tool", joint_types, len(joint_types), posture, value, terms))
+    return factors + _displaced("tool", len(joint_types), joint_types, posture, value, terms)
 
 
 def _by_joint(
     joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term]
 ) -> Iterator[list[ca.SX]]:
     """Yield the factors up to every joint's frame from the one before."""
-    before = _displaced(displacement("base", joint_types, 1, posture, value, terms))
+    before = _displaced("base", 1, joint_types, posture, value, terms)
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
         moved = motion(joint_types, i, posture, value, terms)
@@ -171,25 +149,37 @@ def _by_joint(
             theta = theta + moved
         else:
             d = d + moved
-        after = _displaced(displacement("link", joint_types, i, posture, value, terms))
+        after = _displaced("link", i, joint_types, posture, value, terms)
         yield [*before, *link(alpha, a, theta, d, beta), *after]
         before = []
 
 
-def _displaced(by: ca.SX | None) -> list[ca.SX]:
+def _displaced(
+    at: Place,
+    i: int,
+    joint_types: Sequence[str],
+    posture: Posture,
+    value: Callable[[str], Symbol],
+    terms: Sequence[Term],
+) -> list[ca.SX]:
     """Return the factors by which terms displace a frame; none where none does."""
-    if by is None:
-        return []
-    return placed((0,) * 6, ca.vertsplit(by))
+    by = displacement(at, joint_types, i, posture, value, terms)
+    return [] if by is None else placed((0,) * 6, ca.vertsplit(by))
+
+
+def table_symbols(dof: int) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """Return the symbols of a table, row by row (5 dof,), and by name."""
+    table = ca.SX.sym("mdh", dof * len(MDH))
+    names = [f"{column}{i}" for i in range(1, dof + 1) for column in MDH]
+    return table, dict(zip(names, ca.vertsplit(table), strict=True))
 
 
 @lru_cache(maxsize=32)
 def _flange(joint_types: tuple[str, ...]) -> ca.Function:
     """Build the flange's transform from the table, row by row, and joint values: once for all arms of a kind."""
     dof = len(joint_types)
-    table, q = ca.SX.sym("mdh", dof * len(MDH)), ca.SX.sym("q", dof)
-    names = [f"{column}{i}" for i in range(1, dof + 1) for column in MDH]
-    value = dict(zip(names, ca.vertsplit(table), strict=True))
+    table, value = table_symbols(dof)
+    q = ca.SX.sym("q", dof)
     T = product(chain(joint_types, Posture(ca.vertsplit(q)), lambda name: value.get(name, 0.0)))
     return ca.Function("flange", [table, q], [T])
 

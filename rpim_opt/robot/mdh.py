@@ -86,11 +86,6 @@ class Gravity:
             in the robot's base.
         base
             (3, 3) rotation of frame 0 of the table in the base that is meant, a URDF's root link for instance.
-
-        Raises
-        ------
-        InputError
-            For another word, or three zeros.
         """
         if isinstance(mounting, str):
             if mounting not in MOUNTINGS:
@@ -103,15 +98,7 @@ class Gravity:
         return replace(self, direction=tuple(direction.tolist()))
 
     def carrying(self, payload: float, centre: Sequence[float] | None = None) -> Gravity:
-        """Return the same with a payload.
-
-        Parameters
-        ----------
-        payload
-            Its mass [kg].
-        centre
-            (3,) where it is in the flange frame [m]; as before by default.
-        """
+        """Return the same with a payload [kg] at ``centre`` (3,) in the flange frame [m], as before by default."""
         if centre is None:
             centre = self.payload_centre
         return replace(self, payload=payload, payload_centre=tuple(centre))
@@ -130,16 +117,12 @@ def _vector(values: ArrayLike, where: str) -> Vector:
 
 
 def _unit(values: ArrayLike, where: str) -> Vector:
-    """Return three numbers as a unit vector."""
+    """Return three numbers as a unit vector; one that is stays as it is."""
     vector = _vector(values, where)
     length = math.hypot(*vector)
-    if abs(length - 1) < 1e-15:
-        return vector
     if not length > 0:
         raise InputError(where, f"{list(vector)}", "a vector that points somewhere")
-    array: Array = np.array(vector) / length
-    x, y, z = array.tolist()
-    return x, y, z
+    return vector if abs(length - 1) < 1e-15 else _vector(np.array(vector) / length, where)
 
 
 def _mass(value: float, where: str) -> float:
@@ -208,38 +191,30 @@ class Robot(Brief):
         return f"'{shortened(self.name)}', {self.dof} joints"
 
     def __post_init__(self) -> None:
+        def require(right: bool, where: str, found: str, accepted: str) -> None:
+            if not right:
+                raise InputError(where, found, accepted, self.name)
+
         mdh = _frozen(self.mdh)
-        if mdh.ndim != 2 or mdh.shape[1] != 5 or not len(mdh) or not np.isfinite(mdh).all():
-            raise InputError("mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)", self.name)
-        if np.abs(mdh).max() > FARTHEST:
-            raise InputError("mdh", f"{np.abs(mdh).max():g}", f"sizes of at most {FARTHEST:g} m or rad", self.name)
-        object.__setattr__(self, "mdh", mdh)
-        object.__setattr__(self, "joint_types", self._types())
-        object.__setattr__(self, "joint_map", self._map())
-        object.__setattr__(self, "limits", self._limits())
-        if len(self.gravity.masses) not in (0, self.dof):
-            raise InputError("gravity", f"{len(self.gravity.masses)} masses", f"{self.dof}, one a joint", self.name)
-
-    def _types(self) -> tuple[str, ...]:
-        types = tuple(self.joint_types) or ("revolute",) * self.dof
-        if len(types) != self.dof or not set(types) <= {"revolute", "prismatic"}:
-            raise InputError("joint_types", repr(types), f"{self.dof} times revolute or prismatic", self.name)
-        return types
-
-    def _map(self) -> Array:
-        n = self.dof
+        right = mdh.ndim == 2 and mdh.shape[1] == 5 and len(mdh) > 0 and bool(np.isfinite(mdh).all())
+        require(right, "mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)")
+        n = len(mdh)
+        largest = np.abs(mdh).max()
+        require(largest <= FARTHEST, "mdh", f"{largest:g}", f"sizes of at most {FARTHEST:g} m or rad")
+        types = tuple(self.joint_types) or ("revolute",) * n
+        right = len(types) == n and set(types) <= {"revolute", "prismatic"}
+        require(right, "joint_types", repr(types), f"{n} times revolute or prismatic")
         joint_map = _frozen(self.joint_map if np.size(self.joint_map) else np.eye(n))
-        sane = joint_map.shape == (n, n) and (np.abs(joint_map) <= LARGEST).all()
-        if not sane or not abs(np.linalg.det(joint_map)) > 1e-9:
-            raise InputError("joint_map", f"{joint_map.tolist()}", f"an invertible {n} x {n} matrix", self.name)
-        return joint_map
-
-    def _limits(self) -> Array:
-        unlimited = np.tile([-np.inf, np.inf], (self.dof, 1))
-        limits = _frozen(self.limits if np.size(self.limits) else unlimited)
-        if limits.shape != (self.dof, 2) or not (limits[:, 0] < limits[:, 1]).all():
-            raise InputError("limits", f"{limits.tolist()}", f"{self.dof} pairs lower < upper", self.name)
-        return limits
+        right = joint_map.shape == (n, n) and bool((np.abs(joint_map) <= LARGEST).all())
+        right = right and bool(abs(np.linalg.det(joint_map)) > 1e-9)
+        require(right, "joint_map", f"{joint_map.tolist()}", f"an invertible {n} x {n} matrix")
+        limits = _frozen(self.limits if np.size(self.limits) else np.tile([-np.inf, np.inf], (n, 1)))
+        right = limits.shape == (n, 2) and bool((limits[:, 0] < limits[:, 1]).all())
+        require(right, "limits", f"{limits.tolist()}", f"{n} pairs lower < upper")
+        masses = len(self.gravity.masses)
+        require(masses in (0, n), "gravity", f"{masses} masses", f"{n}, one a joint")
+        for name, value in (("mdh", mdh), ("joint_types", types), ("joint_map", joint_map), ("limits", limits)):
+            object.__setattr__(self, name, value)
 
     @property
     def dof(self) -> int:

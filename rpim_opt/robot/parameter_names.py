@@ -46,10 +46,7 @@ def is_joint_offset(name: str) -> bool:
 
 @lru_cache(KNOWN)
 def group_of(name: str, dimension: str) -> str:
-    """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension.
-
-    What a measurement adds of its own (an anchor, a plane) is placed like the instrument: ``base``.
-    """
+    """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension."""
     for frame in ("tool", "session"):
         if own_name(name).startswith(f"{frame}_"):
             return frame
@@ -59,12 +56,7 @@ def group_of(name: str, dimension: str) -> str:
 
 
 def session_prefix(session: str) -> str:
-    """Return the prefix of a session's parameters: ``session_day_1_`` for "day 1"; letters, digits and _ alone.
-
-    >>> from rpim_opt.robot.parameter_names import session_prefix
-    >>> session_prefix("day 1"), session_prefix("2026-05-04")
-    ('session_day_1_', 'session_2026_05_04_')
-    """
+    """Return the prefix of a session's parameters: ``session_day_1_`` for "day 1"; letters, digits and _ alone."""
     return f"session_{re.sub(r'[^0-9A-Za-z]+', '_', session)}_"
 
 

@@ -16,7 +16,7 @@ from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import SMALLEST, display, fits, quantities, split_unit
 from rpim_opt.robot.extensions import bend_names
 from rpim_opt.robot.kinematics import FRAME_DIMENSION, numeric_frame, roll_pitch_yaw
-from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot
+from rpim_opt.robot.mdh import MDH_DIMENSION, Robot
 from rpim_opt.robot.parameter_names import (
     EXPANSION,
     JOINT_OFFSET,
@@ -157,13 +157,7 @@ class Parameters(Tabled):
         return self.take(np.flatnonzero(self.identified))
 
     def of_robot(self, robot: str) -> Parameters:
-        """Return what one of several robots has of the table, called as the robot itself calls it.
-
-        Parameters
-        ----------
-        robot
-            Its name; ``""`` for the only one.
-        """
+        """Return what one of several robots (``""``: the only one) has of the table, by the robot's own names."""
         if not robot:
             return self
         found = self.take(self.places_of(robot))
@@ -171,27 +165,13 @@ class Parameters(Tabled):
         return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
 
     def called(self, robot: str, own: str) -> str:
-        """Return what the table calls a parameter of one of several robots: ``left.a2``, or ``a2`` if shared.
-
-        Parameters
-        ----------
-        robot
-            Its name; ``""`` for the only one.
-        own
-            The robot's own name of the parameter.
-        """
+        """Return what the table calls one of several robots' own parameter: ``left.a2``, or ``a2`` if shared."""
         if own in self.names or not robot:
             return own
         return f"{robot}.{own}"
 
     def places_of(self, robot: str) -> np.ndarray:
-        """Return where the parameters of one of several robots stand (k,), those that it shares among them.
-
-        Parameters
-        ----------
-        robot
-            Its name; ``""`` for the only one.
-        """
+        """Return where the parameters of one of several robots stand (k,), those that it shares among them."""
         if not robot:
             return np.arange(len(self))
         shared_or_own = ("", robot)
@@ -217,25 +197,14 @@ class Parameters(Tabled):
 
     @cached_property
     def periodic(self) -> np.ndarray:
-        """(P,) which parameters are rotations: after a full turn they describe the same robot at the same place.
-
-        Those are alpha, theta and beta of the joints, and roll, pitch and yaw of frames. Ratios, compliances and
-        eccentricities are none, and of a measurement's own parameters only those of its frames.
-        """
+        """(P,) which parameters are rotations: alpha, theta and beta of joints, roll, pitch and yaw of frames."""
         frames = "|".join(map(re.escape, ("base_", *self.own_frames)))
         turning = re.compile(rf"(alpha|theta|beta)\d+|({frames}|tool_(.*_)?)r[xyz]")
         return np.array([bool(turning.fullmatch(own_name(name))) for name in self.names])
 
     def wrapped(self, x: Array) -> Array:
-        """Return the deviations of the same robot with every rotation in (-pi, pi]; others stay as they are.
+        """Return the deviations x (n,) [SI] of the same robot with every rotation in (-pi, pi].
 
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI], one for every entry of the table: of a calibration's unknowns it is ``free``.
-
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> free = ro.load("position").problem.parameters.identify(["a2", "theta2"]).free
@@ -344,22 +313,10 @@ def overlay(
     signed: bool = False,
     file: object = None,
 ) -> Array:
-    """Return values (P,) [SI] with those of a table in their places; what names fewer parameters goes before.
+    """Return values (P,) [SI] with those of a table (keys as in `Parameters.scaled`) in their places.
 
-    Parameters
-    ----------
-    parameters
-        The table's keys speak of: names, patterns, groups, ``joint_offset`` for every theta.
-    values
-        (P,) [SI] where the table has none.
-    table
-        Values by name, pattern or group, with units.
-    where
-        The table's name in an error.
-    signed
-        Whether zero and negative values are accepted.
-    file
-        What an error names besides.
+    What names fewer parameters goes before. ``where`` and ``file`` are named in errors; ``signed``: whether zero and
+    negative values are accepted.
     """
     members = _members(parameters, table)
     dimensions = np.array(parameters.dimensions)
@@ -441,56 +398,41 @@ def model_parameters(
     >>> parameters.identify(["d1", "tool_A_z"]).free.nominal
     array([0.099927, 0.06    ])
     """
-    entries = list(_of_joints(robot))
-    entries += _of_frame("base_", base)
-    if not tools:
-        tools = {"": (0.0,) * 6}
-    for marker, tool in tools.items():
+    entries = [*_of_joints(robot), *_of_frame("base_", base)]
+    for marker, tool in (tools or {"": (0.0,) * 6}).items():
         entries += _of_frame(tool_prefix(marker), tool)
     for prefix in dict.fromkeys(map(session_prefix, sessions)):
         entries += _of_frame(prefix, (0.0,) * 6)
     if temperature is not None:
         entries.append((EXPANSION, "ratio per temperature", 0.0, STEEL))
         entries.append((REFERENCE, "temperature", temperature, 1.0))
-    if own is not None:
-        entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in own.items()]
-    names, dimensions, nominal, scale = zip(*entries, strict=True)
-    parameters = Parameters(
-        names,
-        dimensions,
-        np.array(nominal, dtype=float),
-        np.array(scale),
-        np.full(len(names), np.inf),
-        np.zeros(len(names), dtype=bool),
-        own_frames,
-    )
-    return with_terms(parameters, robot.model, robot.joint_types)
+    entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in (own or {}).items()]
+    none = np.empty(0)
+    empty = Parameters((), (), none, none, none, none.astype(bool), own_frames)
+    return with_terms(_extended(empty, entries), robot.model, robot.joint_types)
 
 
 def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
-    """Return a table with the parameters of a model's terms behind its own, none of them identified yet.
-
-    Raises
-    ------
-    InputError
-        For a name that the table has.
-    """
-    entries = dict(entries_of(model, joint_types))
-    for name in entries:
+    """Return a table with the parameters of a model's terms behind its own, none of them identified yet."""
+    entries = [(name, each.dimension, each.nominal, each.scale) for name, each in entries_of(model, joint_types)]
+    for name, *_ in entries:
         if name in parameters.names:
             raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")
-    if not entries:
-        return parameters
-    count = len(entries)
+    own = tuple(name for name, *_ in entries)
+    return replace(_extended(parameters, entries), terms=(*parameters.terms, *own)) if own else parameters
+
+
+def _extended(parameters: Parameters, entries: Sequence[Entry]) -> Parameters:
+    """Return a table with further entries, none of them identified."""
+    names, dimensions, nominal, scale = zip(*entries, strict=True)
     return replace(
         parameters,
-        names=(*parameters.names, *entries),
-        dimensions=(*parameters.dimensions, *(entry.dimension for entry in entries.values())),
-        nominal=np.append(parameters.nominal, [entry.nominal for entry in entries.values()]),
-        scale=np.append(parameters.scale, [entry.scale for entry in entries.values()]),
-        tolerance=np.append(parameters.tolerance, np.full(count, np.inf)),
-        identified=np.append(parameters.identified, np.zeros(count, dtype=bool)),
-        terms=(*parameters.terms, *entries),
+        names=(*parameters.names, *names),
+        dimensions=(*parameters.dimensions, *dimensions),
+        nominal=np.append(parameters.nominal, nominal),
+        scale=np.append(parameters.scale, scale),
+        tolerance=np.append(parameters.tolerance, np.full(len(names), np.inf)),
+        identified=np.append(parameters.identified, np.zeros(len(names), dtype=bool)),
     )
 
 
@@ -503,12 +445,10 @@ def _usual(name: str, dimension: str) -> float:
 
 
 def _of_joints(robot: Robot) -> Iterator[Entry]:
-    """Yield the table's parameters row by row, then what the joints have besides, zero on the drawing."""
+    """Yield the table's parameters row by row, then what the joints have besides, zero in a nominal robot."""
     for i, row in enumerate(robot.mdh, start=1):
-        for column, value in zip(MDH, row, strict=True):
-            name = f"{column}{i}"
-            dimension = MDH_DIMENSION[column]
-            yield name, dimension, value, _usual(name, dimension)
+        for (column, dimension), value in zip(MDH_DIMENSION.items(), row, strict=True):
+            yield f"{column}{i}", dimension, value, _usual(f"{column}{i}", dimension)
     for i in range(1, robot.dof + 1):
         for term in JOINT_TERMS:
             if i in term.places(robot.joint_types):

@@ -1,8 +1,4 @@
-"""Terms: what moves an arm besides its joint values, as functions of what they see and of named parameters.
-
-`Posture` and `Joint` are what a term sees, `Term` is one of them, `Model` collects a user's own; `JOINT_TERMS` and the
-first moments of links are those of every arm.
-"""
+"""Terms: what moves an arm besides its joint values, as functions of what they see and of named parameters."""
 
 from __future__ import annotations
 
@@ -35,22 +31,22 @@ BEND_SCALE = 1e-4
 
 
 class Weight:
-    """Gravity on an arm of nominal geometry; this one is zero, `gravity.Statics` is an arm's."""
+    """Gravity of which nothing is known but that all it does is this symbol; `extensions.Statics` is an arm's."""
 
-    payload: Symbol = 0.0
-    """Mass at the flange [kg]."""
+    def __init__(self, payload: Symbol = 0.0) -> None:
+        self.payload = payload  # mass at the flange [kg]
 
     def torque(self, i: int) -> Symbol:
         """Return the torque of gravity about joint i [Nm]."""
-        return 0.0
+        return self.payload
 
     def moment(self, i: int, k: int, axis: str) -> Symbol:
-        """Return what a unit of first moment of link k along its x, y or z means to joint i, without unit."""
-        return 0.0
+        """Return z_i . (R_k e_a x g_hat), without unit."""
+        return self.payload
 
     def down(self, k: int) -> Symbol:
         """Return where gravity points in the frame after joint k, a unit vector (3, 1)."""
-        return ca.DM.zeros(3)
+        return ca.vertcat(self.payload, self.payload, self.payload)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +82,7 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What a term sees of joint ``number`` (from 1), and of the link that it moves.
-
-    A term of the base sees the first joint, one of the tool the last.
-
-    Parameters
-    ----------
-    number
-        Of the joint, from 1.
-    posture
-        Of the arm.
+    """What a term sees of joint ``number`` (from 1) and of its link; one of the base the first, of the tool the last.
 
     Examples
     --------
@@ -155,25 +142,11 @@ class Joint:
         return self.posture.approach[self.number - 1]
 
     def moment(self, k: int, axis: str) -> Symbol:
-        """Return z_i . (R_k e_a x g_hat): what link k's first moment along its ``axis`` a means to this joint i.
-
-        Parameters
-        ----------
-        k
-            The link, from 1.
-        axis
-            ``"x"``, ``"y"`` or ``"z"`` of its frame.
-        """
+        """Return z_i . (R_k e_a x g_hat): what the first moment of link k along ``axis`` means to it."""
         return self._weight.moment(self.number, k, axis)
 
     def column(self, name: str) -> Symbol:
-        """Return a column of the data [SI] by its name; the term has to name it in its ``columns``.
-
-        Raises
-        ------
-        InputError
-            For a column that the term does not name.
-        """
+        """Return a column of the data [SI] by its name; the term has to name it in its ``columns``."""
         if name not in self.posture.columns:
             raise InputError("term", f"column '{name}'", f"columns={{'{name}': ...}} of the term, with its dimension")
         return self.posture.columns[name]
@@ -183,7 +156,7 @@ class Joint:
 
 
 class Entry(NamedTuple):
-    """A parameter of a term: its name without a joint's number, its dimension, its scale and nominal value [SI]."""
+    """A parameter of a term; nominal value and scale in SI."""
 
     stem: str
     dimension: str
@@ -255,7 +228,14 @@ class Term:
             raise InputError("term, at", repr(self.at), ", ".join(map(repr, SIZES)))
         require_columns(self.columns, "term")
         for entry in self.entries:
-            _require_name(entry, self.at)
+            where = f"term, scales, parameter '{entry.stem}'"
+            if not _STEM.fullmatch(entry.stem) or _FRAME.fullmatch(entry.stem):
+                accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
+                raise InputError(where, "a name that is another's", accepted)
+            if self.at in ENDS and "{}" in entry.stem:
+                raise InputError(where, "a place for a number", f"none: the {self.at} has one parameter")
+            if not entry.scale >= SMALLEST:
+                raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
         if len({entry.stem for entry in self.entries}) < len(self.entries):
             raise InputError("term, scales", "one name in two units", "one of them")
 
@@ -276,9 +256,10 @@ class Term:
 
     def names(self, i: int) -> tuple[str, ...]:
         """Return the names of joint or link i's parameters; of the base's and the tool's, which have no number."""
+        stems = (entry.stem for entry in self.entries)
         if self.at in ENDS:
-            return tuple(entry.stem for entry in self.entries)
-        return tuple(_numbered(entry.stem, i) for entry in self.entries)
+            return tuple(stems)
+        return tuple(stem.format(i) if "{}" in stem else f"{stem}{i}" for stem in stems)
 
     def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
         """Return the numbers of the joints or links that have it; the first for the base, the last for the tool."""
@@ -309,35 +290,11 @@ def _quantity(key: str, value: float, where: str) -> tuple[str, str, float]:
     return stem, unit.dimension, number(value, place) * unit.si
 
 
-def _require_name(entry: Entry, at: Place) -> None:
-    """Refuse a parameter's name that would be read as another's, and a scale that is none."""
-    where = f"term, scales, parameter '{entry.stem}'"
-    if not _STEM.fullmatch(entry.stem) or _FRAME.fullmatch(entry.stem):
-        accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx, which are frames'"
-        raise InputError(where, "a name that is another's", accepted)
-    if at in ENDS and "{}" in entry.stem:
-        raise InputError(where, "a place for a number", f"none: the {at} has one parameter")
-    if not entry.scale >= SMALLEST:
-        raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
-
-
-def _numbered(stem: str, i: int) -> str:
-    if "{}" in stem:
-        return stem.format(i)
-    return f"{stem}{i}"
-
-
 def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
-    """Return by how much a term moves, (1, 1) or (6, 1); None where its parameters are all zero.
-
-    Raises
-    ------
-    InputError
-        For a function that returns something else.
-    """
+    """Return by how much a term moves, (1, 1) or (6, 1); None where its parameters are all zero."""
     sizes = [value(name) for name in term.names(joint.number)]
     # an effect may take a whole chain to write down: not for a parameter that is not there
-    if sizes and all(map(is_zero, sizes)):
+    if sizes and all(ca.SX(size).is_zero() for size in sizes):
         return None
     moves = term.moves(joint, *sizes)
     if isinstance(moves, list | tuple):
@@ -347,13 +304,6 @@ def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | N
         accepted = f"{SIZES[term.at]}, as a term of a {term.at} returns"
         raise InputError(f"term '{term.name}'", f"{moves.numel()} numbers", accepted)
     return ca.vec(moves)
-
-
-def is_zero(value: Symbol) -> bool:
-    """Return whether a value is zero whatever the symbols in it."""
-    if isinstance(value, ca.SX):
-        return bool(value.is_zero())
-    return value == 0
 
 
 class Curve(NamedTuple):
@@ -517,7 +467,7 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
     dof = len(joint_types)
     with SYMBOLS:
         q, torque, approach = (ca.SX.sym(name, dof) for name in ("q", "torque", "approach"))
-        gravity = _Symbolic(ca.SX.sym("gravity"))
+        gravity = Weight(ca.SX.sym("gravity"))
         columns = {name: ca.SX.sym(name) for name in model.columns}
         moves = ca.SX(0, 1)
         for term in model.terms:
@@ -539,22 +489,6 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
         )
 
 
-class _Symbolic(Weight):
-    """Gravity of which nothing is known but whether a term depends on it."""
-
-    def __init__(self, gravity: ca.SX) -> None:
-        self.payload = gravity
-
-    def torque(self, i: int) -> Symbol:
-        return self.payload
-
-    def moment(self, i: int, k: int, axis: str) -> Symbol:
-        return self.payload
-
-    def down(self, k: int) -> Symbol:
-        return ca.vertcat(self.payload, self.payload, self.payload)
-
-
 # Terms of every arm
 
 JOINT_TERMS = (
@@ -569,18 +503,15 @@ JOINT_TERMS = (
 """Terms of every joint; all parameters are zero in a nominal robot."""
 
 
-def _bend(k: int, axis: str, joint: Joint, size: Symbol) -> Symbol:
+def _first_moment(k: int, axis: str, joint: Joint, size: Symbol) -> Symbol:
     return size * joint.moment(k, axis)
 
 
 @lru_cache
 def terms_of(dof: int) -> tuple[Term, ...]:
-    """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``bend{i}_{k}{axis}``.
-
-    Joint i has those of the links k that it carries, k >= i; a robot's table leaves out what moves nothing.
-    """
+    """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``bend{i}_{k}{axis}``."""
     bends = [
-        Term(partial(_bend, k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
+        Term(partial(_first_moment, k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
         for k in range(1, dof + 1)
         for axis in "xyz"
     ]
@@ -589,13 +520,7 @@ def terms_of(dof: int) -> tuple[Term, ...]:
 
 @lru_cache(2**14)
 def term_of(name: str, dof: int) -> tuple[Term, int]:
-    """Return the term of a parameter, and the joint (from 1) whose parameter it is.
-
-    Raises
-    ------
-    InputError
-        For a parameter that no term of an arm with so many joints has.
-    """
+    """Return the term of a parameter, and the joint (from 1) whose parameter it is."""
     for i in range(1, dof + 1):
         for term in terms_of(dof):
             if name in term.names(i):
@@ -606,17 +531,12 @@ def term_of(name: str, dof: int) -> tuple[Term, int]:
 def motion(
     joint_types: Sequence[str], i: int, posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> Symbol:
-    """Return the joint value of joint i with all its terms [rad or m].
+    """Return the joint value of joint i with all its terms, q + ratio q + ecc_cos cos q + ... [rad or m].
 
-    ``value("ratio2")`` gives the parameters; ``terms`` are added besides those of every arm::
-
-        q + ratio q + ecc_cos cos q + ecc_sin sin q + compliance torque + ...        revolute
-        q + ratio q                                                                  prismatic
+    ``value("ratio2")`` gives the parameters; ``terms`` are added besides those of every arm.
     """
-    total = posture.q[i - 1]
-    for more in _moves("joint", joint_types, i, posture, value, (*terms_of(len(posture.q)), *terms)):
-        total = total + more
-    return total
+    more = displacement("joint", joint_types, i, posture, value, (*terms_of(len(posture.q)), *terms))
+    return posture.q[i - 1] if more is None else posture.q[i - 1] + more
 
 
 def displacement(
@@ -627,24 +547,8 @@ def displacement(
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
-    """Return the displacement (6, 1) [m, rad] of link i's frame, the robot's or the flange's; None for none at all."""
-    total = None
-    for more in _moves(at, joint_types, i, posture, value, terms):
-        total = more if total is None else total + more
-    return total
-
-
-def _moves(
-    at: Place,
-    joint_types: Sequence[str],
-    i: int,
-    posture: Posture,
-    value: Callable[[str], Symbol],
-    terms: Sequence[Term],
-) -> Iterator[ca.SX]:
-    """Yield what the terms of a place move that are not zero."""
-    for term in terms:
-        if term.at == at and i in term.places(joint_types):
-            more = moved(term, Joint(i, posture), value)
-            if more is not None:
-                yield more
+    """Return the sum of what the terms of a place move, of joint or link i; None where nothing moves it."""
+    own = [term for term in terms if term.at == at and i in term.places(joint_types)]
+    parts = [moved(term, Joint(i, posture), value) for term in own]
+    parts = [part for part in parts if part is not None]
+    return sum(parts[1:], parts[0]) if parts else None

@@ -40,10 +40,7 @@ def camera_blocks(data: Dataset) -> list[Block]:
 
 
 def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
-    """Return the directions x = X / Z, y = Y / Z (N, 2) of pixels (N, 2), without distortion.
-
-    ``uv``: pixels; ``camera``: ``fx, fy, cx, cy``, and distortion where it is known.
-    """
+    """Return the directions x = X / Z, y = Y / Z (N, 2) of pixels (N, 2), without distortion."""
     k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
     xy = seen
@@ -200,15 +197,7 @@ def targets(block: Block) -> Array:
 
 
 def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
-    """Return focal lengths and centre [px] from the homographies of three views or more of a plane (Zhang 2000).
-
-    ``data``, ``block``: what a camera has seen.
-
-    Raises
-    ------
-    InputError
-        For fewer views, boards that are not flat, and views all from one side, which tell no focal length.
-    """
+    """Return focal lengths and centre [px] from the homographies of three views or more of a plane (Zhang 2000)."""
     rows = []
     points = targets(block)
     middle, axes, planar = _plane(points)
@@ -250,15 +239,7 @@ def camera_of(block: Block, own: Mapping[str, float]) -> dict[str, float]:
 
 
 def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
-    """Return the data with a pose for every view of a camera; other measurements as they are.
-
-    ``data``: the measurements; ``own``: values of the cameras' own parameters by name.
-
-    Raises
-    ------
-    InputError
-        For a camera without focal length, and views none of which shows a pose.
-    """
+    """Return the data with a pose for every view of a camera; other measurements as they are."""
     if not camera_blocks(data):
         return data
     blocks: list[Block] = []

@@ -63,17 +63,7 @@ class Located(NamedTuple):
 
 
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
-    """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
-
-    All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where the
-    rotations are not determined by that, closed forms say what they can: poses by `hand_eye`; of positions, distances
-    correct the reflectors and registration places the base.
-
-    Raises
-    ------
-    InputError
-        When there are no positions and no poses, or they do not determine the base.
-    """
+    """Return the base and the reflectors by marker, from positions and poses on the nominal robot."""
     seen = _positions(data, ENOUGH)
     if not seen:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
@@ -127,10 +117,7 @@ def _turn(tools: dict[str, Array], base: Array, seen: Sequence[Block], flanges: 
 
 
 def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located | None:
-    """Return base and reflectors in closed form, from positions alone; None where the nominal robot does not fit them.
-
-    A sum of squares, as that of `locate`: what is off by metres does not fit, and is looked at there.
-    """
+    """Return base and reflectors in closed form, from positions alone; None where they do not fit."""
     seen = _positions(data, FEW // max(len(data.blocks), 1) + 3)
     if not seen:
         return None
@@ -176,10 +163,7 @@ def _started(
 def _seen_from(
     base: Array, seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
 ) -> dict[str, Array]:
-    """Return the reflectors (6,) by marker where their positions are least off, seen from a base (4, 4) that is known.
-
-    They are expected where they are stated, up to `TOOL_ERROR`.
-    """
+    """Return the reflectors (6,) by marker where their positions are least off, seen from a known base (4, 4)."""
     certain = dict.fromkeys(places, TOOL_ERROR**-2)
     total = {marker: place[:3] * TOOL_ERROR**-2 for marker, place in places.items()}
     for block, flange in zip(seen, flanges, strict=True):
@@ -254,16 +238,7 @@ Places = Mapping[str, Array]
 
 
 def met(problem: CalibrationProblem) -> dict[str, Array]:
-    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them.
-
-    The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
-    that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
-
-    Raises
-    ------
-    InputError
-        For a point that robots are said to have touched alike, and that is elsewhere for one of them.
-    """
+    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them."""
     known: dict[str, Array] = {}
     found = {}
     for robot, places in _touched(problem):
@@ -498,14 +473,7 @@ def _own_values(
 
 
 def relocated(problem: Source) -> Source | None:
-    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that.
-
-    Compared is what `locate` finds on the nominal robot with identified frames. A frame that is more than three
-    scales away, and more than the robot's own errors explain, was not known: its deviations then count from where
-    it was found. None when every frame is near enough, or the data do not tell. Where a registration in closed form
-    fits, and puts every frame within half of that, nothing else is asked: the certified start takes longer than all
-    the rest of a calibration.
-    """
+    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that."""
     if len(problem.arms) > 1:
         return _each_relocated(problem)
     p = problem.parameters
@@ -611,11 +579,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
 
 def settled(alone: Source) -> Array:
-    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated.
-
-    Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number; SciPy's, which takes residuals,
-    would load 0.2 s of library for every calibration.
-    """
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated."""
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
     z = np.zeros(len(scale))

@@ -62,11 +62,7 @@ RARE_BASIN = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another mapping that fits as well: signs and zeros (dof,), and how far it is from the first one.
-
-    ``apart`` [m] is the RMS distance of their predictions at unseen configurations, ``told_by`` (dof,) the joint values
-    of the controller [rad or m] among these at which they are farthest apart.
-    """
+    """Another mapping that fits as well: signs and zeros (dof,), and how far it is from the first one."""
 
     sign: Array
     zero: Array
@@ -173,12 +169,7 @@ def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
 
 
 def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | None:
-    """Return signs and zeros of the joints where the nominal robot does not explain the data, and the mapped problem.
-
-    Sought where the base and all reflectors' positions are identified, and the nominal robot leaves more than
-    `UNEXPLAINED` of the extent of positions or poses (weights of gross errors fall as 1 / error). None where nominal
-    signs and small zeros explain them, no mapping does, or a left-handed measured frame is as good an explanation.
-    """
+    """Return signs and zeros of the joints where the nominal robot fails, and the mapped problem."""
     if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1 or not _placed(problem):
         return None
     points = points_of(problem)

@@ -23,17 +23,7 @@ SINGULAR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Turns:
-    """Orientations of measurements B_i = Z A_i X, up to their errors: A_i'A_j and B_i'B_j turn by the same angle.
-
-    Parameters
-    ----------
-    first, second
-        (N, 3, 3) A_i and B_i.
-    sigma
-        (N,) standard deviations of B_i [rad].
-    group
-        (N,) numbers of what has the same Z and X; negative where the orientation was not measured.
-    """
+    """Orientations of measurements B_i = Z A_i X, up to their errors: A_i'A_j and B_i'B_j turn by the same angle."""
 
     first: Array
     second: Array
@@ -43,23 +33,7 @@ class Turns:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Residuals J_i v of measurements, v = (translations, scale, 1, vec R_1, ..., vec R_k), rotations' rows first.
-
-    Parameters
-    ----------
-    rows
-        (N, m, n) J_i, each residual in units of its standard deviation.
-    prior
-        (p, n) residuals of what is expected of translations.
-    linear
-        How many of the n are translations and the scale: they are eliminated exactly.
-    freedom
-        (N,) degrees of freedom of a measurement: 3 for a position, 6 for a pose.
-    shared
-        How many of the rotations, the first ones, others have products with; the others have none among themselves.
-    turns
-        What does not depend on the unknowns.
-    """
+    """Residuals J_i v of measurements, v = (translations, scale, 1, vec R_1, ..., vec R_k), rotations' rows first."""
 
     rows: Array
     prior: Array
@@ -101,25 +75,7 @@ class Loops:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What closes the loops ``measured = base flange tool``.
-
-    Parameters
-    ----------
-    flange
-        (N, 4, 4) in the robot's base.
-    measured
-        (N, 4, 4) in an instrument's frame.
-    turned
-        (N,) whether the orientation was measured, too.
-    instrument, marker
-        (N,) numbers of what saw and what was seen, from 0.
-    sigma
-        (N, 2) standard deviations of a position [m] and an orientation [rad].
-    expected
-        (M, 3) where the markers are expected in the flange frame [m].
-    spread
-        Standard deviation of that [m]; may be infinite.
-    """
+    """What closes the loops ``measured = base flange tool``."""
 
     flange: Array
     measured: Array
@@ -132,17 +88,7 @@ class Seen:
 
 
 def of_poses(seen: Seen, scaled: bool) -> Loops:
-    """Return the loops of bases Z and tools X, several of either.
-
-    ::
-
-        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
-        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
-
-    of the flange A and the measured B with its position y. For an unknown scale s of the instrument's lengths, both
-    sides are in its unit: A_t / s, t / s and u / s. The norm of the second is the angle between the two, up to third
-    order. Rotations are those of the bases Z_R, then X_R' of the tools that were measured to turn.
-    """
+    """Return the loops of bases Z and tools X, several of either."""
     N = len(seen.flange)
     bases = int(seen.instrument.max()) + 1
     tools = len(seen.expected)
@@ -180,15 +126,7 @@ def of_poses(seen: Seen, scaled: bool) -> Loops:
 
 
 def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float, scaled: bool) -> Loops:
-    """Return the loops A X = X B of motions (N, 4, 4), with X_R the only rotation.
-
-    ::
-
-        (X_R B_t - A_R t + t - A_t) / sigma_position,    t = X_t
-        (A_R X_R - X_R B_R) / (sqrt(2) sigma_orientation)
-
-    For an unknown scale s of the lengths in B: A_t / s and t / s.
-    """
+    """Return the loops A X = X B of motions (N, 4, 4), with X_R the only rotation."""
     N = len(A)
     linear = 3 + scaled
     J = np.zeros((N, 12, linear + 10))
@@ -233,14 +171,7 @@ SURPRISE = 1e-4
 
 
 def compatible(turns: Turns, beyond: Array) -> np.ndarray:
-    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames.
-
-    ::
-
-        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
-
-    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
-    """
+    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames."""
     N = len(beyond)
     if N > MOST_PAIRED:
         return np.ones((N, N), dtype=bool)
@@ -266,11 +197,7 @@ def _sizes(matrices: Array) -> Array:
 
 
 def core(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
-
-    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
-    ICRA, find outliers so).
-    """
+    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with."""
     left = np.ones(len(pairs), dtype=bool)
     while True:
         kept = left & (np.sum(pairs[:, left], axis=1) >= count)
@@ -285,10 +212,7 @@ def likeliest(pairs: np.ndarray) -> np.ndarray:
 
 
 def likely(pairs: np.ndarray, among: np.ndarray) -> list[np.ndarray]:
-    """Return smaller sets (N,) to begin with, the larger first: what is likeliest of those that one of some goes with.
-
-    And, where some are few, all but one of them: turning alike, it may be wrong all the same.
-    """
+    """Return smaller sets (N,) to begin with, the larger first: of those that one of some goes with, the likeliest."""
     sets = []
     members = np.flatnonzero(among)
     for each in members[:: 1 + len(members) // ASKED]:
@@ -313,12 +237,7 @@ def _largest(pairs: np.ndarray) -> int:
 
 
 def alone(loops: Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
-    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
-
-    They cannot if fewer are left over than would have to, or if no other is in a core of that size; nor if every set
-    of that size with another in it has a sum of squares, by its relaxation's bound, above what agreeing allows. One
-    whose square (N,) a good one may have, in ten thousand, is no other.
-    """
+    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else."""
     N = len(agreeing)
     count = int(np.sum(agreeing))
     if count >= N // 2 + 2:
@@ -378,25 +297,7 @@ SETTLED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Where a loss of closed loops is least.
-
-    Parameters
-    ----------
-    v
-        (n,) translations, scale, 1 and rotations, as `Loops` has them.
-    smallest
-        Of the last weighted problem.
-    weights
-        (N,) that the loss gives the measurements; one for a square.
-    squares
-        (N,) squared residuals.
-    cost
-        The loss, summed, and what is expected of translations.
-    settled
-        Whether the weights are those of the residuals.
-    alone
-        Whether no other measurements than those of full weight can be as many that agree.
-    """
+    """Where a loss of closed loops is least."""
 
     v: Array
     smallest: Smallest
@@ -411,21 +312,7 @@ Weigh = Callable[[Array], Array]
 
 
 def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
-    """Return the least of a loss of |J_i v|, which is global where it is the sum of squares and the bound meets it.
-
-    ::
-
-        squares    r^2                                    r = |J_i v|
-        huber      r^2,  2 c r - c^2 beyond c             c^2 a quantile of chi-squared
-        truncated  min(r^2, c^2)
-
-    From the relaxation's optimum of the squares Huber's loss follows repeated weights c / r, and the truncated loss
-    graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127), by Newton's steps; the last weighted problem is the
-    relaxation's again. The truncated loss begins with the largest core of measurements that turn alike, and if not all
-    of that agree, with all of them; it is followed from the candidates, too, so that none of them is better.
-
-    ``loops``: the residuals; ``loss``: one of `LOSSES`; ``candidates``: rotations (k, 3, 3) to start from, too.
-    """
+    """Return the least of a loss of |J_i v|, which is global where it is the sum of squares and the bound meets it."""
     if loss == "squares":
         return _weighted(loops, np.ones(len(loops.rows)), loss, candidates)
     beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
@@ -438,10 +325,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
 
 
 def _truncated(loops: Loops, beyond: Array, candidates: Sequence[Array]) -> Solved:
-    """Return the least of the truncated loss that is found from the likeliest measurements, from all and candidates.
-
-    Where too few of the likeliest agree with that, parts of them are begun with, too.
-    """
+    """Return the least of the truncated loss that is found from the likeliest measurements, from all and candidates."""
     pairs = compatible(loops.turns, beyond)
     first = likeliest(pairs)
     found = [_graduated(loops, first, beyond), *(_from(loops, rotations, beyond) for rotations in candidates)]
@@ -515,11 +399,7 @@ def _repeated(loops: Loops, solved: Solved, loss: str, weigh: Weigh) -> Solved:
 
 
 def _graduated(loops: Loops, among: np.ndarray, beyond: Array) -> Solved:
-    """Return a least of the truncated loss: losses of some measurements (N,) from squares to it, each from the last.
-
-    The loss of parameter mu has weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them
-    sqrt(mu (mu + 1) c^2 / r^2) - mu.
-    """
+    """Return a least of the truncated loss: losses of some measurements (N,) from squares to it, each from the last."""
     solved = _weighted(loops, among.astype(float), "truncated")
     ratio = float(np.max(among * solved.squares / beyond))
     mu = 1 / max(2 * ratio - 1, 1e-3)

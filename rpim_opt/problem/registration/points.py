@@ -40,12 +40,7 @@ SHORT = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """N measured points of a robot.
-
-    Joint values of the controller q (N, dof) [rad or m], positions y (N, 3) [m], numbers of the M reflectors
-    ``marker`` (N,), ``tools`` (M, 3) where these are stated in the flange frame [m], orientations ``turns`` (N, 3, 3)
-    or None, rows of the dataset (N,), whether they are poses of a camera's views, and the reflectors' names.
-    """
+    """N measured points of a robot."""
 
     q: Array
     y: Array
@@ -141,11 +136,7 @@ def mirrored(points: Points) -> Points:
 
 
 class Fit(NamedTuple):
-    """Where base, reflectors and joint zeros fit positions best: of B sets of N points, M reflectors.
-
-    Modelled points (B, N, 3) and their errors (B, N) [m], weighted costs (B,) [m^2], bases (B, 4, 4) in the
-    instrument's frame, reflectors (B, M, 3) in the flange frame, and joint zeros (B, dof) [rad or m].
-    """
+    """Where base, reflectors and joint zeros fit positions best: of B sets of N points, M reflectors."""
 
     modelled: Array
     error: Array
@@ -160,11 +151,7 @@ class Fit(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """B sets of N points to be fitted at once.
-
-    Joint values of the model q (B, N, dof), positions y (B, N, 3) [m], reflectors ``marker`` (B, N), start values of
-    joint zeros (B, dof) and reflectors (B, M, 3), their stated places (M, 3) and standard deviations (M,) [m].
-    """
+    """B sets of N points to be fitted at once."""
 
     q: Array
     y: Array

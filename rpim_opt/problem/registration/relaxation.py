@@ -31,11 +31,7 @@ CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))
 
 @lru_cache
 def rotation_constraints(count: int) -> Array:
-    """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic.
-
-    Of every rotation the twenty independent ones: R R' = 1 and R'R = 1, of which one diagonal entry follows from the
-    others, and each row the cross product of the next two, which says that R is right-handed.
-    """
+    """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic."""
     rows = [_quadratic(count, terms) for k in range(count) for terms in _of_rotation(1 + 9 * k)]
     return np.array(rows)
 
@@ -82,25 +78,7 @@ class Moments:
 
 
 def relax(Q: Array, shared: int | None = None, tolerance: float = TOLERANCE) -> Moments:
-    """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns.
-
-    ::
-
-        maximize    bound
-        subject to  Q - bound e e' - sum_j multipliers_j C_j  positive semidefinite,    e = (1, 0, ..., 0)
-
-    For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
-    constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
-    M_00 = 1 and <C_j, M> = 0.
-
-    Where Q has no products of some rotations (tools seen by the same cameras), the left side is the sum of positive
-    semidefinite blocks, one for each of those rotations with 1 and all that they share: its pattern is chordal (Agler
-    et al. 1988, Linear Algebra and its Applications 107:101). Time then grows with their number, not with its power.
-
-    ``Q``: (n, n) symmetric, n = 1 + 9 k for k rotations. ``shared``: the first so many rotations are those that the
-    others have products with, and they have none among themselves; all by default. ``tolerance``: of gap and
-    feasibility.
-    """
+    """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns."""
     clarabel = import_module("clarabel")
 
     count = (len(Q) - 1) // 9
@@ -127,10 +105,7 @@ def _blocks(count: int, shared: int) -> list[np.ndarray]:
 
 @lru_cache
 def _cone(count: int, shared: int) -> tuple[Any, Array]:
-    """Return A and q of Clarabel's form, minimize q'v subject to b - A v in the cone; b has the blocks of Q.
-
-    Unknowns v are the bound, the multipliers, and what each block but the last takes of the corner that all share.
-    """
+    """Return A and q of Clarabel's form, minimize q'v subject to b - A v in the cone; b has the blocks of Q."""
     blocks = _blocks(count, shared)
     common = 1 + 9 * shared
     corner = np.eye(common)[:, None, :, None] * np.eye(common)[None, :, None, :]
@@ -195,13 +170,7 @@ def _settings(tolerance: float) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Smallest:
-    """The rotations (k, 3, 3) that minimize |L x|^2 over x = (1, vec R_1, ..., vec R_k), and what is known of that.
-
-    Beside them ``value`` |L x|^2; ``bound``, below which no rotations are, up to rounding; ``rank_ratio`` of the moment
-    matrix; ``information`` (3k, 3k), half the second derivative of the value by rotation vectors [1/rad^2]; and
-    ``steepness`` c >= 0: every x has a value of at least bound + c |x_other|^2, x_other being what of x is not along
-    the best.
-    """
+    """The rotations (k, 3, 3) that minimize |L x|^2 over x = (1, vec R_1, ..., vec R_k), and what is known of that."""
 
     rotations: Array
     value: float
@@ -211,12 +180,7 @@ class Smallest:
     steepness: float
 
     def radius(self, excess: float) -> float:
-        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
-
-        Both x have the length n = 1 + 3 k, squared, so that c = x'x_best / n has 1 - c^2 = |x_other|^2 / n, and
-        |x - x_best|^2 = 2 n (1 - c), of which one rotation has 8 sin^2(angle / 2). A trace of -1 or more keeps c above
-        (1 - k) / n.
-        """
+        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this."""
         if self.steepness <= 0:
             return float(np.pi)
         k = len(self.rotations)
@@ -235,16 +199,7 @@ def nearest(L: Array, rotations: Array) -> Smallest:
 
 
 def smallest(L: Array, candidates: Iterable[Array] = (), shared: int | None = None) -> Smallest:
-    """Return the best of what the relaxation and candidates (k, 3, 3) lead to, with the relaxation's bound.
-
-    ::
-
-        Q - f e e' - sum_j multipliers_j C_j  >=  mu 1,    mu <= 0
-        x'Q x  >=  f + mu |x|^2  =  f + mu (1 + 3 k)    for every x = (1, vec R_1, ..., vec R_k)
-
-    The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
-    their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
-    """
+    """Return the best of what the relaxation and candidates (k, 3, 3) lead to, with the relaxation's bound."""
     Q = L.T @ L
     moments = relax(Q, shared)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ

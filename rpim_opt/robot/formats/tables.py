@@ -108,19 +108,7 @@ def gravity_with(
     file: object,
     base: Array | None = None,
 ) -> Gravity:
-    """Return a robot's gravity with the mounting and the payload that a file states.
-
-    Parameters
-    ----------
-    gravity
-        What holds where the file states nothing.
-    mounting, payload
-        Of the file.
-    file
-        What an error names.
-    base
-        (3, 3) rotation of frame 0 of the table in the base that the mounting speaks of.
-    """
+    """Return a robot's gravity with the mounting and the payload that a file states."""
     try:
         if mounting is not None:
             gravity = gravity.mounted(mounting, base)

@@ -334,10 +334,7 @@ class _Joint:
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
     def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
-        """Return what to replace in the file so that the origin becomes T, by first and last byte.
-
-        ``size`` is the arm's `reach` [m].
-        """
+        """Return what to replace in the file so that the origin becomes T, by first and last byte."""
         texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin, size), strict=True)
         new = {name: text for name, text in texts if text is not None}
         if not new:
@@ -512,15 +509,7 @@ def _root_element(data: bytes, path: Path) -> _Element:
 
 
 def _urdf_text(path: Path) -> bytes:
-    """Return the content of a URDF file, or what a xacro file says with its own defaults.
-
-    Expressions are carried out and other files included: problem folders, which may be somebody else's, name no xacro.
-
-    Raises
-    ------
-    InputError
-        Where the package xacro is missing, or the file does not say all by itself.
-    """
+    """Return the content of a URDF file, or what a xacro file says with its own defaults."""
     content = read_bytes(path)
     if path.suffix.lower() != XACRO:
         return content
@@ -542,16 +531,7 @@ def _urdf_text(path: Path) -> bytes:
 
 
 def _carried_masses(urdf: _Urdf, steps: Sequence[_Step]) -> tuple[tuple[float, ...], tuple[Array, ...]]:
-    """Return the mass [kg] that each moving joint of a chain carries up to the next, and its centre [m].
-
-    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
-    cannot be read beside the chain is left out, as it is elsewhere.
-
-    Returns
-    -------
-    n masses, and n centres (3,) in the frames of the file's joints; none of both where nothing that moves has a mass,
-    or the base itself is moved.
-    """
+    """Return the mass [kg] that each moving joint of a chain carries up to the next, and its centre [m]."""
     if any(step.up and step.joint.kind for step in steps):
         return (), ()
     frames = _frames(steps)
