@@ -332,7 +332,8 @@ def validate(
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
-        from rpim_opt.use.validation import read_measurements, validate
+        from rpim_opt.use.reading import read_measurements
+        from rpim_opt.use.validation import validate
 
         rows, left_out = read_measurements(loaded, data, measurement, units)
         found = validate(loaded, rows)
@@ -368,7 +369,7 @@ def accept(
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.calibration.acceptance import accept
-        from rpim_opt.use.validation import read_measurements
+        from rpim_opt.use.reading import read_measurements
 
         rows = None
         left_out: tuple[str, ...] = ()
@@ -426,8 +427,8 @@ def update(
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import sha256_of
+        from rpim_opt.use.reading import read_measurements
         from rpim_opt.use.recalibration import update
-        from rpim_opt.use.validation import read_measurements
 
         rows, left_out = read_measurements(loaded, data, measurement, units)
         patterns = reset.replace(",", " ").split()
@@ -454,7 +455,8 @@ def monitor(
     """
     with _loaded(result) as (loaded, _):
         from rpim_opt.report.page import written_checks
-        from rpim_opt.use.monitoring import monitor, read_checks
+        from rpim_opt.use.monitoring import monitor
+        from rpim_opt.use.reading import read_checks
 
         read = read_checks(loaded, checks, measurement, units)
         found = monitor(loaded, read.data, read.when, read.times)
@@ -549,7 +551,7 @@ def compensate(
         note = _forced(loaded, despite_verdict)
         from rpim_opt.use.compensation import compensate
         from rpim_opt.use.export import noted
-        from rpim_opt.use.validation import read_commands
+        from rpim_opt.use.reading import read_commands
 
         read, left_out = read_commands(loaded, targets, units)
         say("compensating")

@@ -5,32 +5,47 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
+from rpim_opt.calibration.intervals import position_noise, scattered
 from rpim_opt.calibration.ranges import Outside
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
-from rpim_opt.robot.mdh import Robot
-from rpim_opt.use.cell import Cell
-from rpim_opt.use.targets import Targets, checked, read_targets
+from rpim_opt.problem.design import random_candidates
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.row_functions import Loads, bearing, loads_on, require_same_torques
+from rpim_opt.robot.kinematics import FRAME, numeric_frame
+from rpim_opt.robot.mdh import Gravity, Robot
+from rpim_opt.robot.parameter_names import reflectors, tool_prefix
+from rpim_opt.robot.parameters import Parameters
+from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
+from rpim_opt.use.reading import Targets, read_targets
 
 SMALLEST = 1e-12
 """Correction [rad or m] below which nothing is corrected."""
 BLOCK = 8192
 """Rows that are worked on together, so that what they need stays in the processor's cache."""
+REACHED = 1e-7
+"""A target counts as reached when no more than this is left [m, rad]."""
+BANK = 2000
+TRIALS = 12
+"""Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +65,8 @@ class Compensation:
     position_error, orientation_error
         (N,) the same for the corrected command.
     std
-        (N,) root mean square distance by which the model may be wrong there [m], from the calibration's covariance
-        C: sqrt(tr J C J'), with the Jacobian J of the position in the instrument's frame, base included. Infinite
-        where the calibration has no covariance.
+        (N,) standard uncertainty of the position there [m], sqrt(tr J C J' + tr R), with the calibration's covariance
+        C, the Jacobian J of the position in the instrument's frame and the repeatability R. Infinite without C.
     status
         For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
         prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
@@ -88,18 +102,18 @@ class Compensation:
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
-        rows = [
-            ("position [mm], nominal command", self.position_before),
-            ("position [mm], corrected command", self.position_error),
-            ("position [mm], standard uncertainty", self.std),
-            ("orientation [mrad], nominal command", self.orientation_before),
-            ("orientation [mrad], corrected command", self.orientation_error),
-        ]
-        figures = [
-            [name, *(f"{1e3 * f:.4f}" for f in (v.mean(), np.sqrt(np.mean(v**2)), v.max()))]
-            for name, v in rows
-            if np.isfinite(v).all()
-        ]
+        rows = {
+            "position [mm], nominal command": self.position_before,
+            "position [mm], corrected command": self.position_error,
+            "position [mm], standard uncertainty": self.std,
+            "orientation [mrad], nominal command": self.orientation_before,
+            "orientation [mrad], corrected command": self.orientation_error,
+        }
+        figures = []
+        for name, values in rows.items():
+            if np.isfinite(values).all():
+                shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
+                figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
         units = [display(dimension)[0] for dimension in self.robot.joint_dimensions]
         changes = zip(self._largest_corrections().values(), units, strict=True)
         largest = [f"q{i} {value:.3f} {unit}" for i, (value, unit) in enumerate(changes, start=1)]
@@ -115,13 +129,11 @@ class Compensation:
         return "\n".join([*lines, *self.outside.sentences()])
 
     def _largest_corrections(self) -> dict[str, float]:
-        """Return the largest correction of every joint, in the unit of its column."""
         joints = joint_columns(self.robot.joint_dimensions)
         change = np.abs(self.q - self.nominal).max(axis=0) / list(joints.values())
         return dict(zip(joints, change.tolist(), strict=True))
 
     def _columns(self) -> dict[str, Array]:
-        """Return the corrected commands, and what is left of the errors, by column."""
         joints = joint_columns(self.robot.joint_dimensions)
         columns = {name: self.q[:, i] / si for i, (name, si) in enumerate(joints.items())}
         columns["position_error_mm"] = 1e3 * self.position_error
@@ -133,9 +145,12 @@ class Compensation:
         """Return the errors [mm, mrad], and a row for every target as in `csv`."""
         columns = self._columns()
         rows = zip(self.label, *(values.tolist() for values in columns.values()), self.status, strict=True)
+        before = (self.position_before, self.orientation_before)
+        after = (self.position_error, self.orientation_error)
+        errors = [{"position": statistics(p), "orientation": statistics(o, "mrad")} for p, o in (before, after)]
         return {
-            "nominal": _errors(self.position_before, self.orientation_before),
-            "corrected": _errors(self.position_error, self.orientation_error),
+            "nominal": errors[0],
+            "corrected": errors[1],
             "largest_corrections": self._largest_corrections(),
             "outside": [self.label[i] for i in self.outside.rows],
             "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
@@ -145,13 +160,9 @@ class Compensation:
         """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
         cells = []
         for name, values in self._columns().items():
-            digits = 6 if name.endswith(("_mm", "_mrad")) and not name.startswith("q") else 9
+            digits = 9 if name.startswith("q") else 6
             cells.append([f"{v:.{digits}f}" if np.isfinite(v) else "" for v in values])
         return csv_text(["label", *self._columns(), "status"], zip(self.label, *cells, self.status, strict=True))
-
-
-def _errors(position: Array, orientation: Array) -> dict[str, Any]:
-    return {"position": statistics(position), "orientation": statistics(orientation, "mrad")}
 
 
 @one_blas_thread
@@ -179,17 +190,15 @@ def compensate(
         |p|^2 + |w|^2 + D' P D
 
     where p [m] and w [rad] are the identified robot's errors of position and orientation. With fewer than six joints
-    only those rotations count that need not move the point. P is zero but for two kinds of directions, from
-    the singular values s of the Jacobian at q. Where the exact correction e / s of an error e would be longer than
-    ``largest`` (near singular), P is (e / largest)^2 - s^2, so that the part (s largest / e)^2 of it is made: the less,
-    the nearer the singularity. Where nothing moves (more joints than needed), a slight P keeps the command, so that
-    the correction is the shortest to first order, in units of the joints' ranges.
+    only those rotations count that need not move the point. With the singular values s of the Jacobian at q, P is zero
+    but where the exact correction e / s of an error e would be longer than ``largest`` (near singular): there it is
+    (e / largest)^2 - s^2, so that the part (s largest / e)^2 is made; and, slightly, where nothing moves (more joints
+    than needed), so that the correction is the shortest to first order, in units of the joints' ranges.
 
-    **Which frame.** The base is where the instrument stands and no fault of the robot: what a calibration identified
-    of it is not compensated, and targets hold in the base as identified. A turn of joint 1 and one of the base are the
-    same to the data; what the scales ascribe to the base stays. With ``base=True`` targets hold in the base as
-    stated, and the robot corrects for its place, too (``base = "auto"`` states none: then it is where registration
-    puts it).
+    **Which frame.** What a calibration identified of the base is where the instrument stands and is not compensated:
+    targets hold in the base as identified. A turn of joint 1 and one of the base are the same to the data; what the
+    scales ascribe to the base stays. With ``base=True`` targets hold in the base as stated, and the robot corrects for
+    its place, too (``base = "auto"`` states none: then it is where registration puts it).
 
     Parameters
     ----------
@@ -224,10 +233,6 @@ def compensate(
     robot
         Which of several robots.
 
-    Returns
-    -------
-    Every row depends on its own target alone.
-
     Raises
     ------
     InputError
@@ -242,49 +247,32 @@ def compensate(
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
     """
-    arms = result.problem.arms
-    if robot not in arms:
-        raise InputError("robot", f"'{robot}'", choices(robot, arms))
-    arm = arms[robot]
-    targets = checked(arm, Targets(tuple(label), q, poses, torque), orientation)
+    arm = pick(result.problem.arms, robot, "robot")
+    targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:
         raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
     oriented = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
-    kind = pose if oriented else position
     gravity = arm.gravity
     if payload_centre is not None:
         gravity = gravity.carrying(gravity.payload, list(payload_centre))
-    cell = Cell.of(result, kind, tool, marker, base, torque is not None, gravity, robot)
-    masses = _masses(cell, payload, payload_centre, len(targets.label))
+    cell = _Cell.of(result, pose if oriented else position, tool, marker, base, torque is not None, gravity, robot)
+    N = len(targets.label)
+    masses = None
+    if payload is not None or payload_centre is not None:
+        masses = _masses(cell, payload, N)
 
-    def part(start: int) -> dict[str, Array]:
+    def compensated(start: int) -> dict[str, Array]:
         def rows(values: Array | None) -> Array | None:
             return None if values is None else values[start : start + BLOCK]
 
-        loads = (rows(targets.torque), rows(masses))
-        return cell.compensated(rows(targets.q), rows(targets.poses), *loads, largest)
+        return cell.compensated(rows(targets.q), rows(targets.poses), rows(targets.torque), rows(masses), largest)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        parts = list(pool.map(part, range(0, len(targets.label), BLOCK)))
+        parts = list(pool.map(compensated, range(0, N, BLOCK)))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     whole["status"] = tuple(whole["status"].tolist())
-    commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((len(targets.label), 3)), 1.0)})
+    commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     return Compensation(arm, targets.label, **whole, outside=result.outside(commands))
-
-
-def _masses(cell: Cell, payload: float | Array | None, centre: object, N: int) -> Array | None:
-    """Return the payload of every row (N,) [kg], if there is one; refuse one that has no effect."""
-    if payload is None and centre is None:
-        return None
-    if not cell.loads.payload:
-        accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
-        raise InputError("payload", "a payload that bends nothing", accepted)
-    if payload is None:
-        payload = cell.robot.gravity.payload
-    values = np.asarray(payload, dtype=float)
-    if values.shape not in ((), (N,)) or not (values >= 0).all() or not np.isfinite(values).all():
-        raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
-    return np.broadcast_to(values, N)
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
@@ -299,11 +287,6 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     options
         Those of `compensate`.
 
-    Raises
-    ------
-    InputError
-        As `read_targets` and `compensate` do.
-
     Examples
     --------
     >>> import rpim_opt as ro
@@ -317,3 +300,261 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     compensation = compensate(result, read.q, read.poses, **(columns | options))
     write_text(Path(out), compensation.csv())
     return compensation
+
+
+# --- arguments ---------------------------------------------------------------------------------------------
+
+
+def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
+    """Return the targets as arrays, labelled, or say what does not fit."""
+    rows = stated.q if stated.poses is None else stated.poses
+    if rows is None:
+        raise InputError("targets", "neither joint values nor poses", "q, poses, or both")
+    N = len(np.atleast_1d(rows))
+    q = _rows("q", stated.q, N, (robot.dof,))
+    poses = _rows("poses", stated.poses, N, (7, 3))
+    torque = _rows("torque", stated.torque, N, (robot.dof,))
+    if poses is not None and poses.shape[1] == 7:
+        try:
+            poses = pose.prepare(poses)[:, : 7 if orientation else 3]
+        except RowError as error:
+            raise error.named(f"poses, {error.where}") from None
+    if len(stated.label) not in (0, N):
+        raise InputError("label", f"{len(stated.label)} labels", f"{N}, one a row")
+    return Targets(stated.label or tuple(str(i) for i in range(1, N + 1)), q, poses, torque)
+
+
+def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> Array | None:
+    if stated is None:
+        return None
+    values = np.asarray(stated, dtype=float)
+    if values.ndim != 2 or values.shape[1] not in columns or len(values) != N or not N:
+        accepted = " or ".join(f"({N or 'N'}, {k})" for k in columns)
+        raise InputError(name, f"shape {values.shape}", accepted)
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise InputError(f"{name}, row {row + 1}", f"{values[row].tolist()}", "finite numbers")
+    return values
+
+
+def _masses(cell: _Cell, payload: float | Array | None, N: int) -> Array:
+    """Return the payload of every row (N,) [kg]; refuse one that has no effect."""
+    if not cell.loads.payload:
+        accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
+        raise InputError("payload", "a payload that bends nothing", accepted)
+    values = np.asarray(cell.robot.gravity.payload if payload is None else payload, dtype=float)
+    if values.shape not in ((), (N,)) or not (values >= 0).all() or not np.isfinite(values).all():
+        raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
+    return np.broadcast_to(values, N)
+
+
+# --- the controller's robot beside the identified one ------------------------------------------------------
+
+
+def _with_tool(
+    parameters: Parameters, x: Array, C: Array | None, prefix: str, tool: Sequence[float] | Array
+) -> tuple[Parameters, Array, Array | None]:
+    """Return parameters, deviations (p,) and covariance with a tool that is known exactly."""
+    frame = np.asarray(tool, dtype=float)
+    if frame.shape != (6,) or not np.isfinite(frame).all():
+        raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+    at = [parameters.names.index(prefix + c) for c in FRAME]
+    nominal = parameters.nominal.copy()
+    nominal[at] = frame
+    identified = parameters.identified.copy()
+    identified[at] = False
+    x = x.copy()
+    x[at] = 0.0
+    if C is not None:
+        still = identified[parameters.identified]
+        C = C[np.ix_(still, still)]
+    return replace(parameters, nominal=nominal, identified=identified), x, C
+
+
+class _Cell(NamedTuple):
+    """The controller's robot, the identified one, and the uncertainty of where that is.
+
+    ``problem`` has the robot's data, ``x`` are the deviations (n,) of its identified parameters and ``covariance``
+    theirs; ``noise`` is the covariance (3, 3) [m^2] of a reading, and ``level`` the noise's variance over it.
+    """
+
+    robot: Robot
+    kind: Measurement
+    nominal: Arm
+    identified: Arm
+    loads: Loads
+    problem: CalibrationProblem
+    x: Array
+    covariance: Array | None
+    marker: str
+    noise: Array
+    level: float
+
+    @classmethod
+    def of(
+        cls,
+        result: Calibration,
+        kind: Measurement,
+        tool: Sequence[float] | Array | None,
+        marker: str,
+        base: bool,
+        torques: bool,
+        gravity: Gravity,
+        which: str,
+    ) -> _Cell:
+        """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
+        robot = replace(result.problem.arms[which], gravity=gravity)
+        whole = result.problem.parameters
+        x = np.zeros(len(whole))
+        x[whole.identified] = result.x
+        C = known_covariance(result)
+        places = whole.places_of(which)
+        if C is not None:
+            own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
+            C = C[np.ix_(own, own)]
+        parameters, x = whole.of_robot(which), x[places]
+        known = reflectors(parameters.names)
+        if tool is not None:  # which takes the place of the first reflector
+            marker = known[0]
+            parameters, x, C = _with_tool(parameters, x, C, tool_prefix(marker), tool)
+        elif marker not in known:
+            raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+        values = parameters.values(x)
+        nominal = dict(zip(parameters.names, parameters.nominal.tolist(), strict=True))
+        identified = dict(zip(parameters.names, values.tolist(), strict=True))
+        moved = np.eye(4)
+        if base:
+            stated, found = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
+            moved = np.linalg.inv(stated) @ found
+        measured = result.problem.sample().alone(which) if which else result.problem
+        scatter = measured.scatter
+        if tool is not None and scatter is not None:
+            scatter = replace(scatter, at=values)
+        problem = CalibrationProblem(robot, parameters, measured.data, scatter=scatter)
+        require_same_torques(robot, parameters, problem.data, torques)
+        loads = loads_on(robot, parameters, problem.data, torques)
+        prefix = tool_prefix(marker)
+        return cls(
+            robot,
+            kind,
+            Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
+            Arm.of(robot, identified, nominal, prefix, moved, kind, loads),
+            loads,
+            problem,
+            x[parameters.identified],
+            C,
+            marker,
+            position_noise(measured),
+            result.noise_level,
+        )
+
+    def compensated(
+        self, q: Array | None, poses: Array | None, torque: Array | None, payload: Array | None, largest: float
+    ) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
+        N = len(np.asarray(q if poses is None else poses))
+        load = self._load(N, torque, payload)
+        if poses is not None:
+            commands, target = self._commands(poses, q, load), poses
+            missed = self.nominal.at(commands, load, poses)[1]
+        else:
+            commands = np.asarray(q)
+            target, error, _ = self.nominal.at(commands, load, np.zeros((N, len(self.kind.columns))))
+            missed = np.zeros_like(error)
+        _, before, J = self.identified.at(commands, load, target)
+        W = attainable(J)
+        unit = joint_units(self.robot, J.shape[1])
+        reached = self._reached(missed, W)
+        due = np.where(reached[:, None], before - missed, 0.0)
+        P = correction_weights(W @ J * unit, times(W, due), largest)
+        lowest, highest = self.robot.limits.T
+        inside = np.clip(commands, lowest, highest)
+        limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
+        corrected, left, active = nearest(self.identified, load, target, commands, limits, unit, W, P)
+        at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
+        cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
+        position_before, orientation_before = self._norms(before)
+        position_error, orientation_error = self._norms(left)
+        return {
+            "nominal": commands,
+            "q": corrected,
+            "position_before": position_before,
+            "orientation_before": orientation_before,
+            "position_error": position_error,
+            "orientation_error": orientation_error,
+            "std": self._std(corrected, torque, payload),
+            "status": np.select(list(cases.values()), list(cases), "near singular"),
+        }
+
+    def _std(self, q: Array, torque: Array | None, payload: Array | None) -> Array:
+        """Return sqrt(tr (J C J' + R)) (N,) [m] of the positions reached at commands; R is the repeatability's."""
+        if self.covariance is None:
+            return np.full(len(q), np.inf)
+        data = Dataset.of(q, np.zeros((len(q), 3)), self.noise, measurement=position)
+        data = bearing(data, self.problem.data, torque, payload)
+        problem = self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(self.marker,)),)))
+        J = problem.jacobian(self.x)
+        known = np.isfinite(np.diag(self.covariance))
+        C = np.where(np.outer(known, known), self.covariance, 0.0)
+        variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
+        variance += np.trace(scattered(problem, self.level).robot[0], axis1=1, axis2=2)
+        unknown = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
+        return np.where(unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+    def _load(self, N: int, torque: Array | None, payload: Array | None) -> Array:
+        """Return what the joints of the model bear, as `Arm.at` takes it, (N, l)."""
+        parts = [np.empty((N, 0))]
+        if torque is not None:
+            parts.append(torque @ np.linalg.inv(self.robot.joint_map))
+        if self.loads.payload:
+            mass = self.robot.gravity.payload if payload is None else payload
+            parts.append(np.broadcast_to(mass, N)[:, None])
+        return np.hstack(parts)
+
+    def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
+        """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
+        every = np.arange(len(poses))
+
+        def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
+            at = self.nominal, load[rows], poses[rows], start, tuple(self.robot.limits.T)
+            return nearest(*at, np.ones(self.robot.dof), W, np.zeros((1, self.robot.dof, self.robot.dof)))
+
+        all_count = np.eye(len(self.kind.components))[None]
+        starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]
+        best, left, _ = found(every, starts[:, 0], all_count)
+        for k in range(1, starts.shape[1]):
+            again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
+            if not len(again):
+                break
+            other, error, _ = found(again, starts[again, k], all_count)
+            better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
+            best[again[better]] = other[better]
+            left[again[better]] = error[better]
+        if poses.shape[1] == 3 or self.robot.dof >= 6:
+            return best
+        return found(every, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
+
+    def _starts(self, poses: Array, loads: int) -> Array:
+        """Return the nearest of many configurations within limits, or a turn, for every pose, (N, TRIALS, dof)."""
+        low, high = self.robot.limits.T
+        low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
+        high = np.where(np.isfinite(high), high, low + 2 * np.pi)
+        bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
+        reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
+        distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
+        if poses.shape[1] == 7:
+            distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
+        closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
+        order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
+        return bank[np.take_along_axis(closest, order, axis=1)]
+
+    def _norms(self, error: Array) -> tuple[Array, Array]:
+        """Return the norms of position and orientation errors; NaN where there is no orientation."""
+        lengths = np.array([dimension == "length" for dimension in self.kind.components.values()])
+        angle = np.full(len(error), np.nan) if lengths.all() else np.linalg.norm(error[:, ~lengths], axis=1)
+        return np.linalg.norm(error[:, lengths], axis=1), angle
+
+    def _reached(self, error: Array, W: Array) -> np.ndarray:
+        distance, angle = self._norms(times(W, error))
+        return (distance <= REACHED) & ~(angle > REACHED)

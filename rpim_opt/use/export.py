@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import json_text, read_bytes, refused, write_files
+from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.transmission import Curves
@@ -101,7 +101,8 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
     """Write the transmission errors of joints as a CSV table: a joint stands at its angle plus the correction.
 
     Columns ``joint``, ``angle_deg`` (of the model, see `Robot`), ``correction_mrad`` and its standard deviation
-    ``std_mrad``, four rows a period of the finest harmonic. They belong to the geometry of the same result.
+    ``std_mrad``, four rows a period of the finest harmonic. They belong to the geometry of the same result. Returned is
+    a sentence on how large they are.
 
     Parameters
     ----------
@@ -109,10 +110,6 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
         A calibration with transmission errors.
     target
         The file.
-
-    Returns
-    -------
-    A sentence on how large they are.
 
     Raises
     ------
@@ -125,7 +122,7 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
         raise InputError("the calibration", "no transmission error", accepted)
     free = result.problem.parameters.free.names
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
-    squares = []
+    sizes = []
     for curve in curves:
         place = [free.index(name) for name in transmission(curve).names(curve.joint)]
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
@@ -134,12 +131,11 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
         columns = Curves((curve,)).columns(values, np.ones_like(values))
         correction = 1e3 * columns @ result.x[place]
         std = 1e3 * np.sqrt(np.sum((columns @ result.covariance[np.ix_(place, place)]) * columns, axis=1))
-        squares.append(np.mean(correction**2))
-        for row in zip(np.degrees(q), correction, std, strict=True):
-            lines.append(f"{curve.joint},{row[0]:.4f},{row[1]:.5f},{row[2]:.5f}")
-    write_files({Path(target): ("\n".join(lines) + "\n").encode()})
-    sizes = joined([f"joint {c.joint} {np.sqrt(square):.3f}" for c, square in zip(curves, squares, strict=True)])
-    return [f"Transmission errors (RMS, mrad): {sizes}. They belong to the geometry of this very result."]
+        sizes.append(f"joint {curve.joint} {np.sqrt(np.mean(correction**2)):.3f}")
+        rows = zip(np.degrees(q), correction, std, strict=True)
+        lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
+    write_text(Path(target), "\n".join(lines) + "\n")
+    return [f"Transmission errors (RMS, mrad): {joined(sizes)}. They belong to the geometry of this very result."]
 
 
 def export_urdf(
@@ -154,9 +150,9 @@ def export_urdf(
 ) -> list[str]:
     """Write a URDF with the identified robot's origins, and base and tool where they are the file's.
 
-    An identified base or reflector that lies where the file has its root or tip (`chain.same_place`) is the same
-    frame, known better, and is written. Elsewhere it is the instrument's or the reflector's own, and the file's frame
-    stays as it is.
+    An identified base or reflector that lies near the file's root or tip is the same frame, known better, and is
+    written. Elsewhere it is the instrument's or the reflector's own, and the file's frame stays as it is. Returned is a
+    sentence for each of the two frames that was identified.
 
     Parameters
     ----------
@@ -170,10 +166,6 @@ def export_urdf(
         Whether to write the base and the tool, instead of that rule.
     marker
         The reflector that is the tip. Of several none is, unless it is named.
-
-    Returns
-    -------
-    A sentence for each of the two frames that was identified.
 
     Examples
     --------
@@ -191,25 +183,23 @@ def export_urdf(
     """
     arm = with_first_reflector(result, marker)
     own = read_urdf(source, root, tip)
-    if marker is None and tool is None and len(reflectors(result.problem.parameters.names)) > 1:
+    names = result.problem.parameters.names
+    if marker is None and tool is None and len(reflectors(names)) > 1:
         tool = False
-    base_place, base_notes = _frame(result, "base", "root", base, arm.base, own.base)
-    tool_place, tool_notes = _frame(result, "tool", "tip", tool, arm.tool, own.tool)
-    write_urdf(source, arm.robot, target, root, tip, base_place, tool_place)
-    return [*base_notes, *tool_notes]
-
-
-def _frame(
-    result: Calibration, name: str, what: str, stated: bool | None, place: Array, own: Array
-) -> tuple[Array | None, list[str]]:
-    """Return a frame (6,) if it is written, and a sentence on it if it was identified."""
-    free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
-    if (free and same_place(place, own)) if stated is None else stated:
-        return place, [f"URDF: its {what} is at the identified {name}, {placed(place)}."]
-    if free:
-        where = f"the identified {name} is not there, but at {placed(place)}"
-        return None, [f"URDF: its {what} stays where it was; {where}."]
-    return None, []
+    written: list[Array | None] = []
+    notes = []
+    of_frames = (("base", "root", base, arm.base, own.base), ("tool", "tip", tool, arm.tool, own.tool))
+    for name, link, stated, place, of_file in of_frames:
+        free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
+        moves = (free and same_place(place, of_file)) if stated is None else stated
+        written.append(place if moves else None)
+        if moves:
+            notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)}.")
+        elif free:
+            where = f"the identified {name} is not there, but at {placed(place)}"
+            notes.append(f"URDF: its {link} stays where it was; {where}.")
+    write_urdf(source, arm.robot, target, root, tip, *written)
+    return notes
 
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
@@ -259,21 +249,10 @@ def noted(text: str, ending: str, note: str) -> str:
     return f"{declaration}{mark}\n<!-- {note.replace('--', '-')} -->\n{rest.lstrip()}".lstrip()
 
 
-def _with_note(path: Path, note: str) -> bytes:
-    if not note:
-        return read_bytes(path)
-    return noted(read_bytes(path).decode(), path.suffix.lower(), note).encode()
-
-
 def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]], note: str = "") -> list[str]:
-    """Write several files, or none of them if one cannot be written; return the notes of their writers.
+    """Write several files with a note in each, or none if one cannot be written; return what their writers say.
 
-    Parameters
-    ----------
-    writers
-        Targets, each with a function that writes to the path it is given.
-    note
-        Stands in every file.
+    ``writers`` are targets, each with a function that writes to the path it is given.
     """
     targets = [target for target, _ in writers]
     for target in targets:
@@ -292,5 +271,8 @@ def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | Non
                 file = target if error.file == path else error.file
                 raise InputError(error.where, error.found, error.accepted, file) from None
         with refused(", ".join(str(target) for target in written)):
-            write_files({target: _with_note(path, note) for target, path in written.items()})
+            contents = {target: read_bytes(path) for target, path in written.items()}
+            if note:
+                contents = {t: noted(data.decode(), t.suffix.lower(), note).encode() for t, data in contents.items()}
+            write_files(contents)
     return notes

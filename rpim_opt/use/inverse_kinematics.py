@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -25,9 +24,8 @@ DECREASE_TOLERANCE = 1e-6
 MAX_ITERATIONS = 50
 
 
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """A robot with all its parameters known: poses, errors and Jacobians of rows.
+class Arm(NamedTuple):
+    """A robot with all its parameters known.
 
     ``function`` maps model joint values, loads (`Loads`) and target, side by side, to the pose, its error and J'.
     """
@@ -40,30 +38,27 @@ class Arm:
         cls,
         robot: Robot,
         values: Mapping[str, float],
-        stated: Mapping[str, float],
-        prefix: str,
+        nominal: Mapping[str, float],
+        tool: str,
         before: Array,
         kind: Measurement,
         loads: Loads,
     ) -> Arm:
-        """Build the function, once for all rows: parameters are numbers in it, so that zeros cost nothing.
-
-        ``values`` are the parameters' by name, ``stated`` their nominal ones, by which gravity acts.
-        """
+        """Build the function from parameter values by name; gravity acts on the nominal ones."""
         command = loads.symbols(robot.dof, 1)
         y = ca.SX.sym("y", len(kind.columns))
 
         def value(name: str) -> float:
             return values.get(name, 0.0)
 
-        posture = loads.posture(robot.joint_types, stated.__getitem__, command)
+        posture = loads.posture(robot.joint_types, nominal.__getitem__, command)
         terms = robot.model.terms
         after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
         flange = chain(robot.joint_types, posture, value, terms)
-        T = product([ca.SX(ca.DM(before)), *flange, *placed([value(prefix + c) for c in FRAME])])
+        T = product([ca.SX(ca.DM(before)), *flange, *placed([value(tool + c) for c in FRAME])])
         joints = list(enumerate(robot.joint_types, start=1))
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
-        moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, moves in joints))
+        moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, _ in joints))
         # gravity bends a joint by the values of all of them
         J = (ca.horzcat(*twists) @ ca.jacobian(moved, command.q))[: len(kind.components), :]
         modelled = kind.model(T)
@@ -84,106 +79,52 @@ def _twist(moves: str, joint: ca.SX, T: ca.SX, beta: float) -> ca.SX:
     return ca.vertcat(ca.cross(axis, T[:3, 3] - joint[:3, 3]), axis)
 
 
-class _State(NamedTuple):
-    """Rows after steps D (N, n): the errors (N, k), the weighted ones, their slopes A (N, k, n), and the objectives."""
-
-    error: Array
-    weighted: Array
-    A: Array
-    value: Array
-
-
-class _Task(NamedTuple):
-    """Rows of `nearest`, whose arguments are described there."""
-
-    arm: Arm
-    load: Array
-    y: Array
-    start: Array
-    low: Array
-    high: Array
-    unit: Array
-    W: Array | None
-    P: Array
-
-    def q(self, rows: np.ndarray, D: Array) -> Array:
-        """Return the joint values of some rows after steps D."""
-        return np.clip(self.start[rows] + self.unit * D, self.low[rows], self.high[rows])
-
-    def at(self, rows: np.ndarray, D: Array) -> _State:
-        """Return the state of some rows after steps D."""
-        _, error, J = self.arm.at(self.q(rows, D), self.load[rows], self.y[rows])
-        weighted = error
-        A = J * self.unit
-        if self.W is not None:
-            weighted = times(self.W[rows], error)
-            A = self.W[rows] @ A
-        value = np.sum(weighted**2, axis=1) + np.sum(D * times(self.P[rows], D), axis=1)
-        return _State(error, weighted, A, value)
-
-    def descent(self, rows: np.ndarray, D: Array, here: _State) -> Array:
-        """Return half the negative gradients (len(rows), n)."""
-        return np.einsum("nki,nk->ni", here.A[rows], here.weighted[rows]) - times(self.P[rows], D[rows])
-
-    def curvature(self, rows: np.ndarray, here: _State, damping: Array) -> Array:
-        """Return damped Gauss-Newton matrices (len(rows), n, n); a trace of damping keeps every one regular."""
-        A = here.A[rows]
-        H = A.transpose(0, 2, 1) @ A + self.P[rows]
-        diagonal = np.einsum("nii->ni", H)
-        diagonal += damping[rows, None] * diagonal + 1e-14 * diagonal.mean(axis=1, keepdims=True) + 1e-300
-        return H
-
-
 def nearest(
-    arm: Arm,
-    load: Array,
-    y: Array,
-    start: Array,
-    low: Array,
-    high: Array,
-    unit: Array,
-    W: Array | None = None,
-    P: Array | None = None,
+    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array], unit: Array, W: Array, P: Array
 ) -> tuple[Array, Array, np.ndarray]:
     """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + unit D, row by row.
 
     Gauss-Newton steps in the box, damped (Levenberg-Marquardt) in rows whose step does not lower the objective.
-
-    Parameters
-    ----------
-    arm, load, y
-        The robot, what its joints bear (N, l), and the targets (N, c).
-    start, low, high, unit
-        (N, n) or (n,) joint values [rad or m], and what counts as one for every joint.
-    W, P
-        (N, k, k) and (N, n, n) weights; without W all errors count alike, without P corrections cost nothing.
-
-    Returns
-    -------
-    Joint values (N, n), their errors (N, k), and which joints are at an active limit (N, n).
+    Shapes: start (N, n), limits (N, n) or (n,), unit (n,), W (N or 1, k, k), P (N or 1, n, n). Returned are joint
+    values (N, n), their errors (N, k), and which joints are at an active limit (N, n).
     """
     N, n = start.shape
-    if P is None:
-        P = np.zeros((N, n, n))
-    if W is not None and len(W) != N:
-        W = None  # one projection for all rows is the identity: see `attainable`
-    low = np.broadcast_to(low, start.shape)
-    high = np.broadcast_to(high, start.shape)
-    task = _Task(arm, load, y, start, low, high, unit, W, P)
+    W = np.broadcast_to(W, (N, *W.shape[1:]))
+    P = np.broadcast_to(P, (N, n, n))
+    low, high = (np.broadcast_to(limit, start.shape) for limit in limits)
     to_low = (low - start) / unit
     to_high = (high - start) / unit
+
+    def joints(rows: np.ndarray, D: Array) -> Array:
+        return np.clip(start[rows] + unit * D, low[rows], high[rows])
+
+    def state(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array, Array]:
+        """Return errors, weighted errors, their slopes, and the objectives."""
+        _, error, J = arm.at(joints(rows, D), load[rows], y[rows])
+        weighted = times(W[rows], error)
+        value = np.sum(weighted**2, axis=1) + np.sum(D * times(P[rows], D), axis=1)
+        return error, weighted, W[rows] @ (J * unit), value
+
+    every = np.arange(N)
     D = np.clip(0.0, to_low, to_high)
     damping = np.zeros(N)
-    every = np.arange(N)
+    error, weighted, A, value = here = state(every, D)
+
+    def descent(rows: np.ndarray) -> Array:
+        """Return half the negative gradients."""
+        return np.einsum("nki,nk->ni", A[rows], weighted[rows]) - times(P[rows], D[rows])
+
     left = every
-    here = task.at(left, D)
     for _ in range(MAX_ITERATIONS):
         if not len(left):
             break
-        g = task.descent(left, D, here)
-        step = _boxed(task.curvature(left, here, damping), g, to_low[left] - D[left], to_high[left] - D[left])
-        new = task.at(left, D[left] + step)
-        better = new.value <= here.value[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
+        g = descent(left)
+        H = A[left].transpose(0, 2, 1) @ A[left] + P[left]
+        diagonal = np.einsum("nii->ni", H)  # a trace of damping keeps every one regular
+        diagonal += damping[left, None] * diagonal + 1e-14 * diagonal.mean(axis=1, keepdims=True) + 1e-300
+        step = _boxed(H, g, to_low[left] - D[left], to_high[left] - D[left])
+        new = state(left, D[left] + step)
+        better = new[-1] <= value[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
         rows = left[better]
         D[rows] += step[better]
         for old, values in zip(here, new, strict=True):
@@ -191,11 +132,11 @@ def nearest(
         damping[rows] = np.where(damping[rows] > 1e-6, damping[rows] / 10, 0.0)
         damping[left[~better]] = np.maximum(10 * damping[left[~better]], 1e-3)
         long = np.abs(step).max(axis=1) > STEP_TOLERANCE
-        promising = np.sum(step * g, axis=1) > DECREASE_TOLERANCE * here.value[left]
-        left = left[long & promising & (here.value[left] > 1e-24)]
-    g = task.descent(every, D, here)
+        promising = np.sum(step * g, axis=1) > DECREASE_TOLERANCE * value[left]
+        left = left[long & promising & (value[left] > 1e-24)]
+    g = descent(every)
     active = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))
-    return task.q(every, D), here.error, active
+    return joints(every, D), error, active
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
@@ -258,10 +199,7 @@ def times(W: Array, vectors: Array) -> Array:
 
 
 def correction_weights(A: Array, due: Array, largest: float) -> Array:
-    """Return the weights P (N, n, n) of corrections.
-
-    With A = U diag(s) V', the correction in direction v_i would be e_i / s_i, e = U' due; see `compensate`.
-    """
+    """Return the weights P (N, n, n) of corrections: with A = U diag(s) V', see `compensate`."""
     n = A.shape[2]
     U, s, Vt = np.linalg.svd(A, full_matrices=True)
     some = s.shape[1]

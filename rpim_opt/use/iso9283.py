@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,35 +25,25 @@ AXES = ("x", "y", "z")
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
 """What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
+Triple = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class PosePerformance:
-    """Accuracy and repeatability at one pose.
+class PosePerformance(NamedTuple):
+    """Accuracy and repeatability at one pose, of so many approaches (``cycles``).
 
-    Parameters
-    ----------
-    pose
-        Its name.
-    cycles
-        How often it was approached.
-    AP, AP_axes
-        Distance of the barycentre of the attained positions from the command [m], and along x, y, z; None where no
-        command is known.
-    RP
-        Positioning repeatability [m].
-    AP_angles, RP_angles
-        Of the orientation, for each of three angles [rad]: mean less command, and 3 standard deviations; None where no
-        orientation was measured.
+    AP and AP_axes are the distance [m] of the barycentre of the attained positions from the command, and along x, y, z;
+    None where no command is known. RP is the positioning repeatability [m]. AP_angles and RP_angles are of the
+    orientation, for each of three angles [rad]: mean less command, and 3 standard deviations; None where no orientation
+    was measured.
     """
 
     pose: str
     cycles: int
     AP: float | None
-    AP_axes: tuple[float, float, float] | None
+    AP_axes: Triple | None
     RP: float
-    AP_angles: tuple[float, float, float] | None = None
-    RP_angles: tuple[float, float, float] | None = None
+    AP_angles: Triple | None = None
+    RP_angles: Triple | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +67,7 @@ class Performance(Tabled):
     1.732 mm, 0.100 mm
     >>> round(found.content()["poses"][0]["RP_l_mm"], 3), found.csv().splitlines()[0]
     (0.1, 'pose,cycles,AP_p_mm,AP_x_mm,AP_y_mm,AP_z_mm,RP_l_mm')
-    >>> print(found.notes()[0])
+    >>> print(found.content()["notes"][0])
     The standard has 5 poses approached 30 times each: there is 1 pose, approached 4 times.
     """
 
@@ -87,37 +77,21 @@ class Performance(Tabled):
     @property
     def accuracy(self) -> float | None:
         """The largest positioning accuracy AP of all poses [m]; None where no command is known."""
-        found = [each.AP for each in self.poses if each.AP is not None]
-        return max(found, default=None)
+        return max((each.AP for each in self.poses if each.AP is not None), default=None)
 
     @property
     def repeatability(self) -> float:
         """The largest positioning repeatability RP of all poses [m]."""
         return max(each.RP for each in self.poses)
 
-    def notes(self) -> list[str]:
-        """Say in what the table is not what the standard asks for, and what is not known."""
-        lines: list[str] = []
-        cycles = sorted({each.cycles for each in self.poses})
-        if cycles[0] < CYCLES or len(self.poses) < POSES:
-            times = f"{cycles[0]}"
-            if len(cycles) > 1:
-                times = f"{cycles[0]} to {cycles[-1]}"
-            verb = "are" if len(self.poses) > 1 else "is"
-            there = f"there {verb} {counted(len(self.poses), 'pose')}, approached {times} times"
-            lines.append(f"The standard has {POSES} poses approached {CYCLES} times each: {there}.")
-        if self.accuracy is None:
-            lines.append("No command is known: there is repeatability, and no accuracy.")
-        return lines
-
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, mrad]."""
         return {
             "standard": "ISO 9283:1998, 7.2.1 and 7.2.2",
-            "accuracy_mm": None if self.accuracy is None else 1e3 * self.accuracy,
+            "accuracy_mm": _milli(self.accuracy),
             "repeatability_mm": 1e3 * self.repeatability,
             "poses": self._frame_rows(),
-            "notes": self.notes(),
+            "notes": self._notes(),
         }
 
     def csv(self) -> str:
@@ -126,43 +100,50 @@ class Performance(Tabled):
         return csv_text(rows[0], [["" if value is None else value for value in row.values()] for row in rows])
 
     def __str__(self) -> str:
-        """Return the figures as a table."""
-        tables = [self._table("_mm")]
-        if self._turned:
-            tables.append(self._table("_mrad"))
-        return "\n".join([*tables, "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP).", *self.notes()])
+        """Return the figures as tables, without what no pose has."""
+        rows = self._frame_rows()
+        parts = []
+        for unit in ("_mm", "_mrad"):
+            shown = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
+            head = ["pose", "cycles", *(key.replace(unit, f" [{unit[1:]}]") for key in shown)]
+            cells = [["-" if row[key] is None else f"{row[key]:.4f}" for key in shown] for row in rows]
+            lines = [[row["pose"], str(row["cycles"]), *more] for row, more in zip(rows, cells, strict=True)]
+            if shown:
+                parts.append(table(head, lines))
+        return "\n".join([*parts, "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP).", *self._notes()])
 
     def _short(self) -> str:
         return f"at {counted(len(self.poses), 'pose')}, RP {1e3 * self.repeatability:.4g} mm"
 
     def _notes(self) -> list[str]:
-        return self.notes()
-
-    @property
-    def _turned(self) -> bool:
-        return any(each.RP_angles is not None for each in self.poses)
+        """Say in what the table is not what the standard requires, and what is not known."""
+        lines: list[str] = []
+        cycles = sorted({each.cycles for each in self.poses})
+        if cycles[0] < CYCLES or len(self.poses) < POSES:
+            times = " to ".join(str(count) for count in dict.fromkeys((cycles[0], cycles[-1])))
+            verb = "are" if len(self.poses) > 1 else "is"
+            there = f"there {verb} {counted(len(self.poses), 'pose')}, approached {times} times"
+            lines.append(f"The standard has {POSES} poses approached {CYCLES} times each: {there}.")
+        if self.accuracy is None:
+            lines.append("No command is known: there is repeatability, and no accuracy.")
+        return lines
 
     def _frame_rows(self) -> list[dict[str, Any]]:
+        turned = any(each.RP_angles is not None for each in self.poses)
         rows = []
         for each in self.poses:
-            figures = {"AP_p_mm": each.AP}
-            figures |= {f"AP_{axis}_mm": value for axis, value in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
-            figures["RP_l_mm"] = each.RP
-            if self._turned:
-                for kind, values in (("AP", each.AP_angles), ("RP", each.RP_angles)):
-                    names = [f"{kind}_{name}_mrad" for name in self.names]
-                    figures |= dict(zip(names, values or [None] * 3, strict=True))
-            milli = {name: None if value is None else 1e3 * value for name, value in figures.items()}
-            rows.append({"pose": each.pose, "cycles": each.cycles, **milli})
+            row: dict[str, Any] = {"pose": each.pose, "cycles": each.cycles, "AP_p_mm": _milli(each.AP)}
+            row |= {f"AP_{axis}_mm": _milli(v) for axis, v in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
+            row["RP_l_mm"] = _milli(each.RP)
+            for kind, values in (("AP", each.AP_angles), ("RP", each.RP_angles)) if turned else ():
+                angles = zip(self.names, values or [None] * 3, strict=True)
+                row |= {f"{kind}_{name}_mrad": _milli(value) for name, value in angles}
+            rows.append(row)
         return rows
 
-    def _table(self, unit: str) -> str:
-        """Return the figures of a unit as a table, without what no pose has."""
-        rows = self._frame_rows()
-        shown = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
-        head = ["pose", "cycles", *(key.replace(unit, f" [{unit[1:]}]") for key in shown)]
-        cells = [["-" if row[key] is None else f"{row[key]:.4f}" for key in shown] for row in rows]
-        return table(head, [[row["pose"], str(row["cycles"]), *more] for row, more in zip(rows, cells, strict=True)])
+
+def _milli(value: float | None) -> float | None:
+    return None if value is None else 1e3 * value
 
 
 def iso9283(
@@ -210,61 +191,43 @@ def iso9283(
     >>> round(1e3 * found.poses[0].RP_angles[2], 2)  # 3 standard deviations [mrad]
     2.51
     """
-    N = len(pose)
-    if not N:
+    if not len(pose):
         raise InputError("iso9283", "no approach", "at least two of a pose")
-    arrays = {"positions": position, "commanded positions": command, "angles": angles}
-    arrays["commanded angles"] = command_angles
-    checked = {what: _rows(values, N, what) for what, values in arrays.items()}
+    attained = _rows(position, len(pose), "positions")
+    commanded = None if command is None else _rows(command, len(pose), "commanded positions")
+    turned = None if angles is None else _rows(angles, len(pose), "angles")
+    commanded_turns = None if command_angles is None else _rows(command_angles, len(pose), "commanded angles")
     poses: list[PosePerformance] = []
     for name in dict.fromkeys(pose):
         at = np.array([each == name for each in pose])
         if at.sum() < 2:
             raise InputError(f"pose '{name}'", "one approach", f"two or more, {CYCLES} by the standard")
-        poses.append(_of_pose(name, **{what.replace(" ", "_"): v[at] for what, v in checked.items() if v is not None}))
+        barycentre = attained[at].mean(axis=0)
+        length = np.linalg.norm(attained[at] - barycentre, axis=1)
+        AP = AP_axes = AP_angles = RP_angles = start = None
+        if commanded is not None:
+            offset = barycentre - _one_command(commanded[at], name, "position")
+            AP, AP_axes = float(np.linalg.norm(offset)), tuple(offset.tolist())
+        if commanded_turns is not None:
+            start = _one_command(commanded_turns[at], name, "orientation")
+        if turned is not None:
+            from_start = turned[at] - (turned[at][0] if start is None else start)
+            beside = (from_start + np.pi) % (2 * np.pi) - np.pi
+            RP_angles = tuple((3 * beside.std(axis=0, ddof=1)).tolist())
+            AP_angles = None if start is None else tuple(beside.mean(axis=0).tolist())
+        RP = float(length.mean() + 3 * length.std(ddof=1))
+        poses.append(PosePerformance(name, int(at.sum()), AP, AP_axes, RP, AP_angles, RP_angles))
     return Performance(tuple(poses), names)
 
 
-def _of_pose(
-    name: str,
-    positions: Array,
-    commanded_positions: Array | None = None,
-    angles: Array | None = None,
-    commanded_angles: Array | None = None,
-) -> PosePerformance:
-    barycentre = positions.mean(axis=0)
-    length = np.linalg.norm(positions - barycentre, axis=1)
-    AP = AP_axes = AP_angles = RP_angles = None
-    if commanded_positions is not None:
-        offset = barycentre - _command(commanded_positions, name, "position")
-        AP, AP_axes = float(np.linalg.norm(offset)), _triple(offset)
-    start = None
-    if commanded_angles is not None:
-        start = _command(commanded_angles, name, "orientation")
-    if angles is not None:
-        beside = (angles - (angles[0] if start is None else start) + np.pi) % (2 * np.pi) - np.pi
-        RP_angles = _triple(3 * beside.std(axis=0, ddof=1))
-        if start is not None:
-            AP_angles = _triple(beside.mean(axis=0))
-    RP = float(length.mean() + 3 * length.std(ddof=1))
-    return PosePerformance(name, len(positions), AP, AP_axes, RP, AP_angles, RP_angles)
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _command(values: Array, name: str, what: str) -> Array:
+def _one_command(values: Array, name: str, what: str) -> Array:
     """Return the command of a pose (3,), which all its rows repeat."""
     if np.ptp(values, axis=0).max() > 1e-9:
         raise InputError(f"pose '{name}'", f"commands of more than one {what}", "one command a pose")
     return values[0]
 
 
-def _rows(values: Array | None, N: int, what: str) -> Array | None:
-    if values is None:
-        return None
+def _rows(values: Array, N: int, what: str) -> Array:
     array = np.asarray(values, dtype=float)
     if array.shape != (N, 3) or not np.isfinite(array).all():
         raise InputError(what, f"shape {array.shape}", f"finite numbers of shape {(N, 3)}")
@@ -329,13 +292,24 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
     pose = poses.get("configuration", poses.get("label"))
     if pose is None or not set(AXES) <= set(attained):
         raise InputError("the header", listed(list(columns), 6), ACCEPTED)
-    angles = next((group for group in ROTATIONS if set(group) <= set(attained)), None)
+    angles = next((group for group in ROTATIONS if set(group) <= set(attained)), ())
+
+    def beside(of: Mapping[str, tuple[str, float]], stems: tuple[str, ...]) -> Any:
+        """Return columns side by side (N, 3), or None where the table has none of them."""
+        if not set(stems) & set(of):
+            return None
+        missing = [stem for stem in stems if stem not in of]
+        if missing:
+            raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
+        rows = [str(i + 1) for i in range(len(columns[pose]))]
+        return np.column_stack([si * numbers(columns[name], rows, name) for name, si in (of[stem] for stem in stems)])
+
     return iso9283(
         texts(columns[pose], pose),
-        np.column_stack([_values(columns, *attained[axis]) for axis in AXES]),
-        _if_there(columns, commanded, AXES),
-        _if_there(columns, attained, angles),
-        _if_there(columns, commanded, angles),
+        beside(attained, AXES),
+        beside(commanded, AXES),
+        beside(attained, angles),
+        beside(commanded, angles),
         angles or ROTATIONS[0],
     )
 
@@ -348,19 +322,3 @@ def _size(name: str, dimension: str, unit: str, units: Mapping[str, str]) -> flo
     if unit in FOREIGN:
         return FOREIGN[unit].size * UNITS[FOREIGN[unit].unit].si
     return UNITS[unit].si
-
-
-def _if_there(
-    columns: Mapping[str, Sequence[Any]], of: Mapping[str, tuple[str, float]], stems: tuple[str, ...] | None
-) -> Array | None:
-    """Return columns side by side (N, 3), or None where the table has none of them."""
-    if stems is None or not set(stems) & set(of):
-        return None
-    missing = [stem for stem in stems if stem not in of]
-    if missing:
-        raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
-    return np.column_stack([_values(columns, *of[stem]) for stem in stems])
-
-
-def _values(columns: Mapping[str, Sequence[Any]], name: str, si: float) -> Array:
-    return si * numbers(columns[name], [str(i + 1) for i in range(len(columns[name]))], name)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,18 +13,22 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.intervals import scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.convex.structure import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.use.changes import Cause, Misfit, candidates
-from rpim_opt.use.recalibration import Recalibration
-from rpim_opt.use.validation import read_table
+from rpim_opt.use.recalibration import (
+    Cause,
+    Misfit,
+    Moved,
+    candidates,
+    posterior_as_prior,
+    previous_deviations,
+    with_data,
+)
 
 FALSE_ALARM = 0.01
 """Probability that a robot that does not drift is said to."""
@@ -42,36 +45,24 @@ CELLS = 150
 HIGHEST_LIMIT = 50.0
 
 
-class Checks(NamedTuple):
-    """Checks that were read: rows, their times (N,) [s] or None, the times as they stand there, columns left out."""
-
-    data: Dataset
-    when: Array | None
-    times: tuple[str, ...]
-    left_out: tuple[str, ...]
-
-
 class Drift(NamedTuple):
     """A change during checks.
 
     Its cause, the number of the first check after it, whether it is steady from the first to the last check, and by how
-    much a single parameter moved in all, with its standard deviation [SI] (None for a frame).
+    much a single parameter moved in all; None for a frame.
     """
 
     cause: Cause
     first: int
     steady: bool
-    change: float | None
-    std: float | None
-    dimension: str
+    moved: Moved | None
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
-        unit, si = display(self.dimension)
-        change = None
-        if self.change is not None and self.std is not None:
-            change = {"unit": unit, "change": self.change / si, "std": self.std / si}
-        return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": change}
+        moved = None
+        if self.moved is not None:
+            moved = {key: value for key, value in self.moved.content().items() if key != "name"}
+        return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": moved}
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +117,7 @@ class Monitoring:
     @property
     def alarm(self) -> int | None:
         """The first check at which the sum passes its limit; None where it does not."""
-        passed = np.flatnonzero(self.sums > self.limit)
-        if not len(passed):
-            return None
-        return int(passed[0])
+        return next((int(i) for i in np.flatnonzero(self.sums > self.limit)), None)
 
     @property
     def drifts(self) -> bool:
@@ -137,14 +125,7 @@ class Monitoring:
         return bool(self.beyond) or self.alarm is not None or self.drift is not None
 
     def content(self) -> dict[str, Any]:
-        """Return the figures, and the chart's points [mm].
-
-        >>> import rpim_opt as ro
-        >>> instance = ro.load("position")
-        >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation).content()
-        >>> found["drifts"], found["checks"], list(found["rows"][0])
-        (False, 40, ['label', 'error_mm', 'sigmas', 'allowed_sigmas', 'sum'])
-        """
+        """Return the figures, and the chart's points [mm]."""
         alarm = since = moved = None
         if self.alarm is not None:
             alarm, since = self.label[self.alarm], self.label[self._since(self.alarm)]
@@ -170,10 +151,9 @@ class Monitoring:
     def __str__(self) -> str:
         """Return the verdict, what shows it, and the largest figures."""
         count = f"{len(self.label)} checks"
-        worst = int(np.argmax(self.sigmas / self.allowed))
-        lines = (
-            [f"The robot is not where its calibration says, in {count}."] if self.drifts else [f"No drift in {count}."]
-        )
+        lines = [f"No drift in {count}."]
+        if self.drifts:
+            lines = [f"The robot is not where its calibration says, in {count}."]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")
@@ -181,11 +161,12 @@ class Monitoring:
             since = self._named(self._since(self.alarm))
             lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
         if self.drift is not None:
-            lines.append(self._moved(self.drift))
+            lines.append(self._explained(self.drift))
         elif self.drifts:
             lines.append("No parameter and no frame explains it alone.")
         if self.drifts and self.mistake:
             lines.append(self.mistake)
+        worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
             f"Largest innovation: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
             f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
@@ -198,32 +179,26 @@ class Monitoring:
         zeros = np.flatnonzero(self.sums[: alarm + 1] == 0)
         return int(zeros[-1]) + 1 if len(zeros) else 0
 
-    def _moved(self, drift: Drift) -> str:
-        text = f"Best explained by {drift.cause.kind} {drift.cause.name}"
-        if drift.change is not None and drift.std is not None:
-            unit, si = display(drift.dimension)
-            text += f", {drift.change / si:+.3g} {unit} (standard deviation {drift.std / si:.2g})"
+    def _explained(self, drift: Drift) -> str:
+        cause = drift.cause
         course = f"at once before {self._named(drift.first)}" if drift.first else "before the first check"
         if drift.steady:
             course = "steadily from the first to the last check"
-        return f"{text}, {course}: chi-squared falls by {drift.cause.gain:.1f}, p-value {drift.cause.p_value:.2g}."
+        return (
+            f"Best explained by {cause.kind} {drift.moved or cause.name}, {course}: chi-squared falls by "
+            f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
+        )
 
     def _named(self, i: int) -> str:
-        if self.times:
-            return f"{self.label[i]} ({self.times[i]})"
-        return f"'{self.label[i]}'"
+        return f"{self.label[i]} ({self.times[i]})" if self.times else f"'{self.label[i]}'"
 
     def _rows(self) -> list[dict[str, Any]]:
         columns: dict[str, Any] = {"label": self.label}
         if self.times:
             columns["time"] = self.times
-        figures = {
-            "error_mm": 1e3 * self.error,
-            "sigmas": self.sigmas,
-            "allowed_sigmas": self.allowed,
-            "sum": self.sums,
-        }
-        columns |= {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
+        figures = {"error_mm": 1e3 * self.error, "sigmas": self.sigmas, "allowed_sigmas": self.allowed}
+        for name, values in (*figures.items(), ("sum", self.sums)):
+            columns[name] = [round(value, 6) for value in values.tolist()]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
@@ -266,15 +241,13 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         order = np.argsort(when, kind="stable")
         data = data.take(order)
         when = when[order]
-        if times:
-            times = tuple(times[i] for i in order)
-    previous = Recalibration(result)
-    problem = previous.problem(replace(data, configuration=_visits(data, when)))
+        times = tuple(times[i] for i in order) if times else ()
+    problem = with_data(result, replace(data, configuration=_visits(data, when)))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
     level = FALSE_ALARM / TESTS
-    sigmas, deviate = innovations(result, problem, level / count)
+    sigmas, deviate = _innovations(result, problem, level / count)
     return Monitoring(
         label=data.label,
         times=times,
@@ -284,7 +257,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)),
         sums=cusum(deviate),
         limit=cusum_limit(count, level),
-        drift=_drift(previous, problem, level),
+        drift=_drift(result, problem, level),
         mistake=misread(result, data),
     )
 
@@ -298,41 +271,10 @@ def _visits(data: Dataset, when: Array | None) -> np.ndarray:
     return np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
 
 
-def read_checks(result: Calibration, source: Any, measurement: str | None = None, units: str = "") -> Checks:
-    """Return check readings of a table with their times, where a column is called time, timestamp or date.
-
-    Parameters
-    ----------
-    result, source, measurement, units
-        As for `read_measurements`.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
-    >>> table = {"date": ["2026-03-01", "2026-04-01"], **{f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}}
-    >>> table |= {"x": [826.6, 810.0], "y": [98.0, 240.0], "z": [107.0, 254.0]}
-    >>> checks = ro.use.read_checks(result, table, units="deg,mm")
-    >>> checks.times, float(checks.when[1] - checks.when[0]) / 86400
-    (('2026-03-01', '2026-04-01'), 31.0)
-    """
-    table = read_table(result, source, measurement, units)
-    name = time_column(table.raw)
-    if name is None:
-        return Checks(table.data, None, (), table.left_out)
-    cells = list(table.raw[name])
-    try:
-        when = seconds(name, cells)
-    except InputError as error:
-        raise error.within(source if isinstance(source, str | Path) else None) from None
-    left_out = tuple(each for each in table.left_out if each != name)
-    return Checks(table.data, when, tuple(str(cell) for cell in cells), left_out)
-
-
 # --- each check --------------------------------------------------------------------------------------------
 
 
-def innovations(result: Calibration, problem: CalibrationProblem, level: float = 0.0) -> tuple[Array, Array]:
+def _innovations(result: Calibration, problem: CalibrationProblem, level: float) -> tuple[Array, Array]:
     """Return innovations of N checks in standard deviations (N,), and as standard normal deviates (N,).
 
     The error of the calibration bends all predictions alike. A Kalman filter takes that away as checks show it, so that
@@ -341,61 +283,44 @@ def innovations(result: Calibration, problem: CalibrationProblem, level: float =
         e = r - J m,    S = J C J' + V,    K = C J' S^-1,    m + K e,    C - K J C
 
     with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C what calibration and earlier checks
-    leave open. Deviates are by Fisher's F, positive where a check misses more than usual.
-
-    Parameters
-    ----------
-    result
-        The calibration.
-    problem
-        Its problem with the checks in the order of time.
-    level
-        The filter learns nothing from a check that is less probable than this.
-
-    Raises
-    ------
-    InputError
-        For a result that has no covariance.
+    leave open. Deviates are by Fisher's F, positive where a check misses more than usual. The filter learns nothing
+    from a check that is less probable than ``level``.
     """
     C = known_covariance(result)
     if C is None:
         accepted = "one with a squared penalty or none, whose predictions have intervals"
         raise InputError("monitor", f"formulation '{result.formulation.name}'", accepted)
     known = np.isfinite(np.diag(C))
-    C = np.where(np.outer(known, known), C, 0.0)
     own = problem.parameters.free.scale[len(C) :]  # of sessions that the calibration does not know
-    C = np.block([[C, np.zeros((len(C), len(own)))], [np.zeros((len(own), len(C))), np.diag(own**2)]])
+    n = len(known)
+    C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(own)))
+    C[n:, n:] = np.diag(own**2)
     m = np.zeros(len(C))
-    rows = _rows(result, problem, np.append(result.x, np.zeros(len(own))))
+    residual, slopes = problem.slopes(previous_deviations(result, problem))
+    readings = scattered(problem, result.noise_level).reading
+    rows: dict[int, tuple[slice, Array]] = {}
+    start = 0
+    for block, V in zip(problem.data.blocks, readings, strict=True):
+        k = len(block.measurement.components)
+        for row, of_row in zip(block.row, np.broadcast_to(V, (len(block.row), k, k)), strict=True):
+            rows[int(row)] = slice(start, start + k), of_row
+            start += k
     freedom = max(result.freedom, 1.0)
     sigmas = np.zeros(len(rows))
     p_values = np.ones(len(rows))
     for t in range(len(rows)):
-        r, J, V = rows[t]
+        equations, V = rows[t]
+        J = slopes[equations]
         S = J @ C @ J.T + V
-        e = r - J @ m
-        gain = np.linalg.solve(S, J @ C).T
+        e = residual[equations] - J @ m
         squares = float(e @ np.linalg.solve(S, e))
         sigmas[t] = np.sqrt(squares)
-        p_values[t] = fdtrc(len(r), freedom, squares / len(r))
+        p_values[t] = fdtrc(len(e), freedom, squares / len(e))
         if p_values[t] >= level:
+            gain = np.linalg.solve(S, J @ C).T
             m = m + gain @ e
             C = C - gain @ S @ gain.T
     return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST)))
-
-
-def _rows(result: Calibration, problem: CalibrationProblem, x: Array) -> dict[int, tuple[Array, Array, Array]]:
-    """Return every row's residual (k,), slopes (k, n) and covariance (k, k) of a reading [SI]."""
-    residual, J = problem.slopes(x)
-    rows = {}
-    start = 0
-    for block, V in zip(problem.data.blocks, scattered(problem, result.noise_level).reading, strict=True):
-        k = len(block.measurement.components)
-        for i, row in enumerate(block.row):
-            part = slice(start + i * k, start + (i + 1) * k)
-            rows[int(row)] = residual[part], J[part], np.broadcast_to(V, (len(block.row), k, k))[i]
-        start += k * len(block.row)
-    return rows
 
 
 # --- their cumulative sum ----------------------------------------------------------------------------------
@@ -417,10 +342,6 @@ def cusum_limit(count: int, level: float) -> float:
     """Return the limit that sums of so many independent standard normal deviates exceed with probability ``level``.
 
     By Brook and Evans' Markov chain (1972), bisected.
-
-    >>> from rpim_opt.use.monitoring import cusum_limit
-    >>> cusum_limit(10, 0.01) < cusum_limit(100, 0.01) < cusum_limit(1000, 0.01)
-    True
     """
     low, high = 0.0, HIGHEST_LIMIT
     while high - low > 1e-3:
@@ -446,34 +367,34 @@ def _exceeding(h: float, count: int) -> float:
 # --- every parameter ---------------------------------------------------------------------------------------
 
 
-def _drift(previous: Recalibration, problem: CalibrationProblem, level: float) -> Drift | None:
+def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:
     """Return the change that explains checks best; None where chance does, over all changes that were tried."""
-    model = problem.linearize(previous.start(problem))
-    penalty = previous.formulation(problem, ()).penalty
+    model = problem.linearize(previous_deviations(result, problem))
+    penalty = posterior_as_prior(result, problem).penalty
     form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
     # rows of one configuration were read together: the first of them says when
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
-    tried = list(_changes(previous.misfit(model, form), when, len(problem.data)))
+    tried = list(_changes(Misfit(result, model, form), problem, when))
     best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
     return best if best.cause.p_value * len(tried) < level else None
 
 
-def _changes(misfit: Misfit, when: np.ndarray, count: int) -> Iterator[Drift]:
+def _changes(misfit: Misfit, problem: CalibrationProblem, when: np.ndarray) -> Iterator[Drift]:
     """Yield all changes with their evidence: of every cause at every moment, and steadily."""
-    free = misfit.model.parameters
+    count = len(problem.data)
     moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
     if count > 2:
         courses.append((0, True, when / (count - 1)))
+    free = problem.parameters.free
     for cause in candidates(free):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
         for first, steady, course in courses:
             g, G = misfit.of_drift(index, course)
-            gain, p_value = misfit.gain(g, G)
-            change = std = None
+            moved = None
             if len(g) == 1 and G[0, 0] > 0:
-                change, std = float(scale * g[0] / G[0, 0]), float(scale / np.sqrt(G[0, 0]))
-            tried = cause._replace(gain=gain, p_value=p_value)
-            yield Drift(tried, first, steady, change, std, free.dimensions[index[0]])
+                std = scale / np.sqrt(G[0, 0])
+                moved = Moved(cause.name, free.dimensions[index[0]], float(scale * g[0] / G[0, 0]), float(std))
+            yield Drift(misfit.evidence(cause, g, G), first, steady, moved)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import fdtrc, logsumexp
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, table
 from rpim_opt.basics.units import UNITS, accepted_units, display
 from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.result import Calibration
@@ -23,29 +25,70 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.structure import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Record
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.several import knowing_sessions
 from rpim_opt.problem.source import Source
+from rpim_opt.robot.parameter_names import is_joint_offset, of_session
+from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.result_file import content
-from rpim_opt.use.changes import SIZES, Cause, Fit, Misfit, Reading, candidates, prior_widths, significant, weigh
 
+FALSE_ALARM = 0.01
+"""Probability with which a robot that did not change is said to have changed, over all causes."""
+SIZES = (1.0, 3.0, 10.0, 30.0)
+"""Multiples of a deviation's prior width that a change may have, each as likely: tails that no crash leaves."""
+UNCHANGED = 0.5
+"""Prior probability that nothing changed; the other half is dealt out to the kinds of causes in use."""
+OUTLIER_WIDTH = 10.0
+"""Standard deviations by which an outlier is off, times `SIZES`."""
+UNOBSERVABLE = 1e-9
+"""Part of the largest eigenvalue below which readings do not observe a direction of a change."""
 MOST = 4
 """Changes of robot and frames that are looked for one after the other: of more it is another robot."""
 SPARED = 0.25
 """Part of the readings that may be wrong."""
 STRANGE = 5.0
 """Readings that no change explains, and that miss by so many times the error before any calibration, are another's."""
-OPEN = SIZES[-1]
-"""Prior widths within which a parameter that changed may be: far enough that readings alone decide it."""
 RIVAL = 0.05
 """Probability from which on another cause is named beside the most probable one."""
 SHOWN = 5
 """Causes that are shown."""
 
 
+class Fit(NamedTuple):
+    """Chi-squared of readings about what a prior predicts of them, over how many equations, and its probability."""
+
+    squares: float
+    equations: int
+    probability: float
+
+    @property
+    def likely(self) -> bool:
+        """Whether chance alone makes it as large in more than one robot of a hundred."""
+        return self.probability >= FALSE_ALARM
+
+    def __str__(self) -> str:
+        """Return the figures."""
+        return f"chi-squared {self.squares:.1f} of {self.equations}, probability {self.probability:.2g}"
+
+
+class Cause(NamedTuple):
+    """A change that may be why readings miss their predictions.
+
+    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
+    chi-squared falls with it, the p-value of that where nothing changed, and the posterior probability.
+    """
+
+    name: str
+    kind: str
+    members: tuple[str, ...]
+    gain: float = 0.0
+    p_value: float = 1.0
+    probability: float = 0.0
+
+
 class Moved(NamedTuple):
-    """By how much a parameter that was released moved, and the standard deviation of that [SI]."""
+    """By how much a parameter moved, and the standard deviation of that [SI]."""
 
     name: str
     dimension: str
@@ -54,11 +97,11 @@ class Moved(NamedTuple):
 
     def __str__(self) -> str:
         """Return it in mm or degrees."""
-        unit, si = display(self.dimension)
-        return f"{self.name} {self.change / si:+.4g} {unit} (standard deviation {self.std / si:.2g})"
+        found = self.content()
+        return f"{self.name} {found['change']:+.4g} {found['unit']} (standard deviation {found['std']:.2g})"
 
     def content(self) -> dict[str, Any]:
-        """Return it as a document."""
+        """Return it as a document [mm, deg]."""
         unit, si = display(self.dimension)
         return {"name": self.name, "unit": unit, "change": self.change / si, "std": self.std / si}
 
@@ -131,11 +174,11 @@ class Update:
         count = f"{self.readings} readings"
         if self.changes:
             verdict = "The robot has changed" if self.changed else "The robot has not changed, but readings are wrong"
-            lines = [f"{verdict}: {_chi_squared(self.before)} as it was."]
+            lines = [f"{verdict}: {self.before} as it was."]
         elif self.before.likely:
-            lines = [f"The robot has not changed, as far as {count} can tell: {_chi_squared(self.before)}."]
+            lines = [f"The robot has not changed, as far as {count} can tell: {self.before}."]
         else:
-            lines = [f"{count} miss the last calibration by more than it allows: {_chi_squared(self.before)}."]
+            lines = [f"{count} miss the last calibration by more than it allows: {self.before}."]
         for cause in self.changes:
             end = ", left out" if cause.kind == "reading" else ""
             figures = f"chi-squared falls by {cause.gain:.1f}, probability {cause.probability:.2g}"
@@ -146,7 +189,7 @@ class Update:
         if rivals:
             lines.append(f"These readings do not tell it apart from a change of {joined(rivals)}: measure more.")
         if self.changes:
-            lines.append(f"With these changes: {_chi_squared(self.after)}.")
+            lines.append(f"With these changes: {self.after}.")
         if not self.explained:
             lines.append(
                 "No few changes of parameters, frames or readings explain the rest: is it the same robot? "
@@ -155,90 +198,6 @@ class Update:
         rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
         return "\n".join([*lines, "", table(head, rows[:SHOWN]), "", self.result.message])
-
-
-def _chi_squared(fit: Fit) -> str:
-    return f"chi-squared {fit.squares:.1f} of {fit.equations}, probability {fit.probability:.2g}"
-
-
-@dataclass(frozen=True, eq=False)
-class Recalibration:
-    """A result as the prior of new readings: its posterior, and its noise as it was learned.
-
-    Parameters
-    ----------
-    result
-        With a squared penalty or none.
-    inflation
-        Factor on its standard deviations.
-    """
-
-    result: Calibration
-    inflation: float = 1.0
-
-    def problem(self, data: Dataset) -> CalibrationProblem:
-        """Return the result's problem with other measurements; sessions that it does not know stand behind."""
-        problem = self.result.problem
-        if not isinstance(problem, CalibrationProblem):
-            raise InputError("the result", "a calibration of measurements in parts", "one of measurements in memory")
-        return knowing_sessions(problem.on(data))
-
-    def start(self, problem: CalibrationProblem) -> Array:
-        """Return the result's deviations (n,) [SI], zero for sessions that it does not know."""
-        return np.append(self.result.x, np.zeros(len(problem.parameters.free) - len(self.result.x)))
-
-    def widths(self, problem: Source) -> Array:
-        """Return the prior standard deviations (n,) before any calibration [SI]."""
-        return np.append(self._widths, problem.parameters.free.scale[len(self._widths) :])
-
-    @cached_property
-    def _widths(self) -> Array:
-        return prior_widths(self.result)
-
-    def prior(self, problem: CalibrationProblem, released: Sequence[str]) -> Prior:
-        """Return the posterior as a prior, wide for the released parameters."""
-        free = problem.parameters.free
-        x = self.start(problem)
-        widths = self.widths(problem)
-        centre, scale = {}, {}
-        for i in [free.names.index(name) for name in released]:
-            unit = next(u for u in accepted_units(free.dimensions[i]) if UNITS[u].si == 1.0)
-            centre[f"{free.names[i]}_{unit}"] = float(x[i])
-            scale[f"{free.names[i]}_{unit}"] = float(OPEN * widths[i])
-        wide = Prior(centre=centre, scale=scale)
-        if len(released) == len(free):
-            return wide
-        known = set(self.result.problem.parameters.free.names)
-        without = tuple(name for name in released if name in known)
-        # in units of the declared noise, as the new readings are: weight 1 then joins both
-        return Prior.from_result(self.result, self.inflation, without, noise=1.0) & wide
-
-    def formulation(self, problem: CalibrationProblem, released: Sequence[str]) -> Formulation:
-        """Return the result's loss and constraints with the prior as the penalty."""
-        prior = self.prior(problem, released)
-        plain = replace(self.result.formulation, penalty=SQUARES, penalty_over=None)
-        return prior.penalized(plain, prior.stated(problem.parameters, widened=False))
-
-    def calibrate(self, problem: CalibrationProblem, released: Sequence[str], start: Array | None) -> Calibration:
-        """Return the calibration; hyperparameters stay as they were learned."""
-        formulation = self.formulation(problem, released)
-        updated = calibrate(problem, formulation, 1.0, start=start)
-        learned = self.result.learned
-        if learned is not None:
-            more = problem.parameters.free.scale[len(learned.stated) :]
-            learned = replace(
-                learned,
-                left_out=(),
-                notes=(),
-                drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
-                stated=np.append(learned.stated, more),
-                local=np.append(learned.local, np.ones(len(more))),
-            )
-        return replace(updated, learned=learned, asked=partial(calibrate, formulation=formulation, weight=1.0))
-
-    def misfit(self, model: LinearModel, penalty: Quadratic) -> Misfit:
-        """Return the misfit of equations and a prior, by the noise of the result."""
-        return Misfit(model, penalty, self.result.noise_level, self.result.freedom)
 
 
 def update(
@@ -287,8 +246,7 @@ def update(
     (['ABB IRB 120-3/0.58'], ())
     """
     say = progress or (lambda text: None)
-    previous = Recalibration(result, prior_inflation)
-    problem = previous.problem(data)
+    problem = with_data(result, data)
     released: tuple[str, ...] = ()
     if reset:
         free = problem.parameters.free
@@ -296,19 +254,20 @@ def update(
         released = tuple(name for name, new in zip(free.names, matches, strict=True) if new)
     say("comparing with the last calibration")
     # a frame that was reset may be anywhere: then it is registered anew
-    updated = previous.calibrate(problem, released, None if released else previous.start(problem))
-    first, before = _weighed(previous, updated, released)
+    start = None if released else previous_deviations(result, problem)
+    updated = _recalibrated(result, problem, released, prior_inflation, start)
+    first, before = _weighed(result, updated, released)
     causes, after = first, before
     changes: list[Cause] = []
-    while (cause := significant(causes)) is not None and _allowed(changes, cause, len(data)):
+    while (cause := _significant(causes)) is not None and _allowed(changes, cause, len(data)):
         say(f"releasing {cause.name}")
         changes.append(cause)
         if cause.kind == "reading":
             problem = problem.without(set(cause.members))
         else:
             released += cause.members
-        updated = previous.calibrate(problem, released, updated.x)
-        causes, after = _weighed(previous, updated, released)
+        updated = _recalibrated(result, problem, released, prior_inflation, updated.x)
+        causes, after = _weighed(result, updated, released)
     if not after.likely:
         _require_this_robot(result, updated, data)
     known = set(result.problem.parameters.free.names)
@@ -318,24 +277,15 @@ def update(
     return Update(replace(updated, record=record), before, after, tuple(changes), first, moved, len(data))
 
 
+def _significant(causes: Sequence[Cause]) -> Cause | None:
+    """Return the most probable of the causes that chance does not explain."""
+    return next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
+
+
 def _allowed(changes: Sequence[Cause], cause: Cause, readings: int) -> bool:
     """Return whether one more change still leaves something of the robot, or of the readings."""
     alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
     return len(alike) < (max(SPARED * readings, 1) if cause.kind == "reading" else MOST)
-
-
-def _weighed(previous: Recalibration, updated: Calibration, released: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
-    """Return all causes with their evidence, and how well readings and prior fit without them."""
-    model = updated.program.model
-    misfit = previous.misfit(model, updated.program.penalty_form or identity(len(updated.x)))
-    labels: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
-    for part in updated.problem.rows():
-        for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
-            labels.setdefault(int(configuration), []).append(label)
-    readings = [Reading(tuple(names), np.flatnonzero(model.group == number)) for number, names in labels.items()]
-    free = updated.problem.parameters.free
-    widths = previous.widths(updated.problem) / free.scale
-    return weigh(misfit, candidates(free, released), widths, readings), misfit.fit
 
 
 def _require_this_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
@@ -354,34 +304,218 @@ def _require_this_robot(result: Calibration, updated: Calibration, data: Dataset
 
 
 def _moved(result: Calibration, updated: Calibration, name: str) -> Moved:
-    """Return by how much a parameter moved."""
     free = updated.problem.parameters.free
     i = free.names.index(name)
-    spread = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
+    std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
     nominal = result.problem.parameters.free.nominal[i]
     change = free.nominal[i] + updated.x[i] - nominal - result.x[i]
-    return Moved(name, free.dimensions[i], float(change), float(spread))
+    return Moved(name, free.dimensions[i], float(change), float(std))
 
 
 def _record(result: Calibration, inflation: float, released: Sequence[str], left_out: Sequence[str]) -> Record:
     """Return the provenance of the new result: the previous one, by its digest, and those before it."""
     old = result.record
-    digest = old.digest or content(result)["digest"]
-    title = old.title or " and ".join(robot.name for robot in result.problem.arms.values())
     last = Earlier(
-        title,
+        old.title or " and ".join(robot.name for robot in result.problem.arms.values()),
         old.made,
-        digest,
+        old.digest or content(result)["digest"],
         len(result.problem.labels),
         {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
         inflation,
         tuple(released),
         tuple(left_out),
     )
-    return Record(
-        old.title,
-        old.source,
-        excluded=dict.fromkeys(left_out, "far from what the last calibration allows"),
-        simulated=old.simulated,
-        earlier=(*old.earlier, last),
-    )
+    excluded = dict.fromkeys(left_out, "far from what the last calibration allows")
+    earlier = (*old.earlier, last)
+    return Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier)
+
+
+# --- the previous result as a prior ------------------------------------------------------------------------
+
+
+def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
+    """Return a result's problem with other measurements; sessions that it does not know stand behind."""
+    problem = result.problem
+    if not isinstance(problem, CalibrationProblem):
+        raise InputError("the result", "a calibration of measurements in parts", "one of measurements in memory")
+    return knowing_sessions(problem.on(data))
+
+
+def previous_deviations(result: Calibration, problem: CalibrationProblem) -> Array:
+    """Return the result's deviations (n,) [SI], zero for sessions that it does not know."""
+    return np.append(result.x, np.zeros(len(problem.parameters.free) - len(result.x)))
+
+
+def posterior_as_prior(
+    result: Calibration, problem: CalibrationProblem, released: Sequence[str] = (), inflation: float = 1.0
+) -> Formulation:
+    """Return the result's loss and constraints with its posterior as penalty, wide for the released parameters."""
+    free = problem.parameters.free
+    x = previous_deviations(result, problem)
+    widths = _widths(result, problem)
+    centre, scale = {}, {}
+    for i in [free.names.index(name) for name in released]:
+        unit = next(u for u in accepted_units(free.dimensions[i]) if UNITS[u].si == 1.0)
+        centre[f"{free.names[i]}_{unit}"] = float(x[i])
+        scale[f"{free.names[i]}_{unit}"] = float(SIZES[-1] * widths[i])  # so wide that readings alone decide
+    prior = Prior(centre=centre, scale=scale)
+    if len(released) < len(free):
+        known = set(result.problem.parameters.free.names)
+        without = tuple(name for name in released if name in known)
+        # in units of the declared noise, as the new readings are: weight 1 then joins both
+        prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
+    plain = replace(result.formulation, penalty=SQUARES, penalty_over=None)
+    return prior.penalized(plain, prior.stated(problem.parameters, widened=False))
+
+
+def _widths(result: Calibration, problem: Source) -> Array:
+    """Return the prior standard deviations (n,) [SI] before any calibration."""
+    p = result.problem.parameters
+    scale = p.scale.copy()
+    if result.learned is not None:
+        scale[p.identified] = result.learned.stated
+    widths = default_widths(replace(p, scale=scale))[p.identified]
+    return np.append(widths, problem.parameters.free.scale[len(widths) :])
+
+
+def _recalibrated(
+    result: Calibration, problem: CalibrationProblem, released: Sequence[str], inflation: float, start: Array | None
+) -> Calibration:
+    """Return the calibration of new readings; hyperparameters stay as they were estimated."""
+    formulation = posterior_as_prior(result, problem, released, inflation)
+    updated = calibrate(problem, formulation, 1.0, start=start)
+    learned = result.learned
+    if learned is not None:
+        more = problem.parameters.free.scale[len(learned.stated) :]
+        learned = replace(
+            learned,
+            left_out=(),
+            notes=(),
+            drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
+            stated=np.append(learned.stated, more),
+            local=np.append(learned.local, np.ones(len(more))),
+        )
+    return replace(updated, learned=learned, asked=partial(calibrate, formulation=formulation, weight=1.0))
+
+
+# --- every parameter, frame and reading as a cause of a misfit ----------------------------------------------
+
+
+class Misfit:
+    """By how much new readings miss their predictions, in standard deviations of those.
+
+    With the readings' equations A z ~ b and the prior's L z ~ c, all in standard deviations, a change d of some
+    deviations moves the prior alone, L (z - d) ~ c. By the residual e of both together and M = I - B (B'B)^-1 B' of
+    B = [A; L], with D = [0; L] of the parameters that change::
+
+        chi^2 = e' e        it falls by  g' G^-1 g,    g = D' e,    G = D' M D
+    """
+
+    def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic) -> None:
+        sigma = np.sqrt(result.noise_level)
+        self.freedom = max(result.freedom, 1.0)
+        self.m = len(model.b)
+        self.A = model.A / sigma
+        self.L = prior.matrix / sigma
+        B = np.vstack([self.A, self.L])
+        y = np.concatenate([model.b / sigma, prior.c / sigma])
+        U, s, _ = np.linalg.svd(B, full_matrices=False)
+        self.Q = U[:, s > RANK_TOLERANCE * s[0]]
+        self.e = y - self.Q @ (self.Q.T @ y)
+        squares = float(self.e @ self.e)
+        # all of it has as many degrees of freedom as there are readings
+        self.fit = Fit(squares, self.m, self._p_value(squares, self.m))
+
+    def of_parameters(self, index: Sequence[int]) -> tuple[Array, Array]:
+        """Return g (p,) and G (p, p) of a change of some parameters."""
+        return self._projected(slice(self.m, None), self.L[:, list(index)])
+
+    def of_equations(self, index: np.ndarray) -> tuple[Array, Array]:
+        """Return the same of readings that are wrong."""
+        return self._projected(index, np.eye(len(index)))
+
+    def of_drift(self, index: Sequence[int], course: Array) -> tuple[Array, Array]:
+        """Return the same of parameters that move while readings are taken, by ``course`` (m,) of the whole change."""
+        return self._projected(slice(self.m), self.A[:, list(index)] * course[:, None])
+
+    def _projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
+        D = np.zeros((len(self.e), values.shape[1]))
+        D[rows] = values
+        along = self.Q.T @ D
+        return D.T @ self.e, D.T @ D - along.T @ along
+
+    def evidence(self, cause: Cause, g: Array, G: Array) -> Cause:
+        """Return a cause with its gain and p-value."""
+        s, U = np.linalg.eigh(G)
+        observed = s > UNOBSERVABLE * max(float(s[-1]), 1.0)
+        if not observed.any():
+            return cause
+        gain = float(np.sum((U[:, observed].T @ g) ** 2 / s[observed]))
+        return cause._replace(gain=gain, p_value=self._p_value(gain, int(observed.sum())))
+
+    def _p_value(self, squares: float, m: int) -> float:
+        return float(fdtrc(m, self.freedom, squares / m))
+
+
+def candidates(free: Parameters, reset: Sequence[str] = ()) -> list[Cause]:
+    """Return the changes to look for: each of the robot's parameters, and every frame as a whole, but for the reset."""
+    causes = []
+    frames: dict[str, list[str]] = {}
+    for name, frame in zip(free.names, free.of_frames, strict=True):
+        if name in reset or of_session(name):  # an earlier session is over
+            continue
+        if frame:
+            frames.setdefault(name.rpartition("_")[0], []).append(name)
+        else:
+            causes.append(Cause(name, "joint offset" if is_joint_offset(name) else "parameter", (name,)))
+    return causes + [Cause(name, "frame", tuple(names)) for name, names in frames.items()]
+
+
+def _weighed(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
+    """Return all causes with their evidence, the most probable first, and how well readings and prior fit.
+
+    Kinds of causes are as likely as each other before the readings, and so are the causes of a kind.
+    """
+    model = updated.program.model
+    misfit = Misfit(result, model, updated.program.penalty_form or identity(len(updated.x)))
+    free = updated.problem.parameters.free
+    width = _widths(result, updated.problem) / free.scale
+    causes: list[Cause] = []
+    logs: list[float] = []
+    for cause in candidates(free, released):
+        index = [free.names.index(name) for name in cause.members]
+        change = misfit.of_parameters(index)
+        causes.append(misfit.evidence(cause, *change))
+        logs.append(_log_bayes_factor(*change, width[index]))
+    rows: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
+    for part in updated.problem.rows():
+        for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
+            rows.setdefault(int(configuration), []).append(label)
+    for number, labels in rows.items():
+        equations = np.flatnonzero(model.group == number)
+        change = misfit.of_equations(equations)
+        causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
+        logs.append(_log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
+    kinds = [cause.kind for cause in causes]
+    share = (1 - UNCHANGED) / len(set(kinds))
+    posterior = np.array(logs) + np.log([share / kinds.count(kind) for kind in kinds])
+    whole = logsumexp([np.log(UNCHANGED), *posterior])
+    order = np.argsort(-posterior)
+    weighed = [causes[i]._replace(probability=float(np.exp(posterior[i] - whole))) for i in order]
+    return tuple(weighed), misfit.fit
+
+
+def _log_bayes_factor(g: Array, G: Array, width: Array) -> float:
+    """Return ln of the Bayes factor for a change against none, of widths (p,) times each of `SIZES`.
+
+    ::
+
+        ln p(y | d ~ N(0, W^2)) / p(y | 0) = (g' (G + W^-2)^-1 g - ln det(I + W G W)) / 2
+    """
+    logs = []
+    for size in SIZES:
+        W = size * width
+        inner = np.eye(len(g)) + W[:, None] * G * W
+        squares = (W * g) @ np.linalg.solve(inner, W * g)
+        logs.append(0.5 * (squares - np.linalg.slogdet(inner)[1]))
+    return float(logsumexp(logs) - np.log(len(SIZES)))

@@ -10,9 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.data.measurements.position import position
 from rpim_opt.store.simulation import write_simulation
-from rpim_opt.use.cell import Cell
 from tests.simulate import ARM
 
 SIGMA = 2e-5
@@ -110,19 +108,6 @@ def test_compensation_closes_the_loop_to_the_noise(payload: float | None) -> Non
     assert np.abs(predicted - nominal)[ok].max() < 1e-7
     other = ro.use.compensate(result, q, orientation=False, payload=5.0)
     assert rms((real.on(data_at(other.q, payload)).modelled(x)[0] - nominal)[ok]) > 3 * SIGMA
-
-
-def test_the_jacobian_of_commands_knows_that_every_joint_bends_the_others() -> None:
-    result, *_ = calibrated(arm())
-    cell = Cell.of(result, position, None, "", False, False, result.problem.robot.gravity)
-    q = np.random.default_rng(9).uniform(-1.5, 1.5, (5, 6))
-    load = np.full((5, 1), 2.5)
-    J = cell.identified.at(q, load, np.zeros((5, 3)))[2]
-    h = 1e-5
-    for i, step in enumerate(h * np.eye(6)):
-        ahead, behind = (cell.identified.at(q + s * step, load, np.zeros((5, 3)))[0] for s in (1, -1))
-        # of 1e-3 that gravity makes of it, differences keep 1e-10
-        assert np.abs(J[:, :, i] - (ahead - behind) / (2 * h)).max() < 1e-9
 
 
 def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:

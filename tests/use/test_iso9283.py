@@ -48,9 +48,9 @@ def test_what_the_standard_asks_for_is_said_where_it_is_not_there() -> None:
     rng = np.random.default_rng(0)
     poses = [f"P{k}" for k in range(5) for _ in range(30)]
     whole = ro.use.iso9283(poses, rng.normal(size=(150, 3)), np.zeros((150, 3)))
-    assert whole.notes() == []
+    assert whole.content()["notes"] == []
     few = ro.use.iso9283(poses[:62], rng.normal(size=(62, 3)))
-    assert few.notes() == [
+    assert few.content()["notes"] == [
         "The standard has 5 poses approached 30 times each: there are 3 poses, approached 2 to 30 times.",
         "No command is known: there is repeatability, and no accuracy.",
     ]

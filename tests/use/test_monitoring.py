@@ -59,7 +59,8 @@ def test_a_step_is_found_with_its_moment_and_size() -> None:
     drift = found.drift
     assert drift is not None
     assert (drift.cause.name, drift.first, drift.steady) == ("theta3", 12, False)
-    assert abs(drift.change - 5e-4) < 4 * drift.std
+    assert drift.moved is not None
+    assert abs(drift.moved.change - 5e-4) < 4 * drift.moved.std
 
 
 def test_a_slow_drift_is_no_step() -> None:

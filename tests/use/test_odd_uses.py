@@ -13,11 +13,9 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.scatter import Scatter
-from rpim_opt.use.changes import Cause
 from rpim_opt.use.export import export_ur_calibration, export_urdf, write_all
 from rpim_opt.use.monitoring import Drift
-from rpim_opt.use.targets import read_targets
-from rpim_opt.use.validation import read_measurements
+from rpim_opt.use.recalibration import Cause, Moved
 from tests.simulate import ARM, simulated
 
 
@@ -49,6 +47,7 @@ def monitored() -> Any:
 
 READING = Cause("c1", "reading", ("c1",), 40.0, 1e-9, 0.9)
 JOINT = Cause("theta2", "joint offset", ("theta2",), 50.0, 1e-9, 0.6)
+MOVED = Moved("theta2", "angle", 1e-3, 1e-4)
 RIVAL = Cause("theta3", "joint offset", ("theta3",), 45.0, 1e-8, 0.4)
 
 
@@ -79,9 +78,9 @@ def test_an_update_says_what_came_out() -> None:
     ("drift", "said"),
     [
         (None, "No parameter and no frame explains it alone."),
-        (Drift(JOINT, 0, True, 1e-3, 1e-4, "angle"), "theta2, +0.0573 deg (standard deviation 0.0057), steadily from"),
-        (Drift(JOINT, 0, False, 1e-3, 1e-4, "angle"), "before the first check"),
-        (Drift(JOINT, 3, False, None, None, "angle"), "theta2, at once before '4'"),
+        (Drift(JOINT, 0, True, MOVED), "theta2 +0.0573 deg (standard deviation 0.0057), steadily from"),
+        (Drift(JOINT, 0, False, MOVED), "before the first check"),
+        (Drift(JOINT, 3, False, None), "theta2, at once before '4'"),
     ],
 )
 def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
@@ -100,7 +99,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     assert only.content()["alarm"] is None
     moved = found.content()["moved"]
     assert (moved is None) == (drift is None)
-    if drift is not None and drift.change is None:
+    if drift is not None and drift.moved is None:
         assert moved["moved"] is None
 
 
@@ -159,13 +158,13 @@ PLACES = {"x_mm": [1.0, 2.0], "y_mm": [1.0, 2.0], "z_mm": [1.0, 2.0]}
 )
 def test_targets_that_are_none(table: dict[str, Any], said: str) -> None:
     with pytest.raises(ro.InputError) as error:
-        read_targets(table, calibrated().robot)
+        ro.use.read_targets(table, calibrated().robot)
     assert said in str(error.value)
 
 
 def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="measurement: found 'pose'"):
-        read_measurements(calibrated(), {**Q, **PLACES}, "pose")
+        ro.use.read_measurements(calibrated(), {**Q, **PLACES}, "pose")
     pose = ro.load("pose")
     path = tmp_path / "raw.csv"
     head = [*(f"J{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "Q0", "Q1", "Q2", "Q3"]
@@ -173,7 +172,7 @@ def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_pa
     with pytest.raises(
         ro.InputError, match="a quaternion whose components are numbered, accepted: names qw, qx, qy, qz"
     ):
-        read_measurements(pose.calibrate(weight=1.0), path)
+        ro.use.read_measurements(pose.calibrate(weight=1.0), path)
 
 
 APPROACHES = {"Pose": ["P1", "P1"], "X [mm]": [0.0, 1.0], "Y [mm]": [0.0, 0.0], "Z [mm]": [0.0, 0.0]}
@@ -263,4 +262,4 @@ def test_a_table_without_any_known_column_is_named_so(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("a,b\n1,2\n")
     with pytest.raises(ro.InputError, match="header: found nothing that is known among a, b"):
-        read_measurements(calibrated(), path)
+        ro.use.read_measurements(calibrated(), path)
