@@ -23,7 +23,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.study import Metric, Report
 
-QUESTION = "Do the intervals of a robot hold that a camera alone has calibrated?"
+QUESTION = "Do the intervals hold for a robot that was calibrated by a camera alone?"
 SIGMA = 0.1
 VIEWS, ELSEWHERE = 25, 20
 BOARD = ro.data.grid_board(5, 4, 0.04)

@@ -15,7 +15,7 @@ import rpim_opt as ro
 from rpim_opt.basics.text import markdown
 from rpim_opt.study import Metric, Report, distributions
 
-QUESTION = "Is the certified start of hand and eye right where closed forms fail, and does it know when it is not?"
+QUESTION = "Is the certified start of hand-eye calibration right where closed forms fail, and does it detect failure?"
 METRICS = {
     "worse_than_a_closed_form": Metric("lower", 0.0),
     "certified_but_wrong": Metric("lower", 0.0),

@@ -17,7 +17,7 @@ from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.baselines import levenberg_marquardt
 from rpim_opt.study import Metric, Report, distributions
 
-QUESTION = "How near do formulations come to the truth: 52 configurations, ten, or four blunders?"
+QUESTION = "How accurate is each formulation: 52 configurations, ten, or four gross errors?"
 SITUATIONS = {"clean52": (52, 0), "few10": (10, 0), "blunders52": (52, 4)}
 SCALES = {
     "generic": {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 1.0},

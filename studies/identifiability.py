@@ -23,7 +23,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.simulation import write_simulation
 from rpim_opt.study import Metric, Report
 
-QUESTION = "What can which instrument identify, with how many configurations, and what do redundant parameters cost?"
+QUESTION = "What can each instrument identify, with how many configurations, and what do redundant parameters cost?"
 ROBOTS = ("ur10e", "kr6_r900", "irb4600_60_205", "panda")
 INSTRUMENTS = {
     "position": "[noise]\nposition_mm = 0.03\n[tool]\nx_mm = 30\ny_mm = -20\nz_mm = 60\n[base]\nx_mm = 0\n",

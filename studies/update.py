@@ -19,7 +19,7 @@ from rpim_opt.calibration import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.study import Metric, Report, distributions
 
-QUESTION = "Is a change of a calibrated robot found, and what do eight points make of what was known before?"
+QUESTION = "Is a change of a calibrated robot detected, and how accurate is an update from eight points?"
 FIRST = 17_000
 """Seed of the first arm: nothing was chosen by these."""
 SIGMA = 5e-5
