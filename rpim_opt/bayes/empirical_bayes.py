@@ -74,27 +74,27 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
     every = sampled(problem)
     estimator, whole, notes = _first(every, estimator, _begin(every, start))
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
+    stated = every.parameters.free.names
     curved = None
+    gain = 0.0
     if model == "auto" and possible(fit.problem):
-        curved = admitted(estimator, fit, every.parameters.free.names, trials)
-    if curved is None:
-        x, fitted = fit.x, fit.laid
-        laid = problem.with_parameters(fitted.parameters).scattered(fitted.scatter)
-    else:
-        x, fitted = curved.x, curved.problem
-        laid = problem.with_transmission(fitted.robot.model.curves).with_parameters(fitted.parameters)
-        laid = laid.scattered(fitted.scatter)
+        curved = admitted(estimator, fit, stated, trials)
+    if curved is not None:
+        fit, trials, gain = curved
+        problem = problem.with_transmission(fit.problem.robot.model.curves)
+    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
-        outliers = beyond_noise(laid, x)
+        outliers = beyond_noise(laid, fit.x)
     if outliers:
         laid = laid.without(outliers)
-    worst = tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1]))
-    stated = set(every.parameters.free.names)
-    added = tuple(name for name in fit.problem.parameters.free.names if name not in stated)
-    if curved is not None:
-        return Found(laid, replace(curved.learned, left_out=worst, notes=notes), curved.stated, x)
-    result = learned(fit, added, trials, worst, notes)
-    return Found(laid, result, estimator.inside(fit.problem, fit.point), fit.x)
+    found = learned(
+        fit,
+        gain,
+        trials=trials,
+        left_out=tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1])),
+        added=tuple(name for name in fit.problem.parameters.free.names if name not in stated),
+    )
+    return Found(laid, replace(found, notes=(*notes, *found.notes)), fit.inside, fit.x)
 
 
 def _begin(problem: CalibrationProblem, start: Array | None) -> Array:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from scipy.linalg import block_diag, get_lapack_funcs
+from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.scatter import Scatter, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
 """Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""
+CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5)}
+"""Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm."""
 NOISE_SD, GEOMETRY_SD, FAMILY_SD = 2.0, 3.0, 2.0
 """Prior standard deviations of the natural logarithms of the hyperparameters."""
 BASE_SD = 1.0
@@ -47,26 +49,30 @@ MOST_WIDENED = 100.0
 """Upper bound on the factor of tails on a local variance: where data contradict them, nothing else bounds it."""
 
 
+class Spectrum(NamedTuple):
+    """Prior variances of Fourier coefficients that stand for Gaussian processes with Matern's covariance (3/2).
+
+    size^2 8 r^3 / (r^2 + w^2)^2 / measure with r = sqrt(3) / length; squared frequencies and measures are (c,).
+    """
+
+    w2: Array
+    measure: Array
+
+    def logarithms(self, length: float) -> tuple[Array, Array, Array]:
+        """Return the logarithms (c,) at size 1, with first and second derivatives by ln length."""
+        r2 = 3 / length**2
+        logs = np.log(8 * r2**1.5 / self.measure) - 2 * np.log(r2 + self.w2)
+        return logs, 4 * r2 / (r2 + self.w2) - 3, -8 * r2 * self.w2 / (r2 + self.w2) ** 2
+
+
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
     """Hierarchical prior of p deviations, in units of their scales.
 
-    Parameters
-    ----------
-    group
-        (p,) number of the group whose scale multiplies a deviation's; -1 without one.
-    heavy
-        (p,) which deviations have Student's tails; the others are normal.
-    names
-        Of the groups.
-    covariance
-        (s, s) of the logarithms of their scales, before the data: `scale_covariance`.
-    tails
-        Degrees of freedom of Student's t.
-    replaced
-        (p,) which deviations have no prior of their own, because `rows` say all.
-    rows, values
-        (k, p) and (k,): rows z - values ~ N(0, I).
+    ``group`` (p,) numbers the groups ``names`` whose scale multiplies a deviation's, -1 without one; deviations are
+    normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom; those ``replaced`` (p,) have no prior of
+    their own. rows z - values ~ N(0, I) besides. The last deviations may have the variances of a ``spectrum``.
+    ``covariance`` (g, g) is that of the logarithms of the groups' scales before the data.
     """
 
     group: np.ndarray
@@ -77,11 +83,52 @@ class Hierarchy:
     replaced: np.ndarray
     rows: Array
     values: Array
+    spectrum: Spectrum | None = None
 
     @property
     def geometry(self) -> np.ndarray:
         """Numbers of the groups that have Student's tails."""
         return np.unique(self.group[self.heavy])
+
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """Names of the groups, and of the spectrum's hyperparameters."""
+        return self.names if self.spectrum is None else (*self.names, *CURVES)
+
+    def variances(self, logs: Array) -> tuple[Array, Array, Array]:
+        """Return variances (p,) at logarithms of hyperparameters, slopes (p, s) and the length's curvature (p,) of ln.
+
+        Without local scales; replaced deviations follow no hyperparameter.
+        """
+        g = len(self.names)
+        variances = np.append(np.exp(2 * logs[:g]), 1.0)[self.group]
+        slopes = np.zeros((len(variances), len(logs)))
+        slopes[:, :g] = 2.0 * (self.group[:, None] == np.arange(g))
+        curvature = np.zeros(len(variances))
+        if self.spectrum is not None:
+            own = slice(len(variances) - len(self.spectrum.w2), None)
+            shares, slope, curvature[own] = self.spectrum.logarithms(float(np.exp(logs[g + 1])))
+            variances[own] = np.exp(2 * logs[g] + shares)
+            slopes[own, g] = 2.0
+            slopes[own, g + 1] = slope
+        slopes[self.replaced] = 0.0
+        return variances, slopes, curvature
+
+    def of(self, keep: np.ndarray) -> Hierarchy:
+        """Return the prior of some of the deviations (p,); all of a spectrum or none."""
+        group = self.group[keep]
+        used = np.unique(group[group >= 0])
+        number = np.full(len(self.names) + 1, -1)
+        number[used] = np.arange(len(used))
+        return replace(
+            self,
+            group=number[group],
+            heavy=self.heavy[keep],
+            names=tuple(self.names[i] for i in used),
+            covariance=self.covariance[np.ix_(used, used)],
+            replaced=self.replaced[keep],
+            rows=self.rows[:, keep],
+        )
 
 
 def scale_covariance(geometry: np.ndarray, base: np.ndarray) -> Array:
@@ -99,6 +146,42 @@ class Linearized:
     X: Array
     y: Array
     stacks: Sequence[Stack]
+
+
+class Whitened(NamedTuple):
+    """One stack, L L' = R its covariances: L^-1 X (N, k, p), L^-1 y (N, k), L^-1 dR L^-T (q, N, k, k), and ln|R|."""
+
+    X: Array
+    y: Array
+    noise: Array
+    logdet: float
+
+
+def whitened(data: Linearized, scatter: Scatter, noise: Mapping[str, float]) -> list[Whitened]:
+    """Return equations in units of their noise, with its derivatives by the logarithms of some of its parts."""
+    found = []
+    for stack in data.stacks:
+        N, k = stack.index.shape
+        L = np.linalg.cholesky(stack.covariance(scatter))
+        inverse = np.linalg.inv(L)
+        slopes = [2 * np.exp(2 * log) * noise_share(stack, kind) for kind, log in noise.items()]
+        by_noise = inverse @ np.reshape(slopes, (-1, N, k, k)) @ inverse.transpose(0, 2, 1)
+        y = (inverse @ data.y[stack.index][:, :, None])[:, :, 0]
+        logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+        found.append(Whitened(inverse @ data.X[stack.index], y, by_noise, logdet))
+    return found
+
+
+def noise_share(stack: Stack, kind: str) -> Array:
+    """Return what a unit of a noise adds to the covariances (N, k, k)."""
+    if kind == "joint":
+        return stack.joint @ stack.joint.transpose(0, 2, 1)
+    if kind == "instrument":
+        return stack.instrument
+    if kind == "position" and stack.unit is not None:
+        return stack.unit
+    mask = stack.angle if kind == "orientation" else stack.length
+    return mask[:, :, None] * np.eye(mask.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,25 +220,6 @@ class Point:
         found = M.diagonal() @ self.own
         found[len(found) - len(self.noise) :] += np.einsum("aij,ij->a", self.noise, M)
         return np.asarray(found, dtype=float)
-
-
-class _Whitened(NamedTuple):
-    """One stack, L L' its covariances: L^-1 X (N, k, p), L^-1 y (N, k), L^-1 dR L^-T (q, N, k, k)."""
-
-    X: Array
-    y: Array
-    noise: Array
-
-
-class _Informed(NamedTuple):
-    """What the data say at some noise (as bytes): H z = h, ln |R|, and X'R^-1 R_a R^-1 X (q, p, p)."""
-
-    noise: bytes
-    parts: Sequence[_Whitened]
-    H: Array
-    h: Array
-    logdet: float
-    S: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,52 +272,61 @@ class Evidence:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all hyperparameters: scales of deviations, then noise."""
-        return (*self.prior.names, *self.noise)
+        return (*self.prior.hyperparameters, *self.noise)
 
     @cached_property
     def centre(self) -> Array:
         """Prior medians of the logarithms of the hyperparameters (s,)."""
-        return np.concatenate([np.zeros(len(self.prior.names)), np.log([CENTRES[kind] for kind in self.noise])])
+        medians = {name: median for name, (median, _) in CURVES.items()} | CENTRES
+        return np.log([medians.get(name, 1.0) for name in self.names])
 
     @cached_property
     def root(self) -> Array:
         """Root L (s, s) of their prior precision L'L."""
         scales = np.linalg.inv(np.linalg.cholesky(self.prior.covariance))
-        return np.asarray(block_diag(scales, np.eye(len(self.noise)) / NOISE_SD), dtype=float)
+        others = self.names[len(self.prior.names) :]
+        precisions = [1 / CURVES[name][1] if name in CURVES else 1 / NOISE_SD for name in others]
+        return np.asarray(block_diag(scales, np.diag(precisions)), dtype=float)
 
     def scatter(self, logs: Array) -> Scatter:
         """Return the noise at logarithms of hyperparameters (s,)."""
-        sizes = np.exp(logs[len(self.prior.names) :])
+        sizes = np.exp(logs[len(logs) - len(self.noise) :])
         return replace(self.fixed, **dict(zip(self.noise, map(float, sizes), strict=True)))
 
     def at(self, logs: Array, near: Point | None = None, accuracy: float = SETTLED) -> Point:
         """Return the marginal likelihood at (s,); local variances are looked for from those of a point on."""
         prior = self.prior
-        s = len(prior.names)
-        data = self._informed(logs)
-        size2 = self._size2(logs)
+        s = len(prior.hyperparameters)
+        parts = whitened(self.data, self.scatter(logs), dict(zip(self.noise, logs[s:], strict=True)))
+        H = prior.rows.T @ prior.rows
+        h = prior.rows.T @ prior.values
+        S = np.zeros((len(self.noise), len(h), len(h)))  # X'R^-1 R_a R^-1 X
+        for part in parts:
+            X = part.X.reshape(-1, len(h))
+            H = H + X.T @ X
+            h = h + X.T @ part.y.ravel()
+            S += X.T @ (part.noise @ part.X).reshape(len(S), len(X), len(h))
+        size2, of_size, bend = prior.variances(logs)
         v = size2
         if near is not None:
-            v = near.v * size2 / self._size2(near.logs)
-        z, C, logdet, v = self._settled(data, size2, v, accuracy)
+            v = near.v * size2 / prior.variances(near.logs)[0]
+        z, C, logdet, v = self._settled(H, h, size2, v, accuracy)
         e2 = z**2 + C.diagonal()
-        residuals = [part.y - part.X @ z for part in data.parts]
+        residuals = [part.y - part.X @ z for part in parts]
         own = ~prior.replaced
         normal = own & ~prior.heavy
-        value = logdet + data.logdet + float(np.sum((prior.rows @ z - prior.values) ** 2))
+        value = logdet + sum(part.logdet for part in parts) + float(np.sum((prior.rows @ z - prior.values) ** 2))
         value += sum(float(np.sum(residual**2)) for residual in residuals)
         value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
         value += self._tails_value(e2, size2, v)
-        of_size = np.zeros((len(z), len(logs)))
-        of_size[own, :s] = 2.0 * (prior.group[own, None] == np.arange(s))
         slope = 2 * (1 - e2 / v)
         slope[self._heavy] = (2 * prior.tails * (size2 / v - 1))[self._heavy]
         gradient = slope @ of_size / 2
-        by_noise, f, among = _by_noise(data, residuals, z, C)
+        by_noise, f, among = _by_noise(parts, residuals, z, C, S)
         gradient[s:] = by_noise
         # how the mean follows noise, and e^2 at constant local variances
         z_by_noise = -C @ f.T
-        CS = C @ data.S
+        CS = C @ S
         among = among + 2 * f @ z_by_noise - np.einsum("aij,bji->ab", CS, CS)
         direct = np.zeros_like(of_size)
         direct[:, s:] = np.einsum("aij,ji->ia", CS, C) + 2 * z[:, None] * z_by_noise
@@ -266,6 +339,8 @@ class Evidence:
         curvature[:s] = of_size[:, :s].T @ slopes / 2
         curvature[s:, :s] = curvature[:s, s:].T
         curvature[s:, s:] = among + 2 * np.diag(by_noise) - direct[:, s:].T @ (information[:, None] * log_v[:, s:])
+        if prior.spectrum is not None:
+            curvature[s - 1, s - 1] += float(np.sum((1 - e2 / v) * bend))
         off = self.root @ (logs - self.centre)
         precision = information[:, None] * log_v
         of_z = C @ (z[:, None] * precision)
@@ -280,12 +355,12 @@ class Evidence:
             v=v,
             slopes=of_z,
             own=precision,
-            noise=data.S,
+            noise=S,
         )
 
     def widening(self, point: Point) -> Array:
         """Return by what deviations move (p, h) beside `Point.C`: D, with D D' what Student's tails add to it."""
-        size = np.sqrt(self._size2(point.logs)[self._heavy])
+        size = np.sqrt(self.prior.variances(point.logs)[0][self._heavy])
         return tail_widening(point.z, point.C, point.v, self._heavy, size, self.prior.tails)
 
     def optima(self, starts: Sequence[Array], accuracy: float = 1e-3) -> list[Point]:
@@ -293,11 +368,6 @@ class Evidence:
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
         accuracy. A way that leads into an optimum that is known ends there.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            When the data are not finite.
         """
         found: list[Point] = []
         for start in starts:
@@ -318,15 +388,15 @@ class Evidence:
                 last = self.at(logs.copy(), last, ROUGHLY)
             return last
 
-        def value(logs: Array) -> float:
-            return float(np.nan_to_num(ask(logs).value, nan=np.inf))
+        def is_known(logs: Array, value: float) -> bool:
+            return any(value >= point.value and np.abs(logs - point.logs).max() <= BASIN for point in known)
 
         def explored(intermediate_result: Any) -> None:
-            if _in_basin(intermediate_result.x, intermediate_result.fun, known):
+            if is_known(intermediate_result.x, intermediate_result.fun):
                 raise StopIteration
 
         found = scipy.optimize.minimize(
-            value,
+            lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
             start,
             method="trust-exact",
             jac=lambda logs: ask(logs).gradient,
@@ -334,16 +404,14 @@ class Evidence:
             callback=explored,
             options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
         )
-        if _in_basin(found.x, found.fun, known):
-            return None
-        return self.at(found.x, last)
+        return None if is_known(found.x, found.fun) else self.at(found.x, last)
 
     def starts(self) -> list[Array]:
         """Return where optima are looked for: all of it noise, prior medians, and large deviations.
 
         The first one leads to the best optimum most often, where only one is used.
         """
-        noisy = 3.0 * (np.arange(len(self.centre)) >= len(self.prior.names))
+        noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = np.zeros(len(self.centre))
         geometry[self.prior.geometry] = 2.0
         found = [self.centre]
@@ -355,63 +423,7 @@ class Evidence:
 
     def restricted(self, keep: np.ndarray) -> Evidence:
         """Return the marginal likelihood of a model with some of the columns (p,)."""
-        prior = self.prior
-        group = prior.group[keep]
-        used = np.unique(group[group >= 0])
-        number = np.full(len(prior.names) + 1, -1)
-        number[used] = np.arange(len(used))
-        fewer = replace(
-            prior,
-            group=number[group],
-            heavy=prior.heavy[keep],
-            names=tuple(prior.names[i] for i in used),
-            covariance=prior.covariance[np.ix_(used, used)],
-            replaced=prior.replaced[keep],
-            rows=prior.rows[:, keep],
-        )
-        return replace(self, data=replace(self.data, X=self.data.X[:, keep]), prior=fewer)
-
-    # --- what the data say at some noise ------------------------------------------------------------------------
-
-    def _informed(self, logs: Array) -> _Informed:
-        """Return what the data say at a noise; the last one is kept, as often only scales of deviations change."""
-        noise = logs[len(self.prior.names) :]
-        if self._last and self._last[0].noise == noise.tobytes():
-            return self._last[0]
-        scatter = self.scatter(logs)
-        H = self.prior.rows.T @ self.prior.rows
-        h = self.prior.rows.T @ self.prior.values
-        p = len(h)
-        S = np.zeros((len(noise), p, p))
-        total = 0.0
-        parts = []
-        for stack, equations, right, shares in self._stacked:
-            L = np.linalg.cholesky(stack.covariance(scatter))
-            inverse = np.asarray(np.linalg.inv(L), dtype=float)
-            total += 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-            by_noise = inverse @ (2 * np.exp(2 * noise)[:, None, None, None] * shares) @ inverse.transpose(0, 2, 1)
-            part = _Whitened(inverse @ equations, (inverse @ right)[:, :, 0], by_noise)
-            X = part.X.reshape(-1, p)
-            H = H + X.T @ X
-            h = h + X.T @ part.y.ravel()
-            S += X.T @ (by_noise @ part.X).reshape(len(noise), len(X), p)
-            parts.append(part)
-        self._last[:] = [_Informed(noise.tobytes(), parts, H, h, total, S)]
-        return self._last[0]
-
-    @cached_property
-    def _last(self) -> list[_Informed]:
-        return []
-
-    @cached_property
-    def _stacked(self) -> list[tuple[Stack, Array, Array, Array]]:
-        """The stacks, their equations (N, k, p) and (N, k, 1), and what a unit of every noise adds (q, N, k, k)."""
-        found = []
-        for stack in self.data.stacks:
-            N, k = stack.index.shape
-            shares = np.array([noise_share(stack, kind) for kind in self.noise]).reshape(-1, N, k, k)
-            found.append((stack, self.data.X[stack.index], self.data.y[stack.index][:, :, None], shares))
-        return found
+        return replace(self, data=replace(self.data, X=self.data.X[:, keep]), prior=self.prior.of(keep))
 
     # --- local variances ----------------------------------------------------------------------------------------
 
@@ -420,17 +432,9 @@ class Evidence:
         """Which deviations have local variances."""
         return np.flatnonzero(self.prior.heavy & ~self.prior.replaced)
 
-    @cached_property
-    def _light(self) -> np.ndarray:
-        """Which deviations have the variance of their group."""
-        return np.flatnonzero(~self.prior.heavy | self.prior.replaced)
-
-    def _size2(self, logs: Array) -> Array:
-        """Return the square of every deviation's group scale (p,)."""
-        squares = np.append(np.exp(2 * logs[: len(self.prior.names)]), 1.0)
-        return squares[self.prior.group]
-
-    def _settled(self, data: _Informed, size2: Array, v: Array, accuracy: float) -> tuple[Array, Array, float, Array]:
+    def _settled(
+        self, H: Array, h: Array, size2: Array, v: Array, accuracy: float
+    ) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v, which determine each other."""
         heavy = self._heavy
         local = v[heavy]
@@ -438,9 +442,10 @@ class Evidence:
         own = np.where(self.prior.replaced, 0.0, 1.0)
         if len(heavy):
             # the others' variances stay: their share of the information is taken out once
-            S, g = _without(data.H, data.h, own / v, heavy, self._light)
+            light = np.setdiff1d(np.arange(len(v)), heavy)
+            S, g = _without(H, h, own / v, heavy, light)
             v[heavy] = self._local(S, g, size2[heavy], local, accuracy)
-        return *_posterior(data.H, data.h, own / v), v
+        return *_posterior(H, h, own / v), v
 
     def _local(self, S: Array, g: Array, size2: Array, v: Array, accuracy: float) -> Array:
         """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g.
@@ -483,23 +488,20 @@ class Evidence:
         return float(np.sum((nu + 1) * np.log((nu * t2 + e2) / (nu + 1)) - nu * np.log(t2) + 1 - e2 / v))
 
 
-def _in_basin(logs: Array, value: float, known: Sequence[Point]) -> bool:
-    """Return whether a point is above an optimum that is known, and near it."""
-    return any(value >= point.value and np.abs(logs - point.logs).max() <= BASIN for point in known)
-
-
-def _by_noise(data: _Informed, residuals: Sequence[Array], z: Array, C: Array) -> tuple[Array, Array, Array]:
+def _by_noise(
+    parts: Sequence[Whitened], residuals: Sequence[Array], z: Array, C: Array, S: Array
+) -> tuple[Array, Array, Array]:
     """Return derivatives by logarithms of noise: the gradient (q,), X'R^-1 R_a u (q, p), and a part of the second's.
 
     The last (q, q) leaves C as it is: 2 u'R_a R^-1 R_b u - tr(R^-1 R_a (R^-1 - 2 R^-1 X C X'R^-1) R_b).
     """
-    q = len(data.S)
-    gradient = -np.einsum("aij,ji->a", data.S, C)
+    q = len(S)
+    gradient = -np.einsum("aij,ji->a", S, C)
     f = np.zeros((q, len(z)))
     among = np.zeros((q, q))
     if not q:
         return gradient, f, among
-    for part, residual in zip(data.parts, residuals, strict=True):
+    for part, residual in zip(parts, residuals, strict=True):
         moved = (part.noise @ residual[:, :, None]).reshape(q, -1)
         gradient += np.einsum("ankk->a", part.noise) - moved @ residual.ravel()
         f += moved @ part.X.reshape(-1, len(z))
@@ -509,34 +511,17 @@ def _by_noise(data: _Informed, residuals: Sequence[Array], z: Array, C: Array) -
     return gradient, f, among
 
 
-def noise_share(stack: Stack, kind: str) -> Array:
-    """Return what a unit of a noise adds to the covariances (N, k, k)."""
-    if kind == "joint":
-        return stack.joint @ stack.joint.transpose(0, 2, 1)
-    if kind == "instrument":
-        return stack.instrument
-    if kind == "position" and stack.unit is not None:
-        return stack.unit
-    mask = stack.length
-    if kind == "orientation":
-        mask = stack.angle
-    return mask[:, :, None] * np.eye(mask.shape[1])
-
-
 # --- linear algebra ---------------------------------------------------------------------------------------------
 
 _potrf: Any = get_lapack_funcs("potrf", dtype=float)
 _potri: Any = get_lapack_funcs("potri", dtype=float)
-_posv: Any = get_lapack_funcs("posv", dtype=float)
-_trtrs: Any = get_lapack_funcs("trtrs", dtype=float)
 
 
 def _factored(H: Array, precision: Array) -> tuple[Array, Array]:
     """Return L and d with L L' = M scaled by d to a diagonal of ones, M = H + diag(precision)."""
-    n = len(precision)
     d = 1 / np.sqrt(H.diagonal() + precision)
     scaled = H * d[:, None] * d
-    scaled.flat[:: n + 1] = 1 + RIDGE
+    scaled.flat[:: len(d) + 1] = 1 + RIDGE
     factor, failed = _potrf(scaled, lower=1)
     if failed:
         raise np.linalg.LinAlgError("information matrix is not positive definite")
@@ -547,7 +532,7 @@ def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, floa
     """Return z = M^-1 h, M^-1 and ln|M| of M = H + diag(precision), with M scaled to a diagonal of ones."""
     factor, d = _factored(H, precision)
     logdet = 2 * float(np.sum(np.log(factor.diagonal() / d)))
-    lower, _ = _potri(factor, lower=1)  # its upper half is zero, as potrf left it
+    lower, _ = _potri(factor, lower=1)  # its upper half is zero, as Cholesky's left it
     C = lower + lower.T
     C.flat[:: len(d) + 1] /= 2
     C *= d[:, None] * d
@@ -562,24 +547,27 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
     if np.abs(change).max() <= COUPLED:
         root = np.sqrt(weighed * v)
         ratio = np.sqrt(weighed / v)
-        _, step, failed = _posv(np.eye(len(v)) - M / np.outer(root, root), change * ratio)
-        step = np.asarray(step, dtype=float) / ratio
-        if not failed and np.abs(step).max() <= LONGEST_COUPLED:
-            return step
+        try:
+            L = np.linalg.cholesky(np.eye(len(v)) - M / np.outer(root, root))
+        except np.linalg.LinAlgError:
+            pass
+        else:
+            step = scipy.linalg.cho_solve((L, True), change * ratio, check_finite=False) / ratio
+            if np.abs(step).max() <= LONGEST_COUPLED:
+                return np.asarray(step, dtype=float)
     return change / (1 - np.minimum(M.diagonal() / (weighed * v), STEEPEST))
 
 
 def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.ndarray) -> tuple[Array, Array]:
     """Return the information on some deviations, and its product with their mean, where the others are integrated.
 
-    By Cholesky's factor, which loses no more than one of the whole matrix would: an inverse loses all digits where
-    frames are nearly free.
+    By Cholesky's factor: an inverse loses all digits where frames are nearly free.
     """
     if not len(others):
         return H, h
     factor, d = _factored(H[others][:, others], precision[others])
     right = np.column_stack([H[others][:, kept], h[others]]) * d[:, None]
-    Y, _ = _trtrs(factor, right, lower=1)
+    Y = solve_triangular(factor, right, lower=True, check_finite=False)
     return H[kept][:, kept] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
 
 
@@ -596,16 +584,8 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
 
         C + D D' = (C^-1 - diag(1 / v - w))^-1        D = C B L^-T,    B B' = diag(1 / v - w),    L L' = I - B'C B
 
-    Means stay. (One step of expectation propagation, from the mean field on.)
-
-    Parameters
-    ----------
-    z, C, v
-        (p,), (p, p) and (p,): posterior means and covariance with the local variances, and these.
-    heavy, size
-        (h,) the deviations with tails, by number, and the scales tau of their groups.
-    tails
-        Degrees of freedom.
+    Means stay (one step of expectation propagation). ``heavy`` (h,) numbers the deviations with tails, ``size`` (h,)
+    are the scales tau of their groups.
     """
     c = C.diagonal()[heavy]
     local = v[heavy]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,15 +12,23 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
 from rpim_opt.basics.threads import phase
-from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, scale_covariance
+from rpim_opt.bayes.evidence import (
+    FARTHEST,
+    Evidence,
+    Hierarchy,
+    Linearized,
+    Point,
+    Spectrum,
+    scale_covariance,
+)
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
-from rpim_opt.bayes.prior_terms import Stated
+from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.scatter import Scatter, Stack
 from rpim_opt.problem.source import Source
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.terms import Curve
 
 MOST = 1000
 """Configurations that hyperparameters are estimated from, drawn at random where there are more."""
@@ -164,19 +171,13 @@ def sessions_spread(learned: Learned | None) -> float:
 class Fit:
     """A problem with hyperparameters laid into it, and where it was linearized.
 
-    Parameters
-    ----------
-    problem
-        With its stated scales.
-    evidence, point, others
-        The last marginal likelihood, its optimum, and others that were reached from other sides.
-    laid
-        The problem with local scales and noise: ordinary Tikhonov at weight 1.
-    x
-        (n,) its solution [SI].
+    ``problem`` has its stated scales and the prior ``stated``; ``evidence`` is the last marginal likelihood, ``point``
+    its optimum, ``others`` those that were reached from other sides. ``laid`` is the problem with local scales and
+    noise, ordinary Tikhonov at weight 1, and ``x`` (n,) its solution [SI].
     """
 
     problem: CalibrationProblem
+    stated: Stated
     evidence: Evidence
     point: Point
     others: Sequence[Point]
@@ -197,12 +198,17 @@ class Fit:
     @property
     def unit(self) -> Array:
         """(n,) what multiplies the deviations of the marginal likelihood [SI]."""
-        return self.laid.parameters.free.scale / np.sqrt(self.point.v)
+        return self.problem.parameters.free.scale * self.stated.scale
 
     @property
     def covariance(self) -> Array:
         """Covariance (n, n) of the deviations [SI]."""
         return self.point.C * np.outer(self.unit, self.unit)
+
+    @property
+    def inside(self) -> Stated:
+        """The prior in units of the estimated scales."""
+        return self.stated.inside(self.stated.scale * np.sqrt(self.point.v))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,27 +223,19 @@ class Estimator:
         Parts of the noise that are estimated, where the data have such equations.
     refit
         How a Tikhonov fit at weight 1 goes on from one linearization; without it the posterior mean stands for one.
+    curves
+        Transmission errors of joints, whose coefficients are the last parameters of a problem.
     """
 
     prior: Prior
     noise: tuple[str, ...]
     refit: Refit | None = None
+    curves: tuple[Curve, ...] = ()
 
-    @cached_property
-    def _tables(self) -> dict[int, tuple[Parameters, Stated]]:
-        return {}
-
-    def stated(self, problem: CalibrationProblem) -> Stated:
-        """Return the prior of a problem's parameters, in units of their stated scales; computed once a table."""
-        table = problem.parameters
-        if id(table) not in self._tables:  # the table is kept, so that its id is its own
-            self._tables[id(table)] = (table, self.prior.stated(table))
-        return self._tables[id(table)][1]
-
-    def evidence(self, problem: CalibrationProblem, x: Array) -> Evidence:
+    def evidence(self, problem: CalibrationProblem, x: Array, stated: Stated | None = None) -> Evidence:
         """Return the marginal likelihood of a linearization at x (n,) [SI]."""
         free = problem.parameters.free
-        stated = self.stated(problem)
+        stated = stated or self.prior.stated(problem.parameters)
         residual, jacobian = problem.slopes(x)
         J = problem.contrasts(jacobian)
         y = problem.contrasts(residual[:, None])[:, 0] + J @ x
@@ -258,6 +256,11 @@ class Estimator:
             rows=stated.rows * stated.scale,
             values=stated.values - stated.rows @ stated.centre,
         )
+        if self.curves:
+            spectrum = spectrum_of(self.curves, unit)
+            known = np.arange(len(unit)) < len(unit) - len(spectrum.w2)
+            own = replace(hierarchy, group=np.where(known, stated.group, FIXED), spectrum=spectrum)
+            hierarchy = own.of(np.ones(len(unit), dtype=bool))
         return Evidence(data, hierarchy, self._kinds(data), problem.scatter or Scatter())
 
     def _kinds(self, data: Linearized) -> tuple[str, ...]:
@@ -295,34 +298,31 @@ class Estimator:
 
     def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
         """Return hyperparameters at one linearization, from known ones (s,) and from several sides, with a fit."""
-        evidence = self.evidence(problem, x)
+        p = problem.parameters
+        stated = self.prior.stated(p)
+        evidence = self.evidence(problem, x, stated)
         starts = [] if known is None else [known]
         if several:
             starts += sides(problem, evidence)
         with phase("selection"):
             point, *others = evidence.optima(starts)
-        laid = self._laid(problem, evidence, point, x)
-        stated = self.stated(problem)
-        mean = problem.parameters.free.scale * (stated.centre + stated.scale * point.z)
-        if self.refit is not None and _distance(mean, x, laid) > CLOSE:  # too far for one linearization
-            mean = self.refit(laid, self.prior.penalized(tikhonov, self.inside(problem, point)), x, iterations)
-        return Fit(problem, evidence, point, others, laid, mean)
-
-    def _widths(self, problem: CalibrationProblem, point: Point) -> Array:
-        """Return by what the scales of the identified parameters are multiplied, (n,)."""
-        return self.stated(problem).scale * np.sqrt(point.v)
-
-    def inside(self, problem: CalibrationProblem, point: Point) -> Stated:
-        """Return the prior in units of the estimated scales."""
-        return self.stated(problem).inside(self._widths(problem, point))
-
-    def _laid(self, problem: CalibrationProblem, evidence: Evidence, point: Point, x: Array) -> CalibrationProblem:
-        """Return the problem with local scales and the robot's repeatability."""
-        p = problem.parameters
         scale = p.scale.copy()
-        scale[p.identified] *= self._widths(problem, point)
+        scale[p.identified] *= stated.scale * np.sqrt(point.v)
         scatter = replace(evidence.scatter(point.logs), at=parameter_values(problem, x))
-        return replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
+        laid = replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
+        mean = p.free.scale * (stated.centre + stated.scale * point.z)
+        fit = Fit(problem, stated, evidence, point, others, laid, mean)
+        if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
+            return fit
+        return replace(fit, x=self.refit(laid, self.prior.penalized(tikhonov, fit.inside), x, iterations))
+
+
+def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
+    """Return the prior variances of the coefficients of curves, the last of (n,) deviations in these units [SI]."""
+    cycles = [np.tile(2 * np.pi / curve.period * np.arange(1, curve.harmonics + 1), 2) for curve in curves]
+    periods = np.concatenate([np.full(2 * curve.harmonics, curve.period) for curve in curves])
+    w = np.asarray(np.concatenate(cycles), dtype=float)
+    return Spectrum(w**2, periods * unit[len(unit) - len(periods) :] ** 2)
 
 
 def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
@@ -364,42 +364,36 @@ def parameter_values(problem: CalibrationProblem, x: Array) -> Array:
 # --- how well they are known ------------------------------------------------------------------------------------
 
 
-def learned(
-    fit: Fit,
-    added: tuple[str, ...] = (),
-    trials: tuple[Trial, ...] = (),
-    left_out: tuple[LeftOut, ...] = (),
-    notes: tuple[str, ...] = (),
-) -> Learned:
-    """Return the hyperparameters of a fit with their uncertainty; the other arguments as of `Learned`.
+def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
+    """Return the hyperparameters of a fit with their uncertainty; ``gain`` is that of curves.
 
     Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L, and the variance V of a reading
     has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three: of all of it, as what is not known of the
     model counts with how little is known of the hyperparameters behind it.
     """
-    evidence, point = fit.evidence, fit.point
+    evidence, point, prior = fit.evidence, fit.point, fit.evidence.prior
     curvature, U = np.linalg.eigh((point.curvature + point.curvature.T) / 2)
     root = U * np.sqrt(2 / np.maximum(curvature, FLATTEST))
     covariance = root @ root.T
     spread = np.sqrt(np.diag(covariance))
     growth = _growth(evidence, point)
-    names = evidence.prior.names
     values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
-    size = np.append(np.exp(point.logs[: len(names)]), np.nan)[evidence.prior.group]
-    drift = fit.unit[:, None] * np.column_stack([point.slopes @ root, evidence.widening(point)])
+    sizes, noise = len(prior.names), len(prior.hyperparameters)
+    plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'
+    size = np.append(np.exp(point.logs[:sizes]), np.nan)[prior.group]
+    local = np.sqrt(point.v) / size
     return Learned(
-        sizes=dict(zip(names, values, strict=False)),
-        noise=dict(zip(evidence.noise, values[len(names) :], strict=True)),
-        local=np.where(np.isfinite(size), np.sqrt(point.v) / size, 1.0),
-        trials=trials,
+        sizes=dict(zip(prior.names, values[:sizes], strict=True)),
+        noise=dict(zip(evidence.noise, values[noise:], strict=True)),
+        local=np.where(np.isfinite(size), local, 1.0),
         value=point.value,
         freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
-        left_out=left_out,
-        covariance=covariance,
+        covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
-        drift=drift,
-        added=added,
-        notes=(*notes, *_doubts(fit, spread)),
+        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, evidence.widening(point)]),
+        notes=tuple(_doubts(fit, spread)),
+        curves=None if prior.spectrum is None else Transmitted(values[sizes], values[sizes + 1], gain),
+        **more,
     )
 
 
@@ -407,10 +401,16 @@ def _growth(evidence: Evidence, point: Point) -> Array:
     """Return the slopes (s,) of ln V by the logarithms of hyperparameters, V = tr(X C X' + R) of all lengths read."""
     X = np.vstack([evidence.data.X[stack.index[_read(stack)]] for stack in evidence.data.stacks])
     scatter = evidence.scatter(point.logs)
-    noise = read_noise(evidence.data.stacks, scatter)
+
+    def read(scatter: Scatter) -> float:
+        """Return the variance of what is read, summed over those equations."""
+        variances = [np.einsum("nkk->nk", stack.covariance(scatter)) for stack in evidence.data.stacks]
+        return sum(float(np.sum(v[_read(stack)])) for v, stack in zip(variances, evidence.data.stacks, strict=True))
+
+    noise = read(scatter)
     rises = point.falls(point.C @ (X.T @ X) @ point.C)
     for i, kind in enumerate(evidence.noise, len(rises) - len(evidence.noise)):  # R is a sum of squares of the noises
-        rises[i] += 2 * (noise - read_noise(evidence.data.stacks, replace(scatter, **{kind: 0.0})))
+        rises[i] += 2 * (noise - read(replace(scatter, **{kind: 0.0})))
     return np.asarray(rises / (float(np.sum((X @ point.C) * X)) + noise), dtype=float)
 
 
@@ -418,11 +418,6 @@ def _read(stack: Stack) -> np.ndarray:
     """Return which equations (N, k) are of lengths (else angles, else pixels)."""
     kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
     return next(kind for kind in kinds if kind.any())
-
-
-def read_noise(stacks: Sequence[Stack], scatter: Scatter) -> float:
-    """Return the variance of what is read, summed over those equations."""
-    return sum(float(np.sum(np.einsum("nkk->nk", stack.covariance(scatter))[_read(stack)])) for stack in stacks)
 
 
 def _doubts(fit: Fit, spread: Array) -> Iterator[str]:

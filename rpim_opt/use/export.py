@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
-from rpim_opt.bayes.transmission import Curves
+from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.asking import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
@@ -128,7 +128,7 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
         values = np.zeros((len(q), curve.joint))
         values[:, -1] = q
-        columns = Curves((curve,)).columns(values, np.ones_like(values))
+        columns = series((curve,), values, np.ones_like(values))
         correction = 1e3 * columns @ result.x[place]
         std = 1e3 * np.sqrt(np.sum((columns @ result.covariance[np.ix_(place, place)]) * columns, axis=1))
         sizes.append(f"joint {curve.joint} {np.sqrt(np.mean(correction**2)):.3f}")

@@ -388,7 +388,7 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
     step = 0.01
     ends = [[evidence.at(logs + side * e).z for side in (-1, 1)] for e in step * np.eye(len(logs))]
     J = np.array([(ahead - behind) / (2 * step) for behind, ahead in ends]).T
-    J = J * (POSITION.parameters.free.scale * estimator.stated(few).scale)[:, None]
+    J = J * (POSITION.parameters.free.scale * fit.stated.scale)[:, None]
     followed, tails = np.split(learned.drift, [len(logs)], axis=1)
     own = np.diag(J @ learned.covariance @ J.T)
     assert np.sum(followed**2, axis=1) == pytest.approx(own, rel=0.1, abs=0.02 * np.diag(result.covariance).min())
