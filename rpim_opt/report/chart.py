@@ -15,25 +15,14 @@ from rpim_opt.basics.arrays import Array
 # --- the description ---------------------------------------------------------------------------------------
 
 MARGIN = 0.04
-"""Between an axis's ends and its first and last values, as a part of its length."""
+"""Margin at an axis's ends, relative to its length."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Map from values to lengths: linear, logarithmic, symmetrically logarithmic, or a place for each name.
+    """Axis with its label and unit: linear, logarithmic, linear up to ``linear_to`` and logarithmic beyond, or names.
 
-    Parameters
-    ----------
-    label
-        The quantity with its unit; empty for names.
-    ends
-        Least and largest value to be shown; what lies beyond is drawn at the edge.
-    log
-        Whether the axis is logarithmic.
-    linear_to
-        Of a symmetrically logarithmic axis, the size up to which it is linear; zero for other axes.
-    names
-        Names at 1, 2, ...; on the y axis from top to bottom.
+    Values beyond ``ends`` are drawn at the edge; names are at 1, 2, ..., on the y axis from top to bottom.
     """
 
     label: str
@@ -77,7 +66,7 @@ Values = NDArray[np.floating[Any]] | Sequence[float]
 
 @dataclass(frozen=True)
 class Line:
-    """A line through points (k,)."""
+    """Line through points (k,); it is interrupted where they are NaN."""
 
     x: Values
     y: Values
@@ -86,14 +75,10 @@ class Line:
     dashed: bool = False
 
 
-@dataclass(frozen=True)
-class Segments:
-    """Straight lines from ``(x[i, 0], y[i, 0])`` to ``(x[i, 1], y[i, 1])``, both (k, 2)."""
-
-    x: NDArray[np.floating[Any]]
-    y: NDArray[np.floating[Any]]
-    role: Role
-    label: str = ""
+def segments(ends: ArrayLike) -> Array:
+    """Return coordinates (3 k,) of a `Line` that consists of the segments between ends (k, 2)."""
+    pairs = np.asarray(ends, dtype=float)
+    return np.hstack([pairs, np.full((len(pairs), 1), np.nan)]).ravel()
 
 
 @dataclass(frozen=True)
@@ -111,34 +96,24 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class Bars:
-    """Bars from the chart's floor to ``top`` (k,), between two values of x."""
+class Boxes:
+    """Rectangles (k,) with tooltips."""
 
-    left: Values
-    right: Values
-    top: Values
+    left: Array
+    right: Array
+    low: Array
+    high: Array
     role: Role
     label: str = ""
     hints: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Cells:
-    """Rectangles of one shade: their lower left corners (k, 2), and the size (2,) of all."""
-
-    corners: NDArray[np.floating[Any]]
-    size: tuple[float, float]
-    role: Role
-    label: str = ""
-    hints: Sequence[str] = ()
-
-
-Mark = Line | Segments | Dots | Bars | Cells
+Mark = Line | Dots | Boxes
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Two axes and marks, drawn in their order; ``height`` is of a page 420 wide, ``alike`` asks for equal scales."""
+    """Two axes and marks in drawing order; ``height`` is of a page 420 wide, ``alike`` asks for equal scales."""
 
     title: str
     x: Axis
@@ -170,18 +145,13 @@ RADIUS = {"small": 2.5, "middle": 3.5, "large": 6.0}
 
 
 def tag(name: str, /, *children: str, **attributes: object) -> Markup:
-    """Return an element; texts and attributes are escaped, ``class_`` stands for ``class``, ``a_b`` for ``a-b``.
-
-    >>> from rpim_opt.report.chart import tag
-    >>> print(tag("text", "a < b", text_anchor="end", class_="tick"))
-    <text text-anchor="end" class="tick">a &lt; b</text>
-    """
+    """Return an element; texts and attributes are escaped, ``class_`` stands for ``class``, ``a_b`` for ``a-b``."""
     named = [Markup(' {}="{}"').format(k.strip("_").replace("_", "-"), v) for k, v in attributes.items()]
     return Markup("<{0}{1}>{2}</{0}>").format(name, Markup("").join(named), Markup("").join(children))
 
 
 class Scale:
-    """An axis on paper: pixels of its values, and its ticks."""
+    """Pixels of an axis's values, and its ticks."""
 
     def __init__(self, axis: Axis):
         self.axis = axis
@@ -197,33 +167,25 @@ class Scale:
     def ticks(self, named: bool = True) -> list[tuple[float, str]]:
         """Return values and texts of the ticks: names, decades, or steps of 1, 2 or 5."""
         axis = self.axis
+        span = self.high - self.low
         if named and axis.names:
             return [(float(k), name) for k, name in enumerate(axis.names, start=1)]
-        if axis.log:
-            return self._powers()
         if axis.linear_to:  # zero, and to either side the end of the linear part and at most four decades
             low, high = axis.limits
             decades = int(np.floor(np.log10(max(-low, high) / axis.linear_to)))
             sizes = axis.linear_to * 10.0 ** np.arange(0, decades + 1, 1 + decades // 4)
             return [(float(v), f"{v:g}") for v in [*-sizes[::-1], 0.0, *sizes] if low <= v <= high]
-        span = self.high - self.low
+        if axis.log:
+            low, high = int(np.ceil(self.low)), int(np.floor(self.high))
+            if span >= 1.5 and high - low >= 2:
+                powers = range(low, high + 1, int(np.ceil(span / 6)))
+                return [(10.0**k, f"{10.0**k:g}" if -3 <= k <= 4 else f"1e{k}") for k in powers]
+            steps = [m * 10.0**k for k in range(low - 1, high + 1) for m in (1, 2, 5)]
+            return [(v, f"{v:g}") for v in steps if self.low <= np.log10(v) <= self.high]
         power = 10.0 ** np.floor(np.log10(span / 5))
         step = next(m * power for m in (1, 2, 5, 10) if span / (m * power) <= 6)
-        steps = np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1)
-        return [(float(v), f"{v:.6g}") for v in steps * step + 0.0]
-
-    def _powers(self) -> list[tuple[float, str]]:
-        """Return decades, or 1, 2 and 5 times each where there are fewer than three."""
-        low = int(np.ceil(self.low))
-        high = int(np.floor(self.high))
-        span = self.high - self.low
-        if span >= 1.5 and high - low >= 2:
-            return [
-                (10.0**k, f"{10.0**k:g}" if -3 <= k <= 4 else f"1e{k}")
-                for k in range(low, high + 1, int(np.ceil(span / 6)))
-            ]
-        steps = [m * 10.0**k for k in range(low - 1, high + 1) for m in (1, 2, 5)]
-        return [(v, f"{v:g}") for v in steps if self.low <= np.log10(v) <= self.high]
+        every = np.arange(np.ceil(self.low / step), np.floor(self.high / step) + 1)
+        return [(float(v), f"{v:.6g}") for v in every * step + 0.0]
 
 
 class Picture:
@@ -292,9 +254,13 @@ class Picture:
     def _mark(self, mark: Mark) -> Iterator[Markup]:
         match mark:
             case Line():
-                yield self._path([(mark.x, mark.y)], mark.role + " dashed" * mark.dashed)
-            case Segments():
-                yield self._path(zip(mark.x, mark.y, strict=True), mark.role)
+                drawn = ""
+                pen = "M"
+                for a, b in zip(self.x(mark.x), self.y(mark.y), strict=True):
+                    inside = np.isfinite(a + b)
+                    drawn += f"{pen}{a:g},{b:g}" if inside else ""
+                    pen = "L" if inside else "M"
+                yield tag("path", d=drawn, class_=f"line {mark.role}" + " dashed" * mark.dashed)
             case Dots(hints=hints) if not len(hints):
                 places = zip(self.x(mark.x), self.y(mark.y), strict=True)
                 yield tag("path", d="".join(f"M{a:g} {b:g}h0" for a, b in places), class_=f"cloud {mark.role}")
@@ -303,25 +269,10 @@ class Picture:
                 for a, b, hint in zip(self.x(mark.x), self.y(mark.y), mark.hints, strict=True):
                     at = {"cx": f"{a:g}", "cy": f"{b:g}"}
                     yield tag("circle", tag("title", hint), **at, r=RADIUS[mark.size], class_=class_)
-            case Bars():
-                left, right, top = self.x(mark.left), self.x(mark.right), self.y(mark.top)
-                yield from _boxes(f"bar {mark.role}", mark.hints, left, top, right - left, self.floor - top)
-            case Cells():
-                lower = np.asarray(mark.corners)
-                upper = lower + np.asarray(mark.size)
-                left, right = self.x(lower[:, 0]), self.x(upper[:, 0])
-                bottom, top = self.y(lower[:, 1]), self.y(upper[:, 1])
-                yield from _boxes(f"cell {mark.role}", mark.hints, left, top, right - left, bottom - top)
-
-    def _path(self, lines, class_: str) -> Markup:
-        drawn = []
-        for x, y in lines:
-            drawn.append("M" + "L".join(f"{a:g},{b:g}" for a, b in zip(self.x(x), self.y(y), strict=True)))
-        return tag("path", d="".join(drawn), class_=f"line {class_}")
-
-
-def _boxes(class_: str, hints: Sequence[str], left: Array, top: Array, width: Array, height: Array) -> Iterator[Markup]:
-    sizes = zip(left, top, np.maximum(width, 0.5), np.maximum(height, 0), hints, strict=True)
-    for x, y, wide, high, hint in sizes:
-        size = {"x": f"{x:g}", "y": f"{y:g}", "width": f"{wide:g}", "height": f"{high:g}"}
-        yield tag("rect", tag("title", hint), class_=class_, **size)
+            case Boxes():
+                x, y = self.x(mark.left), self.y(mark.high)
+                wide = np.maximum(self.x(mark.right) - x, 0.5)
+                tall = np.maximum(self.y(mark.low) - y, 0)
+                for *numbers, hint in zip(x, y, wide, tall, mark.hints, strict=True):
+                    size = dict(zip(("x", "y", "width", "height"), (f"{n:g}" for n in numbers), strict=True))
+                    yield tag("rect", tag("title", hint), class_=f"box {mark.role}", **size)

@@ -1,4 +1,4 @@
-"""What the charts show: errors, parameters, uncertainty in the workspace, selection of the weight, checks over time."""
+"""Charts of a calibration: errors, parameters, uncertainty in the workspace, choice of the weight, checks over time."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Segments
+from rpim_opt.report.chart import Axis, Boxes, Chart, Dots, Line, Mark, segments
 
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
 
 MODELS = {"before": "nominal", "after": "identified"}
-"""Labels of the errors before and after calibration: by which model they are."""
+"""Model that errors before and after calibration are of."""
 
 
 def mm(value: float) -> str:
@@ -35,9 +35,9 @@ def mm(value: float) -> str:
 # --- errors ------------------------------------------------------------------------------------------------
 
 MANY_ROWS = 100
-"""Rows from which each is a small point without a name."""
+"""Above it each row is a small point without a name."""
 LINEAR_MM = 0.1
-"""Signed errors are drawn linearly up to here, logarithmically beyond."""
+"""Size up to which the axis of signed errors is linear."""
 
 
 def lengths_of(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list[str]]:
@@ -54,26 +54,25 @@ def rows_chart(result: Calibration, data: Dataset) -> Chart:
     lengths, labels = lengths_of(result, data)
     every = np.concatenate(list(lengths.values()))
     low = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7)
+    drawn = {when: np.maximum(errors, low) for when, errors in lengths.items()}
     place = np.arange(1.0, len(labels) + 1)
     x = Axis("row", (1, max(len(labels), 2)))
     marks: list[Mark] = []
     hints: dict[str, list[str]] = {"before": [], "after": []}
     if len(labels) <= MANY_ROWS:
         x = Axis("row", names=labels)
-        both = np.maximum(np.column_stack(list(lengths.values())), low)
-        marks.append(Segments(np.column_stack([place, place]), both, "before"))
+        stems = segments(np.column_stack([drawn["before"], drawn["after"]]))
+        marks.append(Line(segments(np.column_stack([place, place])), stems, "before"))
         for when, errors in lengths.items():
             named = zip(labels, errors, strict=True)
             hints[when] = [f"{label}, {MODELS[when]}: {mm(error)} mm" for label, error in named]
-    for when, errors in lengths.items():
-        marks.append(Dots(place, np.maximum(errors, low), when, MODELS[when], hints[when]))
+    marks += [Dots(place, drawn[when], when, MODELS[when], hints[when]) for when in lengths]
     flagged: set[str] = set()
     if data is result.problem.data:
         flagged = {flag.label for flag in result.flagged}
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
-        named = [f"{labels[i]}: flagged" for i in at]
-        marks.append(Dots(place[at], np.maximum(lengths["after"][at], low), "mark", "flagged", named))
+        marks.append(Dots(place[at], drawn["after"][at], "mark", "flagged", [f"{labels[i]}: flagged" for i in at]))
     cut = int(np.sum(every < low))
     note = f"{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
     y = Axis("error [mm]", (low, max(float(every.max()), 1e-6)), log=True)
@@ -86,15 +85,18 @@ def histogram_chart(lengths: Mapping[str, Array]) -> Chart:
     high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
     low = max(float(every.min(initial=high)), 1e-4 * high)
     edges = np.geomspace(low, high, 25 if high > 1.01 * low else 2)
-    marks = []
+    marks: list[Mark] = []
     most = 0
+    below = []
     for when, errors in lengths.items():
         count = np.histogram(np.maximum(errors, edges[0]), edges)[0]
         bins = np.flatnonzero(count)
         hints = [f"{MODELS[when]}: {count[k]} rows from {mm(edges[k])} to {mm(edges[k + 1])} mm" for k in bins]
-        marks.append(Bars(edges[bins], edges[bins + 1], count[bins], when, MODELS[when], hints))
+        floor = np.zeros(len(bins))
+        marks.append(Boxes(edges[bins], edges[bins + 1], floor, count[bins], when, MODELS[when], hints))
         most = max(most, int(count.max()))
-    below = [f"{int(np.sum(errors < low))} {MODELS[when]}" for when, errors in lengths.items() if (errors < low).any()]
+        if (errors < low).any():
+            below.append(f"{int(np.sum(errors < low))} {MODELS[when]}")
     note = f"The first bar includes the rows below {low:.2g} mm: {joined(below)}." if below else ""
     x = Axis("error [mm]", (edges[0], edges[-1]), log=True)
     return Chart("Distribution of the errors before and after calibration", x, Axis("rows", (0, most)), marks, note)
@@ -124,7 +126,7 @@ def axes_chart(result: Calibration, data: Dataset) -> Chart:
             f"{axis}, {MODELS[when]}: mean {m:+z.3f} mm, 95 % of the rows from {low:+z.3f} to {high:+z.3f} mm"
             for axis, m, (low, high) in zip("xyz", mean, spread, strict=True)
         ]
-        marks.append(Segments(np.column_stack([place, place]), spread, when))
+        marks.append(Line(segments(np.column_stack([place, place])), segments(spread), when))
         marks.append(Dots(place, mean, when, MODELS[when], hints))
         ends += [float(spread.min()), float(spread.max())]
     x = Axis(f"axis of {frame}", names=("x", "y", "z"))
@@ -166,16 +168,16 @@ def deviations_chart(result: Calibration, dimension: str, half: Array, confidenc
     place = np.arange(1.0, len(own) + 1)
     names = [free.names[i] for i in own]
     hints = [f"{name}: {d:+z.4f} ± {s:.4f} {unit}" for name, d, s in zip(names, x, spread, strict=True)]
-    level = np.column_stack([place, place])
+    intervals = segments(np.column_stack([x - spread, x + spread]))
     marks: list[Mark] = [
         Line([0, 0], [0.5, len(own) + 0.5], "zero"),
-        Segments(np.column_stack([x - spread, x + spread]), level, "after"),
+        Line(intervals, segments(np.column_stack([place, place])), "after"),
         Dots(x, place, "after", f"deviation, {percent(confidence)} interval", hints),
     ]
     if len(bounded):
         ends = np.concatenate([-bound[bounded], bound[bounded]])
         height = np.tile(np.column_stack([place[bounded] - 0.35, place[bounded] + 0.35]), (2, 1))
-        marks.append(Segments(np.column_stack([ends, ends]), height, "mark", "tolerance"))
+        marks.append(Line(segments(np.column_stack([ends, ends])), segments(height), "mark", "tolerance"))
     # an interval that ends far out would hide all others: it is cut at the chart's edge
     reach = max(float(np.max(np.abs(x), initial=1e-9)), float(np.max(bound[bounded], initial=0.0)))
     if len(x):
@@ -191,66 +193,59 @@ def deviations_chart(result: Calibration, dimension: str, half: Array, confidenc
 
 CELLS = 24
 """Cells along the longer side."""
-LEVELS = 5
-"""Shades."""
+SHADES = 5
 VIEWS = (("from above", 0, 1), ("from the side", 0, 2))
 
 
 def workspace_charts(at: Array, bound: Array, box: Array | None, limit: float | None) -> list[Chart]:
-    """Return maps of the expanded uncertainty, from above and from the side.
+    """Return maps of the expanded uncertainties (N,) at positions (N, 3), from above and from the side, all in mm.
 
-    Parameters
-    ----------
-    at, bound
-        (N, 3) positions and (N,) expanded uncertainties [mm].
-    box
-        (3, 2) sides of the region [mm], or None.
-    limit
-        Above which a cell is marked [mm].
+    Each cell has the largest one of its positions; it is marked above the limit. The box (3, 2) is drawn as a frame.
     """
     low, high = float(bound.min()), float(bound.max())
-    ends = np.linspace(low, high, LEVELS + 1)[1:]
+    levels = np.linspace(low, high, SHADES + 1)[1:]
     decimals = 10.0 ** (int(np.ceil(-np.log10(max(high - low, 1e-3 * high)))) + 1)
-    ends = np.asarray(np.ceil(ends * decimals) / decimals, dtype=float)
+    levels = np.asarray(np.ceil(levels * decimals) / decimals, dtype=float)
     charts = []
     for name, across, up in VIEWS:
-        u, v = at[:, across], at[:, up]
-        largest = max(np.ptp(u), np.ptp(v)) / CELLS
-        (left, wide), (lower, tall) = _cells(u, largest), _cells(v, largest)
-        worst: dict[tuple[float, float], float] = {}
-        for a, b, value in zip(left, lower, bound, strict=True):
-            worst[a, b] = max(value, worst.get((a, b), 0.0))
-        shades: dict[tuple[str, str], list[tuple[float, float]]] = {}
-        for place, value in worst.items():
-            shades.setdefault(_shade(ends, value, limit), []).append(place)
+        plane = at[:, [across, up]]
+        corner, size = _cells(plane)
+        corners, cell = np.unique(corner, axis=0, return_inverse=True)
+        worst = np.zeros(len(corners))
+        np.maximum.at(worst, cell.ravel(), bound)
+        shades: dict[tuple[str, str], list[int]] = {}
+        for k, value in enumerate(worst):
+            shades.setdefault(_shade(levels, value, limit), []).append(k)
         marks: list[Mark] = []
-        for (role, label), places in sorted(shades.items()):
-            hints = [f"{mm(worst[place])} mm" for place in places]
-            marks.append(Cells(np.array(places), (wide, tall), role, label, hints))
+        for (role, label), ks in sorted(shades.items()):
+            lower, upper = corners[ks].T, (corners[ks] + size).T
+            hints = [f"{mm(worst[k])} mm" for k in ks]
+            marks.append(Boxes(lower[0], upper[0], lower[1], upper[1], role, label, hints))
         note = f"{name.capitalize()}."
         if box is not None:
             (a, b), (c, d) = box[across], box[up]
             marks.append(Line([a, b, b, a, a], [c, c, d, d, c], "ink"))
             note += " The frame is the box of the requirement."
-        x = Axis(f"{'xyz'[across]} [mm]", (u.min(), u.max()))
-        y = Axis(f"{'xyz'[up]} [mm]", (v.min(), v.max()))
+        (left, right), (bottom, top) = zip(plane.min(axis=0), plane.max(axis=0), strict=True)
+        x, y = Axis(f"{'xyz'[across]} [mm]", (left, right)), Axis(f"{'xyz'[up]} [mm]", (bottom, top))
         title = f"Largest expanded uncertainty of the position reached, {name}"
         charts.append(Chart(title, x, y, marks, note, alike=True))
     return charts
 
 
-def _cells(values: Array, largest: float) -> tuple[Array, float]:
-    """Return lower ends (N,) of the values' cells, and their common width, at most the largest."""
-    count = max(int(np.ceil(np.ptp(values) / largest - 1e-9)), 1)
-    wide = float(np.ptp(values)) / count
-    number = np.minimum((values - values.min()) // max(wide, 1e-9), count - 1)
-    return values.min() + number * wide, wide
+def _cells(points: Array) -> tuple[Array, Array]:
+    """Return the lower corners (N, 2) of the points' cells, and the cells' common size (2,)."""
+    extent = np.ptp(points, axis=0)
+    count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1)
+    size = extent / count
+    low = points.min(axis=0)
+    return low + np.minimum((points - low) // np.maximum(size, 1e-9), count - 1) * size, size
 
 
-def _shade(ends: Array, value: float, limit: float | None) -> tuple[str, str]:
+def _shade(levels: Array, value: float, limit: float | None) -> tuple[str, str]:
     """Return role and label of a cell."""
-    level = min(int(np.searchsorted(ends, value)), LEVELS - 1)
-    end = float(ends[level])
+    level = min(int(np.searchsorted(levels, value)), SHADES - 1)
+    end = float(levels[level])
     if limit is not None and value > limit:
         return f"level{level} over", f"to {mm(end)} mm, above the limit"
     return f"level{level}", f"to {mm(min(end, limit or np.inf))} mm"

@@ -1,9 +1,9 @@
-"""HTML pages that work offline: templates, tables and figures, and the report of checks over time."""
+"""HTML pages that work offline: blocks, tables and figures, and the page of checks over time."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -19,14 +19,16 @@ from rpim_opt.report.charts import checks_charts, mm
 from rpim_opt.use.monitoring import Monitoring
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
+Block = tuple[str, Any]
+"""Kind and content of a part of a page: a macro of ``templates/parts.html`` and its argument."""
 
 
 class Table(NamedTuple):
-    """Caption, header and rows of texts; with ``prose`` the last column is running text."""
+    """Caption, header and rows of texts, or of texts with a class; with ``prose`` the last column is running text."""
 
     caption: str
     header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[Any]]
     prose: bool = False
 
 
@@ -62,30 +64,25 @@ def _environment() -> Environment:
     return environment
 
 
-def render(template: str, script: str = "", images: bool = False, **content: Any) -> str:
+def render(
+    title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]],
+    script: str = "", data: Mapping[str, Any] | None = None, images: bool = False,
+) -> str:  # fmt: skip
     """Return a page as HTML: all texts are escaped, its own style and script alone may run, nothing is loaded.
 
-    Parameters
-    ----------
-    template
-        A file of the templates, which extends ``base.html``.
-    script
-        A file beside it that reads ``data`` of the content.
-    images
-        Whether the page holds images as data.
-    content
-        The template's variables; ``title``, ``kind`` and ``heading`` of every page.
+    The script is a file of the templates that reads ``data``; ``images`` may stand in the page as data.
     """
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
+    code = (TEMPLATES / script).read_text(encoding="utf-8") if script else ""
     policy = f"default-src 'none'; style-src {_digest(style)}"
-    code = ""
     if script:
-        code = (TEMPLATES / script).read_text(encoding="utf-8")
         policy += f"; script-src {_digest(code)}"
     if images:
         policy += "; img-src data:"
-    page = _environment().get_template(template)
-    return page.render(policy=policy, style=Markup(style), script=Markup(code), **content)
+    return _environment().get_template("page.html").render(
+        title=title, kind=kind, heading=heading, top=top, sections=sections, data=data,
+        policy=policy, style=Markup(style), script=Markup(code),
+    )  # fmt: skip
 
 
 def _digest(text: str) -> str:
@@ -119,11 +116,12 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     """
     verdict, *details = str(found).splitlines()
     heading = title or "Checks"
-    text = render(
-        "checks.html", title=f"Checks: {heading}", kind="Checks of a calibrated robot", heading=heading,
-        verdict=verdict, details=details, alarm=found.drifts,
-        figures=[figure(chart) for chart in checks_charts(found)], checks=_checks(found),
-    )  # fmt: skip
+    sections: list[tuple[str, list[Block]]] = [
+        ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
+        ("Over time", [("figures", [figure(chart) for chart in checks_charts(found)])]),
+        ("Every check", [("table", _checks(found))]),
+    ]
+    text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
     write_text(Path(path), text)
 
 

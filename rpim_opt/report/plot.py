@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.report import charts
-from rpim_opt.report.chart import Axis, Bars, Cells, Chart, Dots, Line, Mark, Role, Segments
+from rpim_opt.report.chart import Axis, Boxes, Chart, Dots, Line, Mark
 
 __all__ = [
     "error_axes", "error_histogram", "error_vectors", "errors", "l_curve", "parameters", "picard", "selection",
@@ -27,17 +27,8 @@ Axes = Any  # matplotlib's, which is imported by whoever makes the axes
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
     """Draw every row's error [mm] before and after calibration; flagged rows of the identification data are marked.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    data
-        The rows; the identification data by default.
-    ax
-        Matplotlib's axes; new ones by default.
+    The rows are those of the identification data, and the axes new ones, unless others are given.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
@@ -100,19 +91,9 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
 def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
     """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    dimension
-        ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm].
-    confidence
-        Level of the intervals, which exist for a squared penalty, or none.
-    ax
-        Matplotlib's axes; new ones by default.
+    The dimension is ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm]. Intervals exist for
+    a squared penalty, or none.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.parameters(result, "angle")
@@ -128,19 +109,9 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
     """Draw the L-curve: root of the penalty against root of the loss over the weight, with the selectors' choices.
 
-    The program is solved at 200 weights where it has a closed form, else at 40.
+    The program is solved at 200 weights where it has a closed form, else at 40; InputError without a penalty. The
+    weight of a result is marked, and the choices that are given by name.
 
-    Parameters
-    ----------
-    of
-        A program, or a result, whose own weight is marked; InputError without a penalty.
-    selections
-        Choices to mark, by name.
-    ax
-        Matplotlib's axes; new ones by default.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.l_curve(result)
@@ -150,7 +121,10 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     'residual norm [standard deviations of the noise]'
     >>> ax.figure.savefig("l_curve.pdf")
     """
-    program, marked = _program_and_weights(of, selections)
+    program = _program(of)
+    marked = {name: choice.weight for name, choice in (selections or {}).items()}
+    if isinstance(of, Calibration) and of.selector not in marked:
+        marked = {of.selector: of.weight, **marked}
     path = program.path(weight_grid(program, 200 if program.closed_form else 40))
     residual, solution = np.sqrt([[e.loss, e.penalty] for e in path]).T
     chosen: dict[str, tuple[float, float]] = {}
@@ -161,16 +135,8 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     return draw(charts.l_curve_chart(residual, solution, chosen, own), ax)
 
 
-def _program_and_weights(
-    of: Program | Calibration, selections: Mapping[str, Selection] | None = None
-) -> tuple[Program, dict[str, float]]:
-    """Return the program, and the weights to mark by name: of a result its own first."""
-    marked = {name: choice.weight for name, choice in (selections or {}).items()}
-    if not isinstance(of, Calibration):
-        return of, marked
-    if of.selector not in marked:
-        marked = {of.selector: of.weight, **marked}
-    return of.program, marked
+def _program(of: Program | Calibration) -> Program:
+    return of.program if isinstance(of, Calibration) else of
 
 
 def selection(selection: Selection, ax: Axes = None) -> Axes:
@@ -195,7 +161,7 @@ def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | N
     >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
     ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
     """
-    return draw(charts.choices_chart(compare(_program_and_weights(of)[0]) if selections is None else selections), ax)
+    return draw(charts.choices_chart(compare(_program(of)) if selections is None else selections), ax)
 
 
 def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:
@@ -211,8 +177,9 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
     ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'root of the weight']
     """
-    program, marked = _program_and_weights(of)
-    return draw(charts.picard_chart(program, weight or next(iter(marked.values()), 0.0)), ax)
+    if isinstance(of, Calibration):
+        weight = weight or of.weight
+    return draw(charts.picard_chart(_program(of), weight), ax)
 
 
 # --- the renderer ------------------------------------------------------------------------------------------
@@ -220,7 +187,6 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
 COLORS = {
     "before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e", "zero": "#a3adb8",
 }  # fmt: skip
-SHADES = (0.12, 0.32, 0.52, 0.74, 1.0)
 SIZES = {"small": 3.5, "middle": 5.0, "large": 9.0}
 SHAPES = "osD^v<>"
 FONT_X, FONT_Y, FONT_LEAST = 7.0, 10.0, 4.0
@@ -236,8 +202,6 @@ def draw(chart: Chart, ax: Axes = None) -> Axes:
     _set_axis(ax, "y", chart.y)
     for mark in chart.marks:
         _draw(ax, mark)
-    if chart.alike:
-        ax.set_aspect("equal")
     if chart.note:
         ax.set_xlabel(f"{ax.get_xlabel()}\n{chart.note}".strip())
     if ax.get_legend_handles_labels()[0]:
@@ -246,7 +210,6 @@ def draw(chart: Chart, ax: Axes = None) -> Axes:
 
 
 def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
-    """Return the given axes, or new ones, as high as a number of named rows needs."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
@@ -254,17 +217,6 @@ def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
     figure, ax = pyplot.subplots(layout="constrained", subplot_kw=kwargs)
     figure.set_figheight(max(figure.get_figheight(), 0.2 * rows + 1.2))
     return ax
-
-
-def color_of(role: Role) -> Any:
-    """Return the colour of a role."""
-    level = role.removesuffix(" over")
-    if not level.startswith("level"):
-        return COLORS[role]
-    from matplotlib.colors import to_rgb
-
-    full = np.array(to_rgb(COLORS["mark" if level != role else "after"]))
-    return tuple(1 - SHADES[int(level[-1])] * (1 - full))
 
 
 def _set_axis(ax: Axes, which: str, axis: Axis) -> None:
@@ -276,32 +228,22 @@ def _set_axis(ax: Axes, which: str, axis: Axis) -> None:
         getattr(ax, f"{which}axis").set_major_formatter("{x:g}")  # 0.1 in the place of powers of ten
     limits = axis.limits
     if axis.names:
-        _set_names(ax, which, axis.names)
         limits = limits[::-1] if which == "y" else limits
+        box = ax.get_window_extent()
+        length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
+        size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * len(axis.names))
+        if size >= FONT_LEAST:
+            turned = 90 if which == "x" and len(axis.names) > 3 else 0
+            ticks = range(1, len(axis.names) + 1)
+            getattr(ax, f"set_{which}ticks")(ticks, axis.names, fontsize=min(size, largest), rotation=turned)
     ax.set(**{f"{which}lim": limits, f"{which}label": axis.label})
 
 
-def _set_names(ax: Axes, which: str, names: Sequence[str]) -> None:
-    """Write names at 1, 2, ... unless they were too small to be read."""
-    box = ax.get_window_extent()
-    length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
-    size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * len(names))
-    if size < FONT_LEAST:
-        return
-    turned = 90 if which == "x" and len(names) > 3 else 0
-    ticks = range(1, len(names) + 1)
-    getattr(ax, f"set_{which}ticks")(ticks, names, fontsize=max(min(size, largest), FONT_LEAST), rotation=turned)
-
-
 def _draw(ax: Axes, mark: Mark) -> None:
-    color = color_of(mark.role)
+    color = COLORS[mark.role]
     match mark:
         case Line():
             ax.plot(mark.x, mark.y, color=color, lw=1.5, ls="--" if mark.dashed else "-", label=mark.label)
-        case Segments():
-            gaps = np.full((len(mark.x), 1), np.nan)
-            x = np.hstack([mark.x, gaps]).ravel()
-            ax.plot(x, np.hstack([mark.y, gaps]).ravel(), color=color, lw=1.2, label=mark.label)
         case Dots(each=True):
             for k, (x, y, hint) in enumerate(zip(mark.x, mark.y, mark.hints, strict=True)):
                 style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8}
@@ -310,12 +252,6 @@ def _draw(ax: Axes, mark: Mark) -> None:
             fill = "none" if mark.hollow else color
             size = SIZES[mark.size] if len(mark.hints) else 2.0
             ax.plot(mark.x, mark.y, "o", color=color, mfc=fill, ms=size, label=mark.label)
-        case Bars():
-            width = np.subtract(mark.right, mark.left)
-            ax.bar(mark.left, mark.top, width, align="edge", color=color, alpha=0.85, label=mark.label)
-        case Cells():
-            from matplotlib.collections import PatchCollection
-            from matplotlib.patches import Rectangle
-
-            cells = [Rectangle(tuple(corner), *mark.size) for corner in mark.corners]
-            ax.add_collection(PatchCollection(cells, facecolor=color, edgecolor="none"))
+        case Boxes():
+            style = {"align": "edge", "color": color, "alpha": 0.85, "label": mark.label}
+            ax.bar(mark.left, mark.high - mark.low, mark.right - mark.left, mark.low, **style)

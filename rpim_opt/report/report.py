@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +24,21 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import turned_frames, weight_lines
 from rpim_opt.convex.atoms import SQUARES
-from rpim_opt.convex.program import Estimate, Program, pose
+from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Block as Rows
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.observability import combination, observe
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import charts, summary
 from rpim_opt.report.chart import Picture, tag
 from rpim_opt.report.charts import mm
-from rpim_opt.report.page import Figure, Table, figure, render
+from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
-
-Section = dict[str, Any]
 
 
 def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
@@ -79,42 +78,35 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     write_text(Path(path), page(replace(calibration, record=record)))
 
 
+@dataclass(frozen=True)
+class Content:
+    """A result, what several sections judge of it, and what the page's script draws."""
+
+    result: Calibration
+    accepted: Acceptance | None
+    map: summary.Workspace | None
+    composition: list[str]
+    embedded: dict[str, Any]
+
+
 def page(result: Calibration) -> str:
     """Return the report as HTML."""
-    data: dict[str, Any] = {}
-    record = result.record
-    heading = record.title or " and ".join(robot.name for robot in result.problem.arms.values())
-    accepted = summary.acceptance(result)
-    map_ = summary.workspace(result)
+    heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     lacking = judged(result)
-    # an effect that the model lacks is said at the top; otherwise what the residuals consist of is a diagnosis
-    alarming = lacking is not None and lacking.alarming
     composition = [] if lacking is None else lacking.sentences()
+    warnings = summary.warnings(result)
+    if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
+        warnings = [" ".join(composition), *warnings]
+        composition = []
+    content = Content(result, summary.acceptance(result), summary.workspace(result), composition, {})
     return render(
-        "report.html",
-        script="report.js",
-        title=f"Calibration: {heading}",
-        kind=f"Robot calibration report, {record.made[:10]}",
-        heading=heading,
-        details=[(FIELDS.get(key, key), text) for key, text in record.details.items()],
-        verdict=_verdict(accepted),
-        headline=summary.headline(result),
-        alarm=not result.verdict.delivered,
-        causes=list(dict.fromkeys([*result.verdict.reasons, *result.causes])),
-        cards=_cards(result, map_, accepted),
-        warnings=[*([" ".join(composition)] if alarming else []), *summary.warnings(result)],
-        acceptance=_acceptance(result, accepted),
-        accuracy=_accuracy(result, accepted),
-        uncertainty=_uncertainty(map_, result),
-        parameters=_parameters(result),
-        residuals=_residuals(result, [] if alarming else composition),
-        space=_space(result, data),
-        identifiability=_identifiability(result),
-        flagged=_flagged(result),
-        convergence=_convergence(result),
-        provenance=_provenance(result),
-        weight=_weight(result, data),
-        data=data,
+        f"Calibration: {heading}",
+        f"Robot calibration report, {result.record.made[:10]}",
+        heading,
+        [*_headline(content), ("notes", warnings)],
+        [(name, list(section(content))) for name, section in SECTIONS],
+        "report.js",
+        content.embedded,
     )
 
 
@@ -123,20 +115,18 @@ def page(result: Calibration) -> str:
 VERDICTS = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}
 
 
-def _verdict(found: Acceptance | None) -> Section | None:
-    if found is None:
-        return None
-    text = f"limit {1e3 * found.requirement.limit:g} mm"
-    if found.bound is not None and np.isfinite(found.bound):
-        text = f"expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
-    text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
-    return {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
-
-
-def _cards(
-    result: Calibration, map_: summary.Workspace | None, accepted: Acceptance | None
-) -> list[tuple[str, str, str]]:
-    """Return name, role and value [mm] of the headline's figures."""
+def _headline(content: Content) -> Iterator[Block]:
+    result = content.result
+    found = content.accepted
+    yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
+    if found is not None:
+        text = f"limit {1e3 * found.requirement.limit:g} mm"
+        if found.bound is not None and np.isfinite(found.bound):
+            text = f"expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
+        text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
+        yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
+    yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
+    yield "notes", list(dict.fromkeys([*result.verdict.reasons, *result.causes]))
     name, nominal, identified = summary.headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
@@ -146,30 +136,68 @@ def _cards(
         ("Mean error, identified", "after", mm(after["mean_mm"])),
         ("Maximum error, identified", "after", mm(after["max_mm"])),
     ]
-    if map_ is None:
-        return cards
-    largest = map_.expanded.max()
-    if accepted is not None and accepted.bound is not None:
-        largest = accepted.bound  # its search goes on between the configurations of the map
-    sure = percent(map_.requirement.confidence)
-    return [*cards, (f"Expanded uncertainty U ({sure}), maximum", "after", mm(1e3 * largest))]
+    if content.map is not None:
+        largest = content.map.expanded.max()
+        if found is not None and found.bound is not None:
+            largest = found.bound  # its search goes on between the configurations of the map
+        sure = percent(content.map.requirement.confidence)
+        cards.append((f"Expanded uncertainty U ({sure}), maximum", "after", mm(1e3 * largest)))
+    yield "cards", cards
 
 
 # --- accuracy and uncertainty ------------------------------------------------------------------------------
 
 
-def _acceptance(result: Calibration, found: Acceptance | None) -> Section | None:
-    if found is None:
-        return None
+def _accuracy(content: Content) -> Iterator[Block]:
+    result = content.result
+    record = result.record
+    if content.accepted is not None:
+        yield "heading", "Acceptance"
+        yield "facts", _acceptance(result, content.accepted)
+        yield "notes", content.accepted.reasons
+    yield "heading", "Accuracy"
+    used = "Identification rows were used to identify the parameters"
+    if record.validation is not None:
+        used += "; validation rows were not used for anything"
+    notes = [summary.nominal_note(result), f"{used}."]
+    covered = None
+    if record.held_out is not None:
+        notes.append("Rows held out were not, when they were judged; they are among the identification rows now.")
+        covered = record.held_out.coverage
+    elif record.validation is not None:
+        covered = predicted(result, record.validation).coverage
+    if covered is not None and content.accepted is None:  # whose section says it
+        share = percent(round(covered, 2))
+        notes.append(f"{share} of the held-out coordinates lie in their 95 % prediction intervals.")
+    yield "text", notes
+    head = ["data, model", *summary.COLUMNS]
+    rows = [row for row in summary.error_rows(result) if row["count"]]
+    yield "table", Table("Error [mm]", head, summary.cells(rows))
+    angles = summary.orientation_rows(result)
+    if angles:
+        yield "table", Table("Orientation error [mrad]", head, summary.cells(angles, "mrad"))
+    for name, data in summary.sets(result).items():
+        touched = scatter(data, result.nominal_errors(data), result.errors(data))
+        if touched:
+            caption = f"{name.capitalize()}, distance of touches from their point [mm]"
+            yield "table", Table(caption, HEADER, scatter_rows(touched))
+    name, data = next(iter(summary.sets(result).items()))
+    yield "figures", _error_figures(result, name, data)
+    if content.map is not None:
+        yield "heading", "Expanded uncertainty in the workspace"
+        yield from _uncertainty(content.map, result)
+
+
+def _acceptance(result: Calibration, found: Acceptance) -> list[tuple[str, str]]:
     requirement = found.requirement
     facts = [
         ("Limit", f"{1e3 * requirement.limit:g} mm, with {percent(requirement.confidence)}"),
         ("Region", requirement.where),
     ]
     if found.bound is not None and found.typical is not None and np.isfinite(found.bound):
-        units = joint_columns(result.problem.robot.joint_dimensions)
         worst = ""
         if found.worst is not None:
+            units = joint_columns(result.problem.robot.joint_dimensions)
             values = [f"{value / si:.1f}" for value, si in zip(found.worst, units.values(), strict=True)]
             worst = f", at joints {', '.join(values)} {' and '.join(sorted({n.rpartition('_')[2] for n in units}))}"
         facts += [
@@ -180,40 +208,7 @@ def _acceptance(result: Calibration, found: Acceptance | None) -> Section | None
         facts.append(("Repeatability", f"{1e3 * found.scatter:.3f} mm of the maximum U, with all parameters known"))
     if found.checked is not None:
         facts.append(("Validation", found.checked.sentence()))
-    return {"facts": facts, "reasons": found.reasons}
-
-
-def _accuracy(result: Calibration, accepted: Acceptance | None) -> Section:
-    record = result.record
-    notes = [summary.nominal_note(result)]
-    used = "Identification rows were used to identify the parameters"
-    if record.validation is not None:
-        used += "; validation rows were not used for anything"
-    notes.append(f"{used}.")
-    if record.held_out is not None:
-        notes.append("Rows held out were not, when they were judged; they are among the identification rows now.")
-    covered = None
-    if record.held_out is not None:
-        covered = record.held_out.coverage
-    elif record.validation is not None:
-        covered = predicted(result, record.validation).coverage
-    if covered is not None and accepted is None:  # whose section says it
-        notes.append(
-            f"{percent(round(covered, 2))} of the held-out coordinates lie in their 95 % prediction intervals."
-        )
-    head = ["data, model", *summary.COLUMNS]
-    rows = [row for row in summary.error_rows(result) if row["count"]]
-    tables = [Table("Error [mm]", head, summary.cells(rows))]
-    angles = summary.orientation_rows(result)
-    if angles:
-        tables.append(Table("Orientation error [mrad]", head, summary.cells(angles, "mrad")))
-    for name, data in summary.sets(result).items():
-        touched = scatter(data, result.nominal_errors(data), result.errors(data))
-        if touched:
-            caption = f"{name.capitalize()}, distance of touches from their point [mm]"
-            tables.append(Table(caption, HEADER, scatter_rows(touched)))
-    name, data = next(iter(summary.sets(result).items()))
-    return {"notes": notes, "tables": tables, "figures": _error_figures(result, name, data)}
+    return facts
 
 
 def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure]:
@@ -224,10 +219,7 @@ def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure
     ]
 
 
-def _uncertainty(map_: summary.Workspace | None, result: Calibration) -> Section | None:
-    """Return the map of the expanded uncertainty over the workspace."""
-    if map_ is None:
-        return None
+def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
         map_.sentence(),
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
@@ -235,21 +227,20 @@ def _uncertainty(map_: summary.Workspace | None, result: Calibration) -> Section
         "of the configurations that reach it, at any depth. Axes of the robot's base.",
     ]
     limit = None
-    box = None
     if result.record.requirement is not None:
         limit = 1e3 * map_.requirement.limit
         notes.append("The search for the maximum goes on between these configurations, and may end above the map's.")
-    if map_.region.box is not None:
-        box = 1e3 * map_.region.box
+    yield "text", notes
+    box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.machine, map_.q, map_.region.marker)
-    maps = charts.workspace_charts(at, 1e3 * map_.expanded, box, limit)
-    return {"notes": notes, "figures": [figure(each) for each in maps]}
+    yield "figures", [figure(each) for each in charts.workspace_charts(at, 1e3 * map_.expanded, box, limit)]
 
 
 # --- parameters --------------------------------------------------------------------------------------------
 
 
-def _parameters(result: Calibration) -> Section:
+def _parameters(content: Content) -> Iterator[Block]:
+    result = content.result
     free = result.problem.parameters.free
     half = np.full(len(result.x), np.nan)
     note = "No intervals: the formulation has no covariance."
@@ -275,17 +266,15 @@ def _parameters(result: Calibration) -> Section:
     if not np.isfinite(tolerance).any():
         head = head[:-1]
         rows = [row[:-1] for row in rows]
+    yield "text", weight_lines(result)
+    yield "text", [note, *turned_frames(result)]
     own = np.array(free.dimensions)[~free.of_frames]
-    return {
-        "estimated": weight_lines(result),
-        "notes": [note, *turned_frames(result)],
-        "table": Table("Identified parameters", head, rows),
-        "figures": [
-            figure(charts.deviations_chart(result, dimension, half), f"The robot's own {dimension} parameters.")
-            for dimension in ("length", "angle")
-            if dimension in own
-        ],
-    }
+    drawn = [
+        figure(charts.deviations_chart(result, dimension, half), f"The robot's own {dimension} parameters.")
+        for dimension in ("length", "angle")
+        if dimension in own
+    ]
+    yield "beside", [("table", Table("Identified parameters", head, rows)), ("figures", drawn)]
 
 
 # --- diagnostics -------------------------------------------------------------------------------------------
@@ -298,8 +287,21 @@ MOST_FLAGGED = 200
 """Flagged rows that are named, the worst first."""
 
 
-def _residuals(result: Calibration, composition: list[str]) -> Section:
-    """Return residuals against noise, what they consist of, and errors along the axes."""
+def _diagnostics(content: Content) -> Iterator[Block]:
+    result = content.result
+    yield "heading", "Residuals"
+    yield from _residuals(result, content.composition)
+    yield from _space(result, content.embedded)
+    yield "heading", "Identifiability"
+    yield from _identifiability(result)
+    yield "heading", "Flagged and excluded rows"
+    yield _flagged(result)
+    yield "heading", "Convergence"
+    yield from _convergence(result)
+
+
+def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
+    yield "text", [*result.noise_sentence(), *composition]
     figures = []
     rows = []
     what = ""
@@ -314,13 +316,13 @@ def _residuals(result: Calibration, composition: list[str]) -> Section:
         for i, axis in enumerate("xyz"):
             means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
             rows.append([f"{name}, {axis}", *means])
-    caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
-    table = Table(caption, ["data, axis", "nominal", "identified"], rows)
-    return {"notes": [*result.noise_sentence(), *composition], "figures": figures, "table": table if rows else None}
+    yield "figures", figures
+    if rows:
+        caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
+        yield "table", Table(caption, ["data, axis", "nominal", "identified"], rows)
 
 
-def _space(result: Calibration, embedded: dict[str, Any]) -> Section | None:
-    """Return the view of measured positions with their errors; what the page's script draws goes into ``embedded``."""
+def _space(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
     points, before, after = [], [], []
     labels: list[str] = []
     for name, data in summary.sets(result).items():
@@ -332,7 +334,7 @@ def _space(result: Calibration, embedded: dict[str, Any]) -> Section | None:
         labels += [f"{data.label[i]} ({name})" for i in np.flatnonzero(finite)]
     P = np.vstack(points)
     if not len(P):
-        return None
+        return
     drawn = np.linspace(0, len(P) - 1, min(len(P), MOST_POINTS)).astype(int)
     embedded["space"] = {
         "points": P[drawn].round(6).tolist(),
@@ -349,10 +351,11 @@ def _space(result: Calibration, embedded: dict[str, Any]) -> Section | None:
     if len(drawn) < len(P):
         text += f" {len(drawn)} of them are drawn."
     label = f"Measured positions in space with their error vectors: {len(P)} points, {span}. Arrow keys turn the view."
-    return {"text": text, "label": label, "views": VIEWS}
+    yield "heading", "Errors in space"
+    yield "space", {"text": text, "label": label, "views": VIEWS}
 
 
-def _lines(points: Array, vectors: Array) -> Section:
+def _lines(points: Array, vectors: Array) -> dict[str, Any]:
     """Return errors [m] as enlarged lines [m]; those far beyond the others are cut so that these can be seen."""
     length = np.linalg.norm(vectors, axis=1)
     longest = 3 * float(np.percentile(length, 90))
@@ -365,7 +368,7 @@ def _lines(points: Array, vectors: Array) -> Section:
     return {"lines": (times * cut).round(5).tolist(), "errors": (1e3 * length).round(6).tolist(), "note": note}
 
 
-def _identifiability(result: Calibration) -> Section:
+def _identifiability(result: Calibration) -> Iterator[Block]:
     found = observe(result.problem)
     text = f"{found.configurations} configurations. {summary.identifiability(result)}"
     redundant = [f"{combination(each)}" for each in found.redundant]
@@ -379,28 +382,29 @@ def _identifiability(result: Calibration) -> Section:
             " At the nominal parameters no measurement changes along the following combinations [mm, mrad]: the "
             "penalty decides there, and predictions do not depend on it."
         )
+    yield "text", [text]
+    yield "bullets", redundant
     indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())
-    condition = f"Condition number {found.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."
-    return {"text": text, "redundant": redundant, "indices": condition}
+    yield (
+        "text",
+        [f"Condition number {found.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."],
+    )
 
 
-def _flagged(result: Calibration) -> Section:
+def _flagged(result: Calibration) -> Block:
     flagged = result.flagged
     kept = "flagged, in the data"
     rows = [[flag.label, f"{flag.sigmas:.1f}", mm(flag.error_mm), kept] for flag in flagged[:MOST_FLAGGED]]
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{kept}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
+    if not rows:
+        return "text", ["No row is flagged (one good data set in a hundred has one), and none is excluded."]
     head = ["row", "standardized residual", "error [mm]", "status"]
-    table = Table("Flagged and excluded rows", head, rows, prose=True) if rows else None
-    return {"table": table, "text": "No row is flagged (one good data set in a hundred has one), and none is excluded."}
+    return "table", Table("Flagged and excluded rows", head, rows, prose=True)
 
 
-def _convergence(result: Calibration) -> Section:
-    rows = [
-        [str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"]
-        for k, it in enumerate(result.history, start=1)
-    ]
+def _convergence(result: Calibration) -> Iterator[Block]:
     try:
         c = result.certificate
         parts = [f"next step of the convex program {c.step:.1e}", f"constraint violation {c.violation:.1e}"]
@@ -409,23 +413,31 @@ def _convergence(result: Calibration) -> Section:
         text = f"Certificate, computed anew at the solution: {', '.join(parts)} (in prior scales)."
     except RpimError as error:
         text = f"No certificate. {error}"
-    head = ["iteration", "objective", "step [prior scales]", "weight"]
-    return {"text": f"{result.message} {text}", "table": Table("Iterations", head, rows)}
+    yield "text", [result.message, text]
+    rows = [
+        [str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"]
+        for k, it in enumerate(result.history, start=1)
+    ]
+    yield "table", Table("Iterations", ["iteration", "objective", "step [prior scales]", "weight"], rows)
 
 
 # --- provenance --------------------------------------------------------------------------------------------
 
 
-def _provenance(result: Calibration) -> Section:
+def _provenance(content: Content) -> Iterator[Block]:
+    result = content.result
     record = result.record
-    facts = [
-        ("Source", record.source or "not stated"),
-        ("Measurements", "simulated" if record.simulated else "as the source says; not marked as simulated"),
-        ("Robot", "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items())),
-        ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
-        ("Made", record.made),
-        ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
-    ]
+    yield (
+        "facts",
+        [
+            ("Source", record.source or "not stated"),
+            ("Measurements", "simulated" if record.simulated else "as the source says; not marked as simulated"),
+            ("Robot", "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items())),
+            ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
+            ("Made", record.made),
+            ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
+        ],
+    )
     count: Counter[tuple[str, str]] = Counter()
     for name, data in summary.sets(result).items():
         for block in data.blocks:
@@ -433,15 +445,14 @@ def _provenance(result: Calibration) -> Section:
             count[f"{name}, {what}", _noise(block)] += len(block.row)
     rows = [[what, str(number), noise] for (what, noise), number in count.items()]
     head = ["data", "rows", "standard uncertainty"]
-    tables = [Table("Measurements and their stated standard uncertainties", head, rows, prose=True)]
+    yield "table", Table("Measurements and their stated standard uncertainties", head, rows, prose=True)
     if record.files:
-        files = [[name, digest] for name, digest in record.files.items()]
-        tables.append(Table("Input files", ["file", "SHA-256"], files, prose=True))
+        yield "table", Table("Input files", ["file", "SHA-256"], list(record.files.items()), prose=True)
     if record.earlier:
         earlier = [[each.title, each.made, str(each.rows), _changes(each), each.digest] for each in record.earlier]
         head = ["calibration", "made", "rows", "changed since", "digest"]
-        tables.append(Table("Earlier calibrations that are the prior", head, earlier, prose=True))
-    return {"facts": facts, "tables": tables}
+        yield "table", Table("Earlier calibrations that are the prior", head, earlier, prose=True)
+    yield "text", ["All figures on this page were computed from the calibration's measurements and parameters."]
 
 
 def _changes(each: Earlier) -> str:
@@ -473,7 +484,7 @@ def _formulation(result: Calibration) -> str:
     return f"{text}, constraints: {', '.join(bounds) or 'none'}"
 
 
-def _noise(block: Block) -> str:
+def _noise(block: Rows) -> str:
     """Return the stated standard deviations by component, as a range where rows differ."""
     spread = np.sqrt(np.einsum("nii->ni", block.covariance))
     components: dict[str, list[str]] = {}
@@ -496,27 +507,30 @@ curves look the same, and a hundred robust fits of two thousand rows take minute
 PICARD = "Picard's condition at the solution: the penalty damps directions below the line; data near 1 are noise."
 
 
-def _weight(result: Calibration, embedded: dict[str, Any]) -> Section:
-    """Return the L-curve with every selector's choice; what the page's slider needs goes into ``embedded``."""
-    picard = figure(charts.picard_chart(result.program, result.penalty_weight), PICARD)
-    section: Section = {"figure": None, "picard": picard}
+def _regularization(content: Content) -> Iterator[Block]:
+    result = content.result
     formulation = result.formulation
     # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
-    if result.record.earlier or formulation.penalty is None or not formulation.solvable or result.weight <= 0:
-        return section
+    has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
+    if has_path and result.weight > 0:
+        yield from _weight(result, content.embedded)
+    yield "figures", [figure(charts.picard_chart(result.program, result.penalty_weight), PICARD)]
+
+
+def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
+    """Yield the L-curve and the choice of every rule; what the page's slider needs goes into ``embedded``."""
     program, note = _drawn_program(result)
     chosen = {result.selector: result.selection or Selection(result.weight, "given", np.array([]), np.array([]), True)}
     if not _slow(program):
         chosen = {**compare(program), **chosen}
     name, curve = _path(result, program, chosen)
-    weights = np.array(curve["weight"])
+    weights, residual, solution = (np.array(curve[key]) for key in ("weight", "residual", "solution"))
     places = {
         rule: int(np.argmin(np.abs(np.log(weights / choice.weight))))
         for rule, choice in chosen.items()
         if choice.weight > 0
     }
     k = places[result.selector]
-    residual, solution = np.array(curve["residual"]), np.array(curve["solution"])
     points = {rule: (residual[i], solution[i]) for rule, i in places.items()}
     picture = Picture(charts.l_curve_chart(residual, solution, points, result.selector))
     x, y = picture.x(residual), picture.y(solution)
@@ -526,22 +540,15 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> Section:
     names = {place: ", ".join(rules) for place, rules in takers.items()}
     embedded["curve"] = {**curve, "of": name, "takers": names, "chosen": k, "x": x.tolist(), "y": y.tolist()}
     cursor = tag("circle", id="cursor", r=9, class_="cursor", cx=f"{x[k]:g}", cy=f"{y[k]:g}")
+    caption = "Every point is the solution at one weight: small weights above left, large ones below right."
+    yield "weight", {"figure": figure(picture, caption + note, cursor), "last": len(weights) - 1, "chosen": k}
     rows = []
     for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
         mean = mm(curve["error"][places[rule]]) if rule in places else ""
         own = f"{rule} (chosen)" if rule == result.selector else rule
         rows.append([own, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
-    caption = "Every point is the solution at one weight: small weights above left, large ones below right."
-    section |= {
-        "figure": figure(picture, caption + note, cursor),
-        "last": len(weights) - 1,
-        "chosen": k,
-        "table": Table(
-            "Weights that the selection rules choose from the identification data alone",
-            ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True,
-        ),
-    }  # fmt: skip
-    return section
+    title = "Weights that the selection rules choose from the identification data alone"
+    yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
 
 
 def _slow(program: Program) -> bool:
@@ -562,22 +569,30 @@ def _drawn_program(result: Calibration) -> tuple[Program, str]:
     return pose(squares, weighted), " The curve is that of its quadratic model at the chosen weight."
 
 
-def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]) -> tuple[str, Section]:
+def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]) -> tuple[str, dict[str, list[float]]]:
     """Solve over a grid of weights and at the chosen ones; return whose mean error [mm] is given, and the curve."""
     count = 80 if program.closed_form else 30
     if _slow(program):
         count = 10
-    estimates: list[Estimate] = []
-    positive = [choice.weight for choice in chosen.values() if choice.weight > 0]
-    for weight in np.unique([*weight_grid(program, count), *positive]):
-        with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
-            estimates += program.path([weight])
     name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
     scale = result.problem.parameters.free.scale
-    return name, {
-        "weight": [estimate.weight for estimate in estimates],
-        "residual": [float(np.sqrt(estimate.loss)) for estimate in estimates],
-        "solution": [float(np.sqrt(estimate.penalty)) for estimate in estimates],
-        "error": [1e3 * float(np.nanmean(problem.errors(scale * estimate.z))) for estimate in estimates],
-    }
+    curve: dict[str, list[float]] = {"weight": [], "residual": [], "solution": [], "error": []}
+    positive = [choice.weight for choice in chosen.values() if choice.weight > 0]
+    for weight in np.unique([*weight_grid(program, count), *positive]):
+        with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
+            (estimate,) = program.path([weight])
+            curve["weight"].append(estimate.weight)
+            curve["residual"].append(float(np.sqrt(estimate.loss)))
+            curve["solution"].append(float(np.sqrt(estimate.penalty)))
+            curve["error"].append(1e3 * float(np.nanmean(problem.errors(scale * estimate.z))))
+    return name, curve
+
+
+SECTIONS = (
+    ("Accuracy and uncertainty", _accuracy),
+    ("Parameters", _parameters),
+    ("Diagnostics", _diagnostics),
+    ("Provenance", _provenance),
+    ("Appendix: regularization", _regularization),
+)

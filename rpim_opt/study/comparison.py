@@ -21,7 +21,7 @@ from rpim_opt.study.methods import USUAL, Method, measure, methods_of, metrics_o
 from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
 from rpim_opt.study.provenance import package_code, provenance
 from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED, WITH_FIGURES, Summary, figures, summarize
-from rpim_opt.study.replicates import Row, open_journal, require_package
+from rpim_opt.study.replicates import Row, require_package, run_cases
 
 MOST_DRAWS = 100_000
 """Each is a calibration of its own, and is listed before the first begins."""
@@ -115,110 +115,75 @@ def compare(
     >>> len(found.to_frame()), found.metric
     (8, 'rms_mm')
     """
-    grid = Grid(
-        sources_of(problems),
-        methods_of(formulations, selectors, methods, options or {}),
-        splits_of(splits),
-        (None,) if counts is None else _whole("counts", counts, 1),
-        _factors(noise),
-        _seeds(seeds),
-        metrics_of(metrics),
-        options or {},
-    )
+    sources = {source.label: source for source in sources_of(problems)}
+    compared = {method.label: method for method in methods_of(formulations, selectors, methods, options or {})}
+    ways = {split.label: split for split in splits_of(splits)}
+    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", _whole(1))
+    factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", _is_factor)
+    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
+        if seeds > MOST_DRAWS:
+            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
+        seeds = range(max(int(seeds), 0))
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", _whole(0))
+    figured = metrics_of(metrics)
+    cases: list[Row] = []
+    for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
+        random = source.drawn or split.label != FOLDER or count is not None or factor > 1
+        drawn = numbered if random else numbered[:1]
+        for seed, fold, method in product(drawn, range(1, split.folds + 1), compared.values()):
+            case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
+            case |= {"selector": method.selector, "split": split.label, "fold": fold, "count": count}
+            cases.append({**case, "noise_factor": float(factor), "seed": seed})
+
+    def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
+        return partial(
+            replicate, sources[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case
+        )
+
     made = provenance()
-    path = None
     code: dict[str, str] = {}
+    path = None
     if journal is not None:
-        path = Path(journal)
-        code = grid.code()
-        with refused(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-    with open_journal(path, grid.cases(), code, resume) as kept, progress_bar("comparing", progress) as say:
-        kept.fill([(key, grid.task(case)) for key, case in kept.waiting], workers, scheduler, say)
-        rows = tuple(kept.rows)
-    drawn = frozenset(source.label for source in grid.sources if source.drawn)
-    return Comparison(rows, tuple(grid.metrics), drawn, grid.axes(), made)
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Axes of a comparison, checked: one entry a value of each; a count of None is all configurations."""
-
-    sources: tuple[Source, ...]
-    methods: tuple[Method, ...]
-    splits: tuple[Split, ...]
-    counts: tuple[int | None, ...]
-    factors: tuple[float, ...]
-    seeds: tuple[int, ...]
-    metrics: Mapping[str, Callable[..., Any]]
-    options: Mapping[str, Any]
-
-    def cases(self) -> list[dict[str, Any]]:
-        """Return one plain table a replicate."""
-        cases = []
-        for source, split, count, factor in product(self.sources, self.splits, self.counts, self.factors):
-            random = source.drawn or split.by_seed or count is not None or factor > 1
-            seeds = self.seeds if random else self.seeds[:1]
-            for seed, fold, method in product(seeds, range(1, split.folds + 1), self.methods):
-                case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
-                case |= {"selector": method.selector, "split": split.label, "fold": fold, "count": count}
-                cases.append({**case, "noise_factor": factor, "seed": seed})
-        return cases
-
-    def task(self, case: Mapping[str, Any]) -> Callable[[], Row]:
-        """Return what computes a case, with no more than it needs."""
-        source = next(each for each in self.sources if each.label == case["problem"])
-        split = next(each for each in self.splits if each.label == case["split"])
-        method = next(each for each in self.methods if each.label == case["method"])
-        return partial(replicate, source, split, method, self.metrics, case)
-
-    def code(self) -> dict[str, str]:
-        """Return what replicates follow from, in digests: the package, and the arguments."""
         require_package("joblib", "journal")
         from rpim_opt.study.content_hash import content_hash
 
-        arguments = {"problems given": self.sources, "methods": self.methods, "metrics": self.metrics}
-        digests = {f"set of {name}": content_hash(value, "journal") for name, value in arguments.items()}
-        return {**package_code(), **digests}
-
-    def axes(self) -> dict[str, str]:
-        """Return the axes in words."""
-        axes = {
-            "Problems": [source.label for source in self.sources],
-            "Methods": [method.label for method in self.methods],
-            "Held out": [split.label for split in self.splits],
-            "Configurations": ["all" if count is None else str(count) for count in self.counts],
-            "Noise factors": [f"{factor:g}" for factor in self.factors],
-            "Seeds": [str(seed) for seed in self.seeds],
-            "Metrics": list(self.metrics),
-            "Options": [f"{name} = {value}" for name, value in self.options.items()],
-        }
-        return {name: ", ".join(values) for name, values in axes.items() if values}
-
-
-def _seeds(stated: int | Iterable[int]) -> tuple[int, ...]:
-    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
-        if stated > MOST_DRAWS:
-            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
-        return _whole("seeds", range(max(int(stated), 0)), 0)
-    return _whole("seeds", stated, 0)
+        path = Path(journal)
+        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
+        code = {**package_code(), **{f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}}
+        with refused(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+    with progress_bar("comparing", progress) as say:
+        rows = run_cases(cases, work, workers, scheduler, say, path, code, resume)
+    axes = {
+        "Problems": sources,
+        "Methods": compared,
+        "Held out": ways,
+        "Configurations": ["all" if count is None else str(count) for count in sizes],
+        "Noise factors": [f"{factor:g}" for factor in factors],
+        "Seeds": [str(seed) for seed in numbered],
+        "Metrics": figured,
+        "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
+    }
+    asked = {name: ", ".join(values) for name, values in axes.items() if values}
+    families = frozenset(label for label, source in sources.items() if source.drawn)
+    return Comparison(tuple(rows), tuple(figured), families, asked, made)
 
 
-def _whole(where: str, stated: Any, least: int) -> tuple[int, ...]:
-    """Return whole numbers, each once."""
+def _numbers(where: str, stated: Any, accepted: str, good: Callable[[Any], bool]) -> list[Any]:
+    """Return numbers, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
-    whole = [isinstance(v, int | np.integer) and not isinstance(v, bool) and v >= least for v in values]
-    if not values or not all(whole):
-        raise InputError(where, f"{stated!r}", f"whole numbers, {least} or more")
-    return tuple(dict.fromkeys(int(v) for v in values))
+    numeric = all(isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values)
+    if not values or not numeric or not all(map(good, values)):
+        raise InputError(where, f"{stated!r}", accepted)
+    return list(dict.fromkeys(int(v) if isinstance(v, int | np.integer) else float(v) for v in values))
 
 
-def _factors(stated: Any) -> tuple[float, ...]:
-    values = list(stated) if isinstance(stated, Iterable) else [stated]
-    numbers = [isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values]
-    if not values or not all(numbers) or not all(1 <= v <= LARGEST_FACTOR for v in values):
-        raise InputError("noise", f"{stated!r}", "factors of 1 or more on the noise that was measured")
-    return tuple(dict.fromkeys(float(v) for v in values))
+def _whole(least: int) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, int | np.integer) and bool(value >= least)
+
+
+def _is_factor(value: Any) -> bool:
+    return 1 <= value <= LARGEST_FACTOR
 
 
 def replicate(
@@ -347,7 +312,7 @@ class Comparison:
             As for `summary`.
         """
         require_package("matplotlib", "report")
-        from rpim_opt.study.page import write_page
+        from rpim_opt.study.figures import write_page
 
         return write_page(Path(folder), self.rows, self.summary(metric, against), self.asked, self.made)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import sysconfig
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -38,11 +39,7 @@ def content_hash(thing: Any, where: str) -> str:
 
     joblib hashes what can be pickled. Functions and classes of a script count by their code, defaults, closures and
     the globals that they read, not by their names or by where they stand; those of installed packages by their names.
-
-    Raises
-    ------
-    InputError
-        Names what has no content that can be hashed: a generator, an open file, a lock.
+    InputError names what has no content that can be hashed: a generator, an open file, a lock.
     """
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(max(limit, DEEPEST))
@@ -103,8 +100,8 @@ def _content(thing: Any) -> tuple[Any, ...] | None:
             code: Any = thing.__code__
             if code.co_filename.startswith(LIBRARIES):
                 code = (thing.__module__, thing.__qualname__)
-            given = (thing.__defaults__, thing.__kwdefaults__, [_held(cell) for cell in thing.__closure__ or ()])
-            return "function", code, given, _globals(thing), dict(vars(thing))
+            given = (thing.__defaults__, thing.__kwdefaults__)
+            return "function", code, given, _read_by(thing), dict(vars(thing))
         case type() if not _is_library(thing.__module__):
             return "class", thing.__qualname__, thing.__bases__, _own(thing)
         case ModuleType():
@@ -130,24 +127,20 @@ def _content(thing: Any) -> tuple[Any, ...] | None:
     return None if wrapped is None else (kind, wrapped)
 
 
-def _held(cell: Any) -> Any:
-    """Return what a cell of a closure holds; one may be empty yet."""
-    try:
-        return cell.cell_contents
-    except ValueError:
-        return None
-
-
-def _globals(function: FunctionType) -> dict[str, Any]:
-    """Return the globals that a script's function reads, with what it reads of the script's modules."""
+def _read_by(function: FunctionType) -> dict[str, Any]:
+    """Return what a function's closure holds, and the globals that a script's one reads, of its modules too."""
+    found: dict[str, Any] = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # it holds nothing yet
+            found[f"cell {name}"] = cell.cell_contents
     if function.__code__.co_filename.startswith(LIBRARIES):
-        return {}
+        return found
     names: set[str] = set()
     codes = [function.__code__]
     for code in codes:
         names.update(code.co_names)
         codes += [each for each in code.co_consts if isinstance(each, CodeType)]
-    found = {name: function.__globals__[name] for name in names if name in function.__globals__}
+    found |= {name: function.__globals__[name] for name in names if name in function.__globals__}
     modules = [each for each in found.values() if isinstance(each, ModuleType) and not _is_library(each.__name__)]
     for module in modules:
         found |= {f"{module.__name__}.{name}": getattr(module, name) for name in names if hasattr(module, name)}

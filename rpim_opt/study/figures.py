@@ -1,9 +1,12 @@
-"""Figures of comparisons and of studies; it is imported where one is drawn."""
+"""Figures and page of a comparison, and figures of studies; it is imported where one is drawn."""
 
 from __future__ import annotations
 
+import base64
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,8 +14,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarFormatter, StrMethodFormatter
 
-from rpim_opt.basics.arrays import Array
-from rpim_opt.study.ranking import Standing, Summary, figures, profiles
+from rpim_opt.basics.files import refused, write_files
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.report.page import Block, Table, render
+from rpim_opt.study.ranking import Rows, Standing, Summary, figures, number, profiles, without_figures
 
 ROW_INCHES = 0.25
 """Height of a method."""
@@ -22,6 +27,8 @@ NAMED_PROFILES = 6
 """Methods with a profile of their own; the others are grey."""
 LARGEST_PROFILE_RATIO = 10.0
 """End of the axis of the profiles; less where all that are named are done before."""
+SHADES = (1.02, 1.1, 1.3, 2.0, 5.0)
+"""Ratios to the best of a problem between which a cell's shade changes."""
 
 
 def picture(figure: Any, name: str, kind: str) -> bytes:
@@ -68,17 +75,20 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     return figure
 
 
-def comparison_figure(rows: Sequence[Mapping[str, Any]], summary: Summary) -> Any:
+def comparison_figure(rows: Rows, summary: Summary) -> Any:
     """Return the figure: methods from best to worst, and what share of replicates each is near the best of."""
     height = max(ROW_INCHES * len(summary.standings) + 1.5, 3.5)
     figure = Figure(figsize=(11, height), dpi=150, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
     _ratios(left, rows, summary)
     _profiles(right, rows, summary)
+    for ax in (left, right):
+        _round_ticks(ax)
+        ax.grid(axis="x", alpha=0.25)
     return figure
 
 
-def _ratios(ax: Any, rows: Sequence[Mapping[str, Any]], summary: Summary) -> None:
+def _ratios(ax: Any, rows: Rows, summary: Summary) -> None:
     """Draw every replicate's ratio as a dot, and the mean with its interval."""
     of = figures(rows, summary.metric)
     other = of[summary.reference]
@@ -89,39 +99,34 @@ def _ratios(ax: Any, rows: Sequence[Mapping[str, Any]], summary: Summary) -> Non
         ratios = np.array([own[pair] / other[pair] for pair in own if other.get(pair)])
         alpha = min(0.5, 3 / max(len(ratios), 1) ** 0.5)
         ax.plot(_inside(ratios), np.full(len(ratios), top - k), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        for edge, beyond, turn in (
-            (LARGEST_RATIO, ratios > LARGEST_RATIO, ">"),
-            (1 / LARGEST_RATIO, ratios < 1 / LARGEST_RATIO, "<"),
-        ):
-            if beyond.any():
-                ax.plot([edge], [top - k], turn, ms=6, color="C0", zorder=2)
-        _mean(ax, each, top - k, each.method == summary.reference)
+        if (ratios > LARGEST_RATIO).any():
+            ax.plot([LARGEST_RATIO], [top - k], ">", ms=6, color="C0", zorder=2)
+        if (ratios < 1 / LARGEST_RATIO).any():
+            ax.plot([1 / LARGEST_RATIO], [top - k], "<", ms=6, color="C0", zorder=2)
+        if each.ratio is not None:
+            _mean(ax, each, each.ratio, top - k, each.method == summary.reference)
     ax.set_yticks(range(top + 1), [each.method for each in reversed(summary.standings)], fontsize=8)
     ax.set_ylim(-0.7, top + 0.7)
     ax.set_xscale("log")
-    _round_ticks(ax)
-    ax.grid(axis="x", alpha=0.25)
     ax.set_xlabel(f"{summary.metric} over that of {summary.reference}, same replicate")
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9, color="0.3")
 
 
-def _inside(ratios: Any) -> Array:
+def _inside(ratios: Any) -> Any:
     return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
 
 
-def _mean(ax: Any, each: Standing, y: int, reference: bool) -> None:
-    if each.ratio is None:
-        return
+def _mean(ax: Any, each: Standing, ratio: float, y: int, reference: bool) -> None:
     colour = "0.3"
     if each.different:
-        colour = "C2" if each.ratio < 1 else "C3"
-    if each.low is not None and each.high is not None and not reference:
+        colour = "C2" if ratio < 1 else "C3"
+    if each.low is not None and not reference:
         ends = _inside([each.low, each.high])
         ax.plot(ends, [y, y], "-", lw=2, color=colour, zorder=3, solid_capstyle="butt")
-    ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
+    ax.plot(_inside([ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
 
 
-def _profiles(ax: Any, rows: Sequence[Mapping[str, Any]], summary: Summary) -> None:
+def _profiles(ax: Any, rows: Rows, summary: Summary) -> None:
     """Draw what share of replicates is within a ratio of the best method's figure."""
     of = profiles(rows, summary.metric)
 
@@ -129,32 +134,26 @@ def _profiles(ax: Any, rows: Sequence[Mapping[str, Any]], summary: Summary) -> N
         return float(np.mean(np.maximum(np.log(LARGEST_PROFILE_RATIO) - np.log(of[name]), 0)))
 
     ranked = sorted(of, key=area, reverse=True)
-    for name in reversed(ranked[NAMED_PROFILES:]):
-        _step(ax, of[name], color="0.85", lw=0.8)
-    for k, name in enumerate(ranked[:NAMED_PROFILES]):
-        _step(ax, of[name], color=f"C{k}", lw=1.6, label=name)
-    finite = np.concatenate([of[name][np.isfinite(of[name])] for name in ranked[:NAMED_PROFILES]])
+    named = ranked[:NAMED_PROFILES]
+    for name in reversed(ranked):
+        style: dict[str, Any] = {"color": "0.85", "lw": 0.8}
+        if name in named:
+            style = {"color": f"C{named.index(name)}", "lw": 1.6, "label": name}
+        finite = of[name][np.isfinite(of[name])]
+        share = np.arange(len(finite) + 1) / len(of[name])
+        ax.step([1.0, *finite, LARGEST_PROFILE_RATIO], [*share, share[-1]], where="post", **style)
+    reached = np.concatenate([of[name][np.isfinite(of[name])] for name in named])
     ax.set_xscale("log")
-    ax.set_xlim(1, float(np.clip(1.1 * finite.max(initial=1.0), 1.2, LARGEST_PROFILE_RATIO)))
+    ax.set_xlim(1, float(np.clip(1.1 * reached.max(initial=1.0), 1.2, LARGEST_PROFILE_RATIO)))
     ax.set_ylim(0, 1.02)
-    _round_ticks(ax)
-    ax.grid(alpha=0.25)
     ax.set_xlabel("ratio to the best method of the replicate")
     ax.set_ylabel("share of replicates within that ratio")
-    others = len(ranked) - NAMED_PROFILES
-    ax.legend(frameon=False, fontsize=8, loc="lower right")
+    lines, labels = ax.get_legend_handles_labels()
+    ax.legend(lines[::-1], labels[::-1], frameon=False, fontsize=8, loc="lower right")
     title = "performance profiles"
-    if others > 0:
-        title += f" (the best {NAMED_PROFILES}; grey: {others} others)"
+    if len(ranked) > len(named):
+        title += f" (the best {NAMED_PROFILES}; grey: {len(ranked) - len(named)} others)"
     ax.set_title(title, fontsize=9, color="0.3")
-
-
-def _step(ax: Any, over: Any, **style: Any) -> None:
-    share = np.arange(1, len(over) + 1) / len(over)
-    finite = np.isfinite(over)
-    x = np.concatenate([[1.0], over[finite], [LARGEST_PROFILE_RATIO]])
-    y = np.concatenate([[0.0], share[finite], share[finite][-1:] if finite.any() else [0.0]])
-    ax.step(x, y, where="post", **style)
 
 
 def _round_ticks(ax: Any) -> None:
@@ -169,3 +168,103 @@ def _round_ticks(ax: Any) -> None:
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+CAPTION = (
+    "Left: every replicate's figure over the reference's on the same data, and the geometric mean with its interval "
+    "(green or red where that leaves 1 out). Right: the share of replicates on which a method is within a ratio of the "
+    "best one; a method without a figure never is."
+)
+
+
+def write_page(
+    folder: Path, rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]
+) -> Path:
+    """Write the page, the replicates and the figure into a folder: all of them, or none; return the page's path."""
+    figure = comparison_figure(rows, summary)
+    vector = picture(figure, "comparison", "svg")
+    names = list(rows[0])
+    cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
+    files = {
+        "index.html": _html(rows, summary, vector, axes, provenance).encode(),
+        "replicates.csv": csv_text(names, cells).encode(),
+        "comparison.svg": vector,
+        "comparison.png": picture(figure, "comparison", "png"),
+    }
+    with refused(folder):
+        write_files({folder / name: content for name, content in files.items()})
+    return folder / "index.html"
+
+
+def _html(rows: Rows, summary: Summary, vector: bytes, axes: Mapping[str, str], provenance: Mapping[str, str]) -> str:
+    problems = list(dict.fromkeys(row["problem"] for row in rows))
+    where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
+    heading = f"{len({row['method'] for row in rows})} methods on {where}"
+    words = "ratios to the reference by method, and performance profiles"
+    source = f"data:image/svg+xml;base64,{base64.b64encode(vector).decode()}"
+    title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
+    ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes[:3])]
+    sections = [("Methods", ranking), ("By problem", [("table", _medians(rows, summary, problems))])]
+    missing = _missing(rows, problems)
+    if missing.rows:
+        sections.append(("What could not be computed", [("table", missing)]))
+    sections.append(("How it was made", [("facts", [*axes.items(), *provenance.items()])]))
+    top: list[Block] = [
+        ("lead", {"text": headline(summary), "alarm": False}),
+        ("image", {"source": source, "words": words, "caption": CAPTION}),
+    ]
+    kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
+    return render(f"Comparison: {heading}", kind, heading, top, sections, images=True)
+
+
+def headline(summary: Summary) -> str:
+    """Return which method is best in a sentence or two."""
+    best = summary.standings[0]
+    better = [each for each in summary.standings if each.different and (each.ratio or 1) < 1]
+    if best.method == summary.reference and not better:
+        return f"No method is better than {summary.reference} in the geometric mean of {summary.metric}."
+    between = ""
+    if best.low is not None and best.high is not None:
+        between = f" (95 % interval {number(best.low)} to {number(best.high)})"
+    chance = "" if best.different else " That is no difference that these replicates can tell from none."
+    return (
+        f"{best.method} has the lowest {summary.metric}: {number(best.ratio)} times that of {summary.reference} in the "
+        f"geometric mean{between}.{chance}"
+    )
+
+
+def _medians(rows: Rows, summary: Summary, problems: list[str]) -> Table:
+    """Return every method's median on every problem, shaded by how near it is to the best."""
+    of: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        if row.get(summary.metric) is not None:
+            of.setdefault((row["method"], row["problem"]), []).append(row[summary.metric])
+    medians = {key: float(np.median(values)) for key, values in of.items()}
+    best: dict[str, float] = {}
+    for (_, problem), value in medians.items():
+        best[problem] = max(min(value, best.get(problem, np.inf)), np.finfo(float).tiny)
+    table = []
+    for each in summary.standings:
+        cells: list[Any] = [each.method]
+        for problem in problems:
+            value = medians.get((each.method, problem))
+            if value is None:
+                cells.append(("-", "none"))
+            else:
+                cells.append((number(value), f"shade{np.searchsorted(SHADES, value / best[problem])}"))
+        table.append(cells)
+    caption = f"Median {summary.metric} by problem; darker is farther from the best"
+    return Table(caption, ["method", *problems], table)
+
+
+def _missing(rows: Rows, problems: list[str]) -> Table:
+    """Return the replicates without figures, by method and reason."""
+    lines: list[list[str]] = []
+    for (method, status, reason), missing in without_figures(rows).items():
+        where = Counter(missing)
+        names = "all" if len(where) == len(problems) else ", ".join(where)
+        lines.append([method, status, str(len(missing)), names, reason])
+    header = ["method", "status", "replicates", "problems", "reason"]
+    return Table("Replicates without a figure", header, lines, prose=True)

@@ -22,7 +22,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance
-from rpim_opt.study.problems import FOLDER
+from rpim_opt.study.problems import FOLDER, each_once
 from rpim_opt.use.validation import validate
 
 NONE = "none"
@@ -36,18 +36,9 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method says of a problem.
+    """What a method returns: deviations x (n,) [SI], a calibration, or positions (N, 3) [m] of joint values (N, dof).
 
-    Parameters
-    ----------
-    x
-        Deviations (n,) [SI].
-    result
-        A calibration.
-    predict
-        A function from joint values (N, dof) to positions (N, 3) [m].
-    problem
-        Of which x is, where that identifies other parameters.
+    ``problem`` is the one that x belongs to, where that identifies other parameters.
     """
 
     x: Array | None = None
@@ -69,12 +60,7 @@ class Method:
 def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
     """Return what a function of a problem returned: a calibration, a baseline, x (n,), or a function of q (N, dof).
 
-    Instead of x alone it may be a problem that identifies other parameters, and x.
-
-    Raises
-    ------
-    InputError
-        For anything else.
+    Instead of x alone it may be a problem that identifies other parameters, and x; InputError for anything else.
     """
     where = f"method {label}"
     own = None
@@ -97,8 +83,8 @@ def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
     return Answer(x, problem=own)
 
 
-def _calibrate(instance: Instance, asked: Mapping[str, Any]) -> Answer:
-    result = instance.calibrate(**asked)
+def _calibrate(instance: Instance, stated: Mapping[str, Any]) -> Answer:
+    result = instance.calibrate(**stated)
     return Answer(result.x, result)
 
 
@@ -107,43 +93,31 @@ def _apply(instance: Instance, function: Callable[[CalibrationProblem], Any], la
 
 
 def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> tuple[Method, ...]:
-    """Return every formulation with every selector, then the functions.
+    """Return every formulation with every selector, then the functions; InputError for unknown or repeated names.
 
     A formulation without penalty has no weight: it is there once.
-
-    Raises
-    ------
-    InputError
-        For an unknown name, or one that occurs twice.
     """
     methods: list[Method] = []
     weights = [_selector(label, each) for label, each in _listed(selectors)]
     for name, formulation in (_formulation(label, each) for label, each in _listed(formulations)):
-        asked = dict(options)
+        stated = dict(options)
+        pairs = weights
         if formulation is not None:
-            asked["formulation"] = formulation
-        if formulation is not None and formulation.penalty is None:
-            methods.append(Method(name, partial(_calibrate, asked={**asked, "weight": 0.0}), name))
-            continue
-        for selector, weight in weights:
-            label = "as the folder says" if name == selector == FOLDER else f"{name}, {selector}"
-            own = asked if selector == FOLDER else {**asked, "weight": weight}
-            methods.append(Method(label, partial(_calibrate, asked=own), name, selector))
+            stated["formulation"] = formulation
+            if formulation.penalty is None:
+                pairs = [(NONE, 0.0)]
+        for selector, weight in pairs:
+            label = name if selector == NONE else f"{name}, {selector}"
+            if name == selector == FOLDER:
+                label = "as the folder says"
+            own = stated if selector == FOLDER else {**stated, "weight": weight}
+            methods.append(Method(label, partial(_calibrate, stated=own), name, selector))
     for label, each in _listed(functions):
-        function = each
-        if isinstance(each, str):
-            function = pick(BASELINES, each, "methods", also="a function of the problem, ")
-        elif not callable(each):
-            raise InputError("methods", f"{each!r}", f"functions of the problem, or {', '.join(BASELINES)}")
-        name = label or (each if isinstance(each, str) else _name(each))
+        name, function = _named(label, each, BASELINES, "methods", "the problem")
         methods.append(Method(name, partial(_apply, function=function, label=name)))
-    labels = [method.label for method in methods]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError("methods", f"'{label}' twice", "a name of its own for each: {'a name': ...}")
     if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
-    return tuple(methods)
+    return each_once("methods", methods, "...")
 
 
 def _listed(stated: Any) -> list[tuple[str, Any]]:
@@ -153,6 +127,15 @@ def _listed(stated: Any) -> list[tuple[str, Any]]:
     if isinstance(stated, str) or callable(stated) or not isinstance(stated, Iterable):
         return [("", stated)]
     return [("", each) for each in stated]
+
+
+def _named(label: str, each: Any, ready: Mapping[str, Any], where: str, argument: str) -> tuple[str, Any]:
+    """Return name and function of what is stated as a function, or by the name of a ready one."""
+    if isinstance(each, str):
+        return label or each, pick(ready, each, where, also=f"a function of {argument}, ")
+    if not callable(each):
+        raise InputError(where, f"{each!r}", f"functions of {argument}, or {', '.join(ready)}")
+    return label or _name(each), each
 
 
 def _name(function: Any) -> str:
@@ -172,10 +155,8 @@ def _selector(label: str, each: Any) -> tuple[str, Any]:
     """Return the name of a selector or weight, and what it is."""
     if each is None:
         each = LEARNED
-    if each == FOLDER:
-        return label or FOLDER, FOLDER
     if isinstance(each, str):
-        return label or each, weight_of(each)
+        return label or each, each if each == FOLDER else weight_of(each)
     if callable(each):
         ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
         return label or ready, each
@@ -206,7 +187,7 @@ class Fitted:
     answer
         The method's: ``x`` (n,) [SI], ``result``, ``predict``, whichever it has.
     seconds
-        That it took.
+        Its time.
 
     Examples
     --------
@@ -280,26 +261,12 @@ METRICS: dict[str, Callable[[Fitted], float | None]] = {
     "covered_percent": _coverage,
     "seconds": lambda fitted: fitted.seconds,
 }
-"""Ready ones: errors of rows held out and of rows fitted, the share of readings in their 95 % intervals, time."""
 USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")
 
 
 def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
-    """Return metrics by their names, which are columns and carry their units.
-
-    Raises
-    ------
-    InputError
-        For an unknown name, or what is no function.
-    """
-    metrics = {}
-    for label, each in _listed(stated):
-        if isinstance(each, str):
-            metrics[label or each] = pick(METRICS, each, "metrics", also="a function of a fit, ")
-        elif callable(each):
-            metrics[label or _name(each)] = each
-        else:
-            raise InputError("metrics", f"{each!r}", f"functions of a fit, or {', '.join(METRICS)}")
+    """Return metrics by their names, which are columns and carry their units; InputError for anything else."""
+    metrics = dict(_named(label, each, METRICS, "metrics", "a fit") for label, each in _listed(stated))
     if not metrics:
         raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
     return metrics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,16 @@ MOST_FOLDS = 10_000
 """Each is a calibration of its own, and is listed before the first begins."""
 NOISE_STREAM = 11
 """Stream of the noise that is added, apart from those that draw configurations."""
+Labelled = TypeVar("Labelled", bound=Any)
+
+
+def each_once(where: str, labelled: Sequence[Labelled], what: str) -> tuple[Labelled, ...]:
+    """Return things with labels as a tuple; InputError for a label that occurs twice."""
+    labels = [each.label for each in labelled]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InputError(where, f"'{label}' twice", f"a name of its own for each: {{'a name': {what}}}")
+    return tuple(labelled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,69 +59,50 @@ class Source:
 
 
 def sources_of(problems: Any) -> tuple[Source, ...]:
-    """Return what a comparison runs on, each with a name of its own.
-
-    Raises
-    ------
-    InputError
-        For what is no problem, a folder without any, and a name that occurs twice.
-    """
-    sources = tuple(_sources(problems))
+    """Return what a comparison runs on; InputError for what is no problem, and a name that occurs twice."""
+    sources = each_once("problems", list(_sources(problems)), "problem")
     if not sources:
         raise InputError("problems", "none", ACCEPTED)
-    labels = [source.label for source in sources]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError("problems", f"'{label}' twice", "a name of its own for each: {'a name': problem}")
     return sources
 
 
-def _sources(problems: Any) -> Iterator[Source]:
+def _sources(problems: Any, label: str = "") -> Iterator[Source]:
+    instance = _instance(problems, label)
     if isinstance(problems, Mapping):
-        yield from (_source(str(label), problem) for label, problem in problems.items())
+        for name, problem in problems.items():
+            yield from _sources(problem, str(name))
     elif isinstance(problems, str | Path):
-        yield from _in_folder(problems)
-    elif isinstance(problems, tuple) and _instance(problems, "") is not None:
-        yield _source("problem", problems)
-    elif isinstance(problems, Iterable):
+        for path in [problems] if label else _folders(problems):
+            place = Path(path)
+            name = place.parent.name if place.name == "problem.toml" else place.name
+            yield Source(label or name or str(path), load(path))
+    elif instance is not None:
+        title = "problem"
+        if isinstance(problems, Instance | CalibrationProblem):
+            title = problems.title if isinstance(problems, Instance) else problems.robot.name
+        elif isinstance(problems, SimulatedArm):
+            title = "SimulatedArm"
+        yield Source(label or title, instance)
+    elif isinstance(problems, Iterable) and not label:
         for problem in problems:
             yield from _sources(problem)
-    else:
-        yield _source(_name(problems), problems)
-
-
-def _in_folder(path: str | Path) -> Iterator[Source]:
-    """Yield the problem of a folder or a name, or those of the folders in a folder."""
-    place = Path(path)
-    if place.is_dir() and not (place / "problem.toml").is_file():
-        inside = sorted(each.parent for each in place.glob("*/problem.toml"))
-        if not inside:
-            raise InputError("problems", f"no problem.toml in '{place}' or a folder in it", ACCEPTED)
-        yield from (Source(folder.name, load(folder)) for folder in inside)
-        return
-    label = place.parent.name if place.name == "problem.toml" else place.name
-    yield Source(label or str(path), load(path))
-
-
-def _source(label: str, stated: Any) -> Source:
-    if isinstance(stated, str | Path):
-        return Source(label, load(stated))
-    instance = _instance(stated, label)
-    if instance is not None:
-        return Source(label, instance)
-    if callable(stated):
-        return Source(label, stated)
-    if isinstance(stated, Program):
+    elif isinstance(problems, Program):
         raise InputError("problems", "a program", f"{ACCEPTED}; ro.select.compare compares selectors on a program")
-    raise InputError("problems", f"a {type(stated).__name__}", ACCEPTED)
+    elif callable(problems):
+        yield Source(label or getattr(problems, "__name__", type(problems).__name__), problems)
+    else:
+        raise InputError("problems", f"a {type(problems).__name__}", ACCEPTED)
 
 
-def _name(stated: Any) -> str:
-    if isinstance(stated, Instance):
-        return stated.title
-    if isinstance(stated, CalibrationProblem):
-        return stated.robot.name
-    return getattr(stated, "__name__", type(stated).__name__)
+def _folders(path: str | Path) -> list[str | Path]:
+    """Return the folder or name of a problem, or the folders of problems in a folder."""
+    place = Path(path)
+    if not place.is_dir() or (place / "problem.toml").is_file():
+        return [path]
+    inside = sorted(each.parent for each in place.glob("*/problem.toml"))
+    if not inside:
+        raise InputError("problems", f"no problem.toml in '{place}' or a folder in it", ACCEPTED)
+    return list(inside)
 
 
 def _instance(given: Any, label: str) -> Instance | None:
@@ -133,26 +124,11 @@ def _instance(given: Any, label: str) -> Instance | None:
 
 @dataclass(frozen=True)
 class Split:
-    """A way to hold configurations out.
-
-    Parameters
-    ----------
-    label
-        What rows call it.
-    part
-        What part of the configurations is held out at random; zero otherwise.
-    folds
-        In how many folds each is held out once; one for no folds.
-    """
+    """A way to hold configurations out: a random part of them, or each once in a number of folds."""
 
     label: str
     part: float = 0.0
     folds: int = 1
-
-    @property
-    def by_seed(self) -> bool:
-        """Whether another seed holds others out."""
-        return self.label != FOLDER
 
     def held_out(self, data: Dataset, fold: int, seed: int) -> np.ndarray:
         """Return which rows (N,) are held out; all rows of a configuration are, or none."""
@@ -168,13 +144,7 @@ class Split:
 
 
 def splits_of(stated: Any) -> tuple[Split, ...]:
-    """Return what ``splits`` says: ``"folder"``, a part (0.25), a number of folds (5), or several of them.
-
-    Raises
-    ------
-    InputError
-        For anything else.
-    """
+    """Return what ``splits`` says: ``"folder"``, a part (0.25), a number of folds (5), or several of them."""
     if isinstance(stated, Sequence) and not isinstance(stated, str) and stated:
         return tuple(dict.fromkeys(_split(each) for each in stated))
     return (_split(stated),)
@@ -195,23 +165,8 @@ def _split(stated: Any) -> Split:
 def divide(instance: Instance, split: Split, fold: int, count: int | None, noise: float, seed: int) -> Instance:
     """Return an instance with the data to fit, and the data that are held out as its validation data.
 
-    Parameters
-    ----------
-    instance
-        The problem; its validation data are used by the split ``"folder"`` and by no other.
-    split, fold
-        What is held out; folds count from 1.
-    count
-        How many of the configurations that are left are fitted, drawn at random; None for all.
-    noise
-        By what the noise of the data to fit is larger than it was measured with.
-    seed
-        Of everything that is drawn.
-
-    Raises
-    ------
-    InputError
-        For fewer configurations than asked, or nothing that is held out.
+    Of the configurations that a split's fold (from 1) leaves, ``count`` are fitted, drawn at random, or all; their
+    noise is ``noise`` times what it was. InputError for fewer configurations, or nothing that is held out.
     """
     data = instance.problem.data
     held_out = instance.validation
@@ -234,11 +189,11 @@ def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
     To a row of covariance S comes noise of covariance (factor^2 - 1) S; it then declares factor^2 S.
     """
     rng = np.random.default_rng([seed, NOISE_STREAM])
-    return replace(data, blocks=tuple(_add_noise(block, factor, rng) for block in data.blocks))
 
+    def noisy(block: Block) -> Block:
+        k = block.covariance.shape[1]
+        root = np.sqrt(factor**2 - 1) * np.linalg.cholesky(block.covariance)
+        error = (root @ rng.standard_normal((len(block.y), k, 1)))[:, :, 0]
+        return replace(block, y=block.measurement.plus(block.y, error), covariance=factor**2 * block.covariance)
 
-def _add_noise(block: Block, factor: float, rng: np.random.Generator) -> Block:
-    k = block.covariance.shape[1]
-    root = np.sqrt(factor**2 - 1) * np.linalg.cholesky(block.covariance)
-    error = (root @ rng.standard_normal((len(block.y), k, 1)))[:, :, 0]
-    return replace(block, y=block.measurement.plus(block.y, error), covariance=factor**2 * block.covariance)
+    return replace(data, blocks=tuple(map(noisy, data.blocks)))

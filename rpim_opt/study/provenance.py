@@ -5,7 +5,6 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -21,18 +20,16 @@ SHORT = 12
 
 def package_code() -> dict[str, str]:
     """Return digests of the package and of its problems, and the versions of what computes."""
-    problems = problems_folder()
     return {
-        "package": files_digest(PACKAGE, PACKAGE.rglob("*.py")),
-        "set of problems": files_digest(problems, problems.glob("*/*.*")),
+        "package": _folder_digest(PACKAGE, "**/*.py"),
+        "set of problems": _folder_digest(problems_folder(), "*/*.*"),
         "set of versions": versions(),
     }
 
 
-def files_digest(folder: Path, files: Iterable[Path]) -> str:
-    """Return the SHA-256 of files with their names in a folder."""
+def _folder_digest(folder: Path, pattern: str) -> str:
     content = sha256()
-    for file in sorted(files):
+    for file in sorted(folder.glob(pattern)):
         content.update(sha256(str(file.relative_to(folder)).encode()).digest())
         content.update(sha256(file.read_bytes()).digest())
     return content.hexdigest()
@@ -45,12 +42,12 @@ def versions() -> str:
 
 
 def file_state(path: Path) -> str:
-    """Say which version of a file this is: its digest, its commit, and whether that holds it as it is."""
+    """Return a file's name with its digest and its commit."""
     return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({commit(path.parent, path)})"
 
 
 def package_state() -> str:
-    """Say which version of the package computes: its number, its digest, and its commit where there is one."""
+    """Return the package's version, its digest, and its commit where there is one."""
     said = f"rpim-opt {version_of('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]}"
     if PACKAGE.parent.joinpath("pyproject.toml").is_file():
         return f"{said} ({commit(PACKAGE.parent, PACKAGE, problems_folder())})"
@@ -58,42 +55,34 @@ def package_state() -> str:
 
 
 def commit(folder: Path, *paths: Path) -> str:
-    """Say which commit some paths are of, and whether it lacks them (``untracked``) or has other ones (``dirty``).
+    """Return the commit that paths are of, and whether it lacks them (``untracked``) or has others (``dirty``).
 
-    Results of studies count for nothing.
+    Results of studies do not count.
     """
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     names = [*map(str, paths), ":(exclude,glob)**/results/**"]
     try:
-        said = f"commit {_git(folder, 'describe', '--always')}"
-        changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *names)
-        new = _git(folder, "ls-files", "--others", "--exclude-standard", "--", *names)
+        said = f"commit {git('describe', '--always')}"
+        if git("ls-files", "--others", "--exclude-standard", "--", *names):
+            return f"{said}, untracked"
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", *names)
+        return f"{said}, dirty" if changed else said
     except (OSError, subprocess.CalledProcessError):
         return "in no repository"
-    if new:
-        return f"{said}, untracked"
-    return f"{said}, dirty" if changed else said
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(folder), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def provenance() -> dict[str, str]:
-    """Return what makes a comparison, in words: script, package, versions and time."""
-    return {
-        "Script": _script(),
-        "Package": package_state(),
-        "Versions": versions(),
-        "Made": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-
-
-def _script() -> str:
-    """Say which file is run, if it is one."""
+    """Return script, package, versions and time of a comparison."""
     file = getattr(sys.modules.get("__main__"), "__file__", None)
     if file is None or not Path(file).is_file():
-        return "none: an interactive session"
-    if Path(file).name in ("rpim-opt", "__main__.py"):
-        return "rpim-opt " + " ".join(sys.argv[1:])
-    return file_state(Path(file).resolve())
+        script = "none: an interactive session"
+    elif Path(file).name in ("rpim-opt", "__main__.py"):
+        script = "rpim-opt " + " ".join(sys.argv[1:])
+    else:
+        script = file_state(Path(file).resolve())
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"Script": script, "Package": package_state(), "Versions": versions(), "Made": made}

@@ -125,25 +125,21 @@ class Summary:
         """What the columns are called."""
         over = f"over {self.reference}"
         columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse")
-        return (*columns, "no figure") if self._some_missing else columns
+        return (*columns, "no figure") if any(each.missing for each in self.standings) else columns
 
     def cells(self) -> list[list[str]]:
         """Return the table's rows as text."""
-        return [self._cells(each) for each in self.standings]
-
-    def _cells(self, each: Standing) -> list[str]:
-        interval = ""
-        if each.low is not None and each.high is not None:
-            interval = f"{number(each.low)} to {number(each.high)}{' *' if each.different else ''}"
-        against = [number(each.ratio), interval, f"{each.wins}/{each.ties}/{each.losses}"]
-        if each.method == self.reference:
-            against = ["1", "reference", ""]
-        missing = [f"{each.missing} of {each.replicates}"] if self._some_missing else []
-        return [each.method, number(each.median), number(each.worst), *against, *missing]
-
-    @property
-    def _some_missing(self) -> bool:
-        return any(each.missing for each in self.standings)
+        rows = []
+        for each in self.standings:
+            interval = ""
+            if each.low is not None and each.high is not None:
+                interval = f"{number(each.low)} to {number(each.high)}{' *' if each.different else ''}"
+            against = [number(each.ratio), interval, f"{each.wins}/{each.ties}/{each.losses}"]
+            if each.method == self.reference:
+                against = ["1", "reference", ""]
+            missing = f"{each.missing} of {each.replicates}"
+            rows.append([each.method, number(each.median), number(each.worst), *against, missing][: len(self.header)])
+        return rows
 
     def __str__(self) -> str:
         """Return the table and the notes."""
@@ -208,24 +204,14 @@ def _standing(
 ) -> Standing:
     mine = [row for row in rows if row["method"] == method]
     ratios = {pair: _log_ratio(own[pair], other[pair]) for pair in own if pair in other}
-    ratio, low, high = interval(ratios, drawn)
     compared = {_pair(row) for row in mine} & (set(own) | set(other))
     wins = sum(pair in own and (pair not in other or ratios[pair] < -TIE) for pair in compared)
     losses = sum(pair in other and (pair not in own or ratios[pair] > TIE) for pair in compared)
+    unconverged = sum(row["status"] == UNCONVERGED for row in mine)
     return Standing(
-        method=method,
-        replicates=len(mine),
-        missing=len(mine) - len(own),
-        unconverged=sum(row["status"] == UNCONVERGED for row in mine),
-        median=float(np.median(list(own.values()))),
-        worst=max(own.values()),
-        ratio=ratio,
-        low=low,
-        high=high,
-        wins=wins,
-        ties=len(compared) - wins - losses,
-        losses=losses,
-    )
+        method, len(mine), len(mine) - len(own), unconverged, float(np.median(list(own.values()))), max(own.values()),
+        *interval(ratios, drawn), wins, len(compared) - wins - losses, losses,
+    )  # fmt: skip
 
 
 def _log_ratio(one: float, other: float) -> float:
@@ -296,7 +282,16 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     said = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
     compared = sum(each.low is not None and each.method != reference for each in standings)
     if compared:
-        said.append(_scope({row["problem"] for row in rows}, drawn, compared))
+        problems = {row["problem"] for row in rows}
+        scope = f"other problems like these {len(problems)}"
+        if len(problems) < ENOUGH:
+            of_family = problems <= drawn
+            scope = "other arms of the same family" if of_family else "these problems alone, with other seeds or folds"
+        text = f"Intervals speak of {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
+        if compared > 1:
+            chance = (1 - CONFIDENCE) * compared
+            text += f" Each is for itself: where nothing differs, {chance:.2g} of {compared} would be marked by chance."
+        said.append(text)
     elif len(standings) > 1:
         few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"
         said.append(f"There are no intervals: {few}.")
@@ -304,27 +299,13 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     if late:
         said.append(f"{late} replicates did not converge; their figures count (column status).")
     every = Counter(row["method"] for row in rows)
-    for (method, status, reason), problems in without_figures(rows).items():
+    for (method, status, reason), missing in without_figures(rows).items():
         where = ""
-        if len(problems) < every[method]:
-            where = f" ({listed(list(dict.fromkeys(problems)), 4)})"
-        count = f"{len(problems)} of {every[method]} replicates{where}"
+        if len(missing) < every[method]:
+            where = f" ({listed(list(dict.fromkeys(missing)), 4)})"
+        count = f"{len(missing)} of {every[method]} replicates{where}"
         said.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
     return tuple(said)
-
-
-def _scope(problems: set[str], drawn: AbstractSet[str], compared: int) -> str:
-    """Say what the intervals speak of, and how many are wrong by chance."""
-    scope = f"other problems like these {len(problems)}"
-    if len(problems) < ENOUGH and problems <= drawn:
-        scope = "other arms of the same family"
-    elif len(problems) < ENOUGH:
-        scope = "these problems alone, with other seeds or folds"
-    said = f"Intervals speak of {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
-    if compared > 1:
-        chance = (1 - CONFIDENCE) * compared
-        said += f" Each is for itself: where nothing differs, {chance:.2g} of {compared} would be marked by chance."
-    return said
 
 
 def without_figures(rows: Rows) -> dict[tuple[str, str, str], list[str]]:

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from itertools import product
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +20,7 @@ from typing import Any
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, write_files
 from rpim_opt.study.provenance import SHORT, commit, file_state, package_code, package_state, versions
-from rpim_opt.study.replicates import Progress, Row, open_journal, require_package
+from rpim_opt.study.replicates import Progress, Row, remove_journal, require_package, run_cases
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """What a study has: a text, a `Metric` for each figure that is held, and three functions."""
@@ -96,9 +96,7 @@ def find_study(name: str | Path) -> Path:
     """
     text = str(name)
     if text.endswith(".py") or os.sep in text or "/" in text or text in (".", ".."):
-        path = Path(text)
-        if path.is_dir():
-            path = path / FILE
+        path = Path(text, FILE) if Path(text).is_dir() else Path(text)
         if not path.is_file():
             raise InputError("study", f"no file '{path}'", f"a Python file with a study, or a folder with {FILE}")
         return path.resolve()
@@ -115,11 +113,10 @@ def find_study(name: str | Path) -> Path:
     raise InputError("study", f"'{text}'", accepted)
 
 
-def _name(path: Path) -> str:
-    """Return what a study is called: its file, or its folder where that holds ``study.py``."""
-    if path.name == FILE:
-        return path.parent.name
-    return path.stem
+def _label(path: Path, quick: bool = False) -> str:
+    """Return the name of a study: its file, or its folder where that holds ``study.py``."""
+    name = path.parent.name if path.name == FILE else path.stem
+    return f"{name}-quick" if quick else name
 
 
 @lru_cache(maxsize=8)
@@ -171,16 +168,16 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     """
     folder = path.parent
     stated = getattr(study, "DEPENDS", None)
-    files = list(_beside(folder))
+    files = set(_beside(folder))
     if stated is not None:
-        files = [file for file in files if file.suffix == ".py"]
+        files = {file for file in files if file.suffix == ".py"}
         for pattern in stated:
             matches = [Path(match) for match in glob.glob(str(folder / pattern), recursive=True)]
             if not matches and not glob.has_magic(str(pattern)):
                 raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
             for match in matches:
-                files += _beside(match, results=True) if match.is_dir() else [match]
-    return {os.path.relpath(file, folder): _digest(file) for file in sorted(set(files))}
+                files.update(_beside(match, results=True) if match.is_dir() else [match])
+    return {os.path.relpath(file, folder): _digest(file) for file in sorted(files)}
 
 
 def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
@@ -205,18 +202,15 @@ def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
 def _digest(file: Path) -> str:
     try:
         with file.open("rb") as stream:
-            content = sha256()
-            while chunk := stream.read(1 << 20):
-                content.update(chunk)
+            return file_digest(stream, "sha256").hexdigest()
     except OSError:  # nor can the study read it
         return "unreadable"
-    return content.hexdigest()
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
-    """Say which command, commit, files and versions make the replicates."""
+    """Return which command, commit, files and versions make the replicates."""
     own = path.parent == studies_folder()
-    command = f"rpim-opt study {_name(path) if own else path.name}{' --quick' if quick else ''}"
+    command = f"rpim-opt study {_label(path) if own else path.name}{' --quick' if quick else ''}"
     if own:
         root = path.parent.parent
         source = f" ({commit(root, *(root / name for name in ('rpim_opt', 'studies', 'problems')))})"
@@ -231,19 +225,13 @@ def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> st
 
 
 def run_study(
-    name: str | Path,
-    quick: bool = False,
-    workers: int = 1,
-    scheduler: Any = None,
-    resume: bool | None = None,
-    redraw: bool = False,
-    out: Path | None = None,
-    progress: Progress = lambda _done, _every: None,
-) -> tuple[Report, Path]:
-    """Run a study and write its results.
+    name: str | Path, quick: bool = False, workers: int = 1, scheduler: Any = None, resume: bool | None = None,
+    redraw: bool = False, out: Path | None = None, progress: Progress = lambda _done, _every: None,
+) -> tuple[Report, Path]:  # fmt: skip
+    """Run a study; return its report and the folder with ``README.md``, ``metrics.json``, replicates and figures.
 
     Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
-    computes them. A finished replicate is written down at once; ``resume`` takes those up.
+    computes them. A finished replicate is written down at once.
 
     Parameters
     ----------
@@ -251,23 +239,12 @@ def run_study(
         A file ``mine.py``, a folder with ``study.py``, or a study of the checkout without its ending.
     quick
         The small version.
-    workers
-        Processes on this machine (joblib).
-    scheduler
-        Address of a Dask scheduler to compute on instead, or a client of one.
-    resume
-        Go on where an interrupted run was; if false everything is computed anew. With None that is refused as long as
-        replicates of an interrupted run are there.
+    workers, scheduler, resume, progress
+        As `run_cases` has them.
     redraw
         Compute nothing: write the report anew from the replicates of the last run, which say what made them.
     out
         Where results go; ``results/NAME`` or ``results/NAME-quick`` beside the study by default.
-    progress
-        Told how many replicates of how many are done.
-
-    Returns
-    -------
-    The report and the folder that holds ``README.md``, ``metrics.json``, the replicates and the figures.
     """
     path = find_study(name)
     study = load_study(path)
@@ -285,17 +262,12 @@ def run_study(
     files = files_of(path, study)
     made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
     code = {**{f"file {file}": digest for file, digest in files.items()}, **package_code()}
-    with open_journal(folder / f"{REPLICATES}.sqlite", cases, code, resume) as journal:
-        tasks = [(key, partial(_run, path, case)) for key, case in journal.waiting]
-        journal.fill(tasks, workers, scheduler, progress)
-        report = study.report(journal.rows)
-        write(folder, study.QUESTION, report, made, replicate_file(journal.rows, made))
-        journal.remove()
+    journal = folder / f"{REPLICATES}.sqlite"
+    rows = run_cases(cases, lambda case: partial(_run, path, case), workers, scheduler, progress, journal, code, resume)
+    report = study.report(rows)
+    write(folder, study.QUESTION, report, made, replicate_file(rows, made))
+    remove_journal(journal)
     return report, folder
-
-
-def _label(path: Path, quick: bool) -> str:
-    return f"{_name(path)}-quick" if quick else _name(path)
 
 
 def _run(path: Path, case: Mapping[str, Any]) -> Row:
@@ -344,28 +316,28 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
     """Write ``README.md`` with the figures, ``metrics.json`` and the file of the replicates: all, or none."""
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
-    files = dict(replicates)
+    files = {
+        **replicates,
+        "README.md": (text + "\n").encode(),
+        "metrics.json": json_text(dict(report.metrics)).encode(),
+    }
     if report.figures:
         from rpim_opt.study.figures import picture
 
         for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
             files[f"{title}.{kind}"] = picture(figure, title, kind)
-    files["README.md"] = (text + "\n").encode()
-    files["metrics.json"] = json_text(dict(report.metrics)).encode()
     with refused(folder):
         write_files({folder / name: content for name, content in files.items()})
-        for kind in ("json", "parquet"):
-            if replicates and f"{REPLICATES}.{kind}" not in replicates:
-                (folder / f"{REPLICATES}.{kind}").unlink(missing_ok=True)
+        for name in (f"{REPLICATES}.json", f"{REPLICATES}.parquet"):
+            if replicates and name not in replicates:
+                (folder / name).unlink(missing_ok=True)
 
 
 def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:
     """Return a sentence for every metric that is worse than ``baselines.json`` beside the study allows."""
     file = find_study(name)
     path = file.parent / "baselines.json"
-    known: dict[str, dict[str, float]] = {}
-    if path.is_file():
-        known = read_json(path)
+    known = read_json(path) if path.is_file() else {}
     label = _label(file, quick)
     if label not in known:
         raise InputError("baseline", f"none for '{label}'", choices(label, known), path)

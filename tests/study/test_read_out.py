@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.page import headline
+from rpim_opt.study.figures import headline
 from rpim_opt.study.problems import sources_of, splits_of
 from rpim_opt.study.ranking import UNCONVERGED, number
 from rpim_opt.study.replicates import compute
