@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye
-from rpim_opt.problem.registration.loops import FULL, LOSSES, Loops, Seen, Solved, of_motions, of_poses, solve
+from rpim_opt.problem.registration.loops import FULL, LOSSES, Loops, Solved, Solver, of_motions, of_poses
 
 GAP = 1e-3
 """What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
@@ -86,8 +87,8 @@ class CertifiedStart:
     reason: str
 
 
-def judged(
-    solved: Solved, loops: Loops, frames: tuple[Mapping[str, Array], Mapping[str, Array]], scale: float
+def _judged(
+    solved: Solved, loops: Loops, bases: Mapping[str, Array], tools: Mapping[str, Array], scale: float
 ) -> CertifiedStart:
     """Return the start with its proof, or what it lacks."""
     best = solved.smallest
@@ -96,11 +97,22 @@ def judged(
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
     radius = best.radius(float(chdtri(loops.unknowns, AS_WELL)))
-    doubt = _doubt(solved, gap, uncertainty, radius, scale)
-    reason = doubt or f"no other start is better: the bound meets the cost within {gap:.1e} of it"
+    full = int(np.sum(solved.weights > FULL))
+    several = solved.weights.min() < 1 and not solved.alone
+    doubts = {
+        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
+            uncertainty > UNKNOWN
+        ),
+        f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
+        f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
+        "the measurements do not determine the scale": scale <= 0,
+        "the weights of the loss did not settle": not solved.settled,
+        f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
+    }
+    doubt = next((text for text, true in doubts.items() if true), "")
     return CertifiedStart(
-        bases=frames[0],
-        tools=frames[1],
+        bases=bases,
+        tools=tools,
         scale=float(scale),
         cost=solved.cost,
         bound=solved.cost - excess,
@@ -110,29 +122,8 @@ def judged(
         radius=radius,
         weights=solved.weights,
         certified=not doubt,
-        reason=reason,
+        reason=doubt or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
     )
-
-
-def _doubt(solved: Solved, gap: float, uncertainty: float, radius: float, scale: float) -> str:
-    """Return what keeps a start from being certain, in words; nothing where nothing does."""
-    N = len(solved.weights)
-    if uncertainty > UNKNOWN:
-        return (
-            f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would"
-        )
-    if gap > GAP:
-        return f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better"
-    if radius > FAR:
-        return f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell"
-    if scale <= 0:
-        return "the measurements do not determine the scale"
-    if not solved.settled:
-        return "the weights of the loss did not settle"
-    if solved.weights.min() < 1 and not solved.alone:
-        full = int(np.sum(solved.weights > FULL))
-        return f"{full} of {N} measurements agree, and as many others may agree with another start"
-    return ""
 
 
 @one_blas_thread
@@ -156,7 +147,7 @@ def certified_hand_eye(
                                                + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
 
     over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t of several instruments and markers, all at once. The
-    translations are eliminated exactly; the rotations are relaxed to a moment matrix (`moments.Relaxation`).
+    translations are eliminated exactly; the rotations are relaxed to a moment matrix (`relaxation.relax`).
 
     Parameters
     ----------
@@ -204,13 +195,21 @@ def certified_hand_eye(
     markers, which = _numbered(marker, N, "marker")
     instruments, where = _numbered(instrument, N, "instrument")
     places = np.array([np.asarray((expected or {}).get(name, (0, 0, 0)), dtype=float)[:3] for name in markers])
-    seen = Seen(flange, measured, turned, where, which, _deviations(sigma, N), places, spread)
-    loops = of_poses(seen, scaled)
-    simple = len(markers) == len(instruments) == 1 and turned.all()
-    solved = solve(loops, loss, _closed_form(flange, measured) if simple else [])
-    bases, tools, scale = _frames(solved, seen, loops.linear, scaled)
-    named = dict(zip(instruments, bases, strict=True)), dict(zip(markers, tools, strict=True))
-    return judged(solved, loops, named, scale)
+    loops = of_poses(flange, measured, turned, where, which, _deviations(sigma, N), places, spread, scaled)
+    candidates = []
+    if len(markers) == len(instruments) == 1 and turned.all():
+        with suppress(InputError):
+            Z, X = hand_eye(flange, measured)
+            candidates.append(np.stack([Z[:3, :3], X[:3, :3].T]))
+    solved = Solver(loops, loss).solve(candidates)
+    R = solved.smallest.rotations
+    count = len(instruments)
+    scale = 1 / solved.v[loops.linear - 1] if scaled else 1.0
+    t = solved.v[: loops.linear - scaled].reshape(-1, 3) * scale
+    turns = dict(zip(np.unique(which[turned]).tolist(), R[count:].swapaxes(1, 2), strict=True))
+    bases = {name: _transform(R[i], R[i] @ t[len(markers) + i]) for i, name in enumerate(instruments)}
+    tools = {name: _transform(turns.get(k, np.eye(3)), t[k]) for k, name in enumerate(markers)}
+    return _judged(solved, loops, bases, tools, scale)
 
 
 @one_blas_thread
@@ -271,10 +270,10 @@ def certified_motions(
         raise InputError("B", "motions without a rotation", "rotations of all motions")
     place = np.asarray(expected, dtype=float)
     loops = of_motions(A, B, _deviations(sigma, len(A)), place, spread, scaled)
-    solved = solve(loops, loss)
+    solved = Solver(loops, loss).solve()
     scale = 1 / solved.v[3] if scaled else 1.0
     tool = _transform(solved.smallest.rotations[0], solved.v[:3] * scale)
-    return judged(solved, loops, ({}, {"": tool}), scale)
+    return _judged(solved, loops, {}, {"": tool}, scale)
 
 
 def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tuple[Array, Array, np.ndarray]:
@@ -323,30 +322,6 @@ def _deviations(sigma: tuple[float | Array, float | Array], N: int) -> Array:
     if not (np.isfinite(both).all() and (both > 0).all()):
         raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
     return both
-
-
-def _closed_form(flange: Array, measured: Array) -> list[Array]:
-    """Return the closed form's rotations (2, 3, 3), if there is one."""
-    try:
-        Z, X = hand_eye(flange, measured)
-    except InputError:
-        return []
-    return [np.stack([Z[:3, :3], X[:3, :3].T])]
-
-
-def _frames(solved: Solved, seen: Seen, linear: int, scaled: bool) -> tuple[list[Array], list[Array], float]:
-    """Return bases, tools and the scale of `loops.of_poses`."""
-    v = solved.v
-    R = solved.smallest.rotations
-    tools = len(seen.expected)
-    scale = 1 / v[linear - 1] if scaled else 1.0
-    bases = (linear - scaled) // 3 - tools
-    turning = np.unique(seen.marker[seen.turned]).tolist()
-    turns = {k: R[bases + i].T for i, k in enumerate(turning)}
-    t = v[: linear - scaled].reshape(-1, 3) * scale
-    Z = [_transform(R[i], R[i] @ t[tools + i]) for i in range(bases)]
-    X = [_transform(turns.get(k, np.eye(3)), t[k]) for k in range(tools)]
-    return Z, X, scale
 
 
 def _transform(R: Array, t: Array) -> Array:

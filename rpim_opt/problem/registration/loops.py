@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
-from math import comb
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -14,46 +13,63 @@ from scipy.special import chdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.registration.closed_forms import proper
-from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, smallest, undercut
+from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, smallest
 
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
 SINGULAR = 1e-13
+LOSSES = ("squares", "huber", "truncated")
+QUANTILES = {"huber": 0.90, "truncated": 0.99}
+"""Which part of good measurements a loss leaves as they are: the squares of their errors are chi-squared."""
+GRADUATION = 1.6
+"""Factor by which the truncated loss comes nearer to itself from one iteration to the next."""
+MOST_ITERATIONS = 100
+FULL = 0.999
+"""Weight from which a measurement agrees."""
+SETTLED = 1e-6
+"""Change of weights below which they have converged."""
+FEWEST = 3
+"""Measurements that have to have a weight."""
+MOST_PAIRED = 2000
+"""Measurements up to which all pairs are compared."""
+FEW = 10
+"""Measurements of which each is left out in turn, and how many sets are begun with at most."""
+ASKED = 40
+"""Measurements, evenly spread, of which is asked what they go with."""
+ROUNDING = 1e-7
+"""Error of an angle from its cosine [rad]."""
+SURPRISE = 1e-4
+"""Probability that a good measurement is off by more than counts as good."""
 
 
 @dataclass(frozen=True, eq=False)
-class Turns:
-    """Orientations of measurements B_i = Z A_i X, up to their errors: A_i'A_j and B_i'B_j turn by the same angle."""
+class Loops:
+    """Residuals J_i v of N measurements, v = (translations, scale, 1, vec R_1, ..., vec R_k), rotations' rows first.
 
+    ``first`` and ``second`` (N, 3, 3) are orientations B_i = Z A_i X up to errors of ``sigma`` (N,) [rad], ``group``
+    (N,) numbers what has the same Z and X, negative where the orientation was not measured: A_i'A_j and B_i'B_j of a
+    group turn by the same angle.
+    """
+
+    rows: Array  # (N, m, n) J_i, each residual in units of its standard deviation
+    prior: Array  # (p, n) residuals of what is expected of translations
+    linear: int  # how many of the n are translations and the scale: they are eliminated exactly
+    equations: Array  # (N,) of a measurement: 3 of a position, 6 of a pose
     first: Array
     second: Array
     sigma: Array
     group: np.ndarray
 
-
-@dataclass(frozen=True, eq=False)
-class Loops:
-    """Residuals J_i v of measurements, v = (translations, scale, 1, vec R_1, ..., vec R_k), rotations' rows first."""
-
-    rows: Array
-    prior: Array
-    linear: int
-    freedom: Array
-    shared: int
-    turns: Turns
-
     @property
     def unknowns(self) -> int:
         """How many numbers are sought: three a rotation."""
-        n = self.rows.shape[2] - 1 - self.linear
-        return self.linear + n // 3
+        return self.linear + (self.rows.shape[2] - 1 - self.linear) // 3
 
     def triangle(self, weights: Array) -> Array:
         """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
         n = self.rows.shape[2]
         rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
-        stacked = np.vstack([rows, self.prior, np.zeros((n, n))])
-        return np.asarray(np.linalg.qr(stacked, mode="r"))
+        return np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
 
     def squares(self, v: Array) -> Array:
         """Return |J_i v|^2 (N,)."""
@@ -73,60 +89,70 @@ class Loops:
         return np.concatenate([np.asarray(y, dtype=float), x])
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What closes the loops ``measured = base flange tool``."""
+def of_poses(
+    flange: Array,
+    measured: Array,
+    turned: np.ndarray,
+    instrument: np.ndarray,
+    marker: np.ndarray,
+    sigma: Array,
+    expected: Array,
+    spread: float,
+    scaled: bool,
+) -> Loops:
+    """Return the loops ``measured = base flange tool`` of several bases Z and tools X.
 
-    flange: Array
-    measured: Array
-    turned: np.ndarray
-    instrument: np.ndarray
-    marker: np.ndarray
-    sigma: Array
-    expected: Array
-    spread: float
+    ::
 
+        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
 
-def of_poses(seen: Seen, scaled: bool) -> Loops:
-    """Return the loops of bases Z and tools X, several of either."""
-    N = len(seen.flange)
-    bases = int(seen.instrument.max()) + 1
-    tools = len(seen.expected)
-    turning = np.unique(seen.marker[seen.turned])
+    of the flange A and the measured B with its position y. For an unknown scale s of the instrument's lengths, both
+    sides are in its unit: A_t / s, t / s and u / s. The norm of the second is the angle between the two, up to third
+    order. Rotations are those of the bases Z_R, then X_R' of the tools that were measured to turn.
+    """
+    N = len(flange)
+    bases = int(instrument.max()) + 1
+    tools = len(expected)
+    turning = np.unique(marker[turned])
     linear = 3 * (tools + bases) + scaled
-    one = linear
-    lengths = 1 / seen.sigma[:, 0]
-    angles = seen.turned / (np.sqrt(2) * seen.sigma[:, 1])
+    lengths = 1 / sigma[:, 0]
+    angles = turned / (np.sqrt(2) * sigma[:, 1])
     J = np.zeros((N, 12, linear + 1 + 9 * (bases + len(turning))))
     each = np.arange(N)
-    A = seen.flange[:, :3, :3]
-    B = seen.measured[:, :3, :3]
-    eye = np.eye(3)
-    robot = linear - 1 if scaled else one
-    J[:, :3, robot] = -seen.flange[:, :3, 3] * lengths[:, None]
-    first = one + 1 + 9 * seen.instrument
-    last = one + 1 + 9 * (bases + np.searchsorted(turning, seen.marker))  # of those turned
+    A = flange[:, :3, :3]
+    B = measured[:, :3, :3]
+    robot = linear - 1 if scaled else linear
+    J[:, :3, robot] = -flange[:, :3, 3] * lengths[:, None]
+    first = linear + 1 + 9 * instrument
+    last = linear + 1 + 9 * (bases + np.searchsorted(turning, marker))  # of those turned
     for a in range(3):
-        J[each, a, 3 * (tools + seen.instrument) + a] = -lengths
+        J[each, a, 3 * (tools + instrument) + a] = -lengths
         for b in range(3):
-            J[each, a, 3 * seen.marker + b] = -A[:, a, b] * lengths
+            J[each, a, 3 * marker + b] = -A[:, a, b] * lengths
             # (Z_R' y)_a = sum_b (Z_R)_ba y_b
-            J[each, a, first + 3 * b + a] = seen.measured[:, b, 3] * lengths
-    of_base = np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
-    of_tool = np.einsum("nai,bj->nabij", B, eye).reshape(N, 9, 9)
-    at = np.flatnonzero(seen.turned)
+            J[each, a, first + 3 * b + a] = measured[:, b, 3] * lengths
+    of_base = np.einsum("ai,njb->nabij", np.eye(3), A).reshape(N, 9, 9)
+    of_tool = np.einsum("nai,bj->nabij", B, np.eye(3)).reshape(N, 9, 9)
+    at = np.flatnonzero(turned)
     for k in range(9):
         J[at, 3:, first[at] + k] = -of_base[at, :, k] * angles[at, None]
         J[at, 3:, last[at] + k] = of_tool[at, :, k] * angles[at, None]
-    weak = RIDGE * float(np.sqrt(np.sum(lengths**2)))
-    prior = _expected(seen.expected, max(1 / seen.spread, weak), robot, J.shape[2])
-    group = np.where(seen.turned, seen.instrument * tools + seen.marker, -1)
-    turns = Turns(A, B, seen.sigma[:, 1], group)
-    return Loops(J, prior, linear, np.where(seen.turned, 6, 3), bases, turns)
+    prior = _expected(expected, spread, lengths, robot, J.shape[2])
+    group = np.where(turned, instrument * tools + marker, -1)
+    return Loops(J, prior, linear, np.where(turned, 6, 3), A, B, sigma[:, 1], group)
 
 
 def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float, scaled: bool) -> Loops:
-    """Return the loops A X = X B of motions (N, 4, 4), with X_R the only rotation."""
+    """Return the loops A X = X B of motions (N, 4, 4), with X_R the only rotation.
+
+    ::
+
+        (X_R B_t - A_R t + t - A_t) / sigma_position,    t = X_t
+        (A_R X_R - X_R B_R) / (sqrt(2) sigma_orientation)
+
+    For an unknown scale s of the lengths in B: A_t / s and t / s.
+    """
     N = len(A)
     linear = 3 + scaled
     J = np.zeros((N, 12, linear + 10))
@@ -140,64 +166,53 @@ def of_motions(A: Array, B: Array, sigma: Array, expected: Array, spread: float,
     J[:, 3:, linear + 1 :] = (left - right).reshape(N, 9, 9)
     J[:, :3] /= sigma[:, 0, None, None]
     J[:, 3:] /= np.sqrt(2) * sigma[:, 1, None, None]
-    weak = RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2)))
-    prior = _expected(expected[None], max(1 / spread, weak), robot, J.shape[2])
-    turns = Turns(A[:, :3, :3], B[:, :3, :3], sigma[:, 1], np.zeros(N, dtype=int))
-    return Loops(J, prior, linear, np.full(N, 6), 1, turns)
+    prior = _expected(expected[None], spread, 1 / sigma[:, 0], robot, J.shape[2])
+    return Loops(J, prior, linear, np.full(N, 6), A[:, :3, :3], B[:, :3, :3], sigma[:, 1], np.zeros(N, dtype=int))
 
 
-def _expected(points: Array, certainty: float, robot: int, n: int) -> Array:
+def _expected(points: Array, spread: float, lengths: Array, robot: int, n: int) -> Array:
     """Return the residuals (p, n) of translations, the first of v, that are expected at points."""
+    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(lengths**2))))
     prior = np.zeros((points.size, n))
     prior[:, : points.size] = certainty * np.eye(points.size)
     prior[:, robot] = -certainty * points.ravel()
     return prior
 
 
-MOST_PAIRED = 2000
-"""Measurements up to which all pairs are compared."""
-FEW = 10
-"""Measurements of which each is left out in turn, and how many sets are begun with at most."""
-FEWEST = 3
-"""Measurements that have to have a weight."""
-ASKED = 40
-"""Measurements, evenly spread, of which is asked what they go with."""
-MOST_SOLVED = 60
-"""Pairs, and sets, of measurements whose relaxations are solved to show that they do not agree."""
-ROUNDING = 1e-7
-"""Error of an angle from its cosine [rad]."""
-SURPRISE = 1e-4
-"""Probability that a good measurement, or what is expected of translations, is off by more than counts as good."""
+# Which measurements can agree
 
 
-def compatible(turns: Turns, beyond: Array) -> np.ndarray:
-    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames."""
+def compatible(loops: Loops, beyond: Array) -> np.ndarray:
+    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames.
+
+    ::
+
+        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
+
+    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
+    """
     N = len(beyond)
     if N > MOST_PAIRED:
         return np.ones((N, N), dtype=bool)
-    first = proper(turns.first)
-    second = proper(turns.second)
-    # matrices that are rotations but for a few digits are taken for the nearest
-    rough = _sizes(turns.first - first) + _sizes(turns.second - second)
-    chord = turns.sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
+    angles = []
+    rough = np.zeros(N)
+    for given in (loops.first, loops.second):
+        rotations = proper(given)
+        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
+        flat = rotations.reshape(-1, 9)
+        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
+    chord = loops.sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
     off = 2 * np.arcsin(np.minimum(1.0, chord)) + ROUNDING
-    alike = np.abs(_angles(first) - _angles(second)) <= off[:, None] + off
-    known = (turns.group[:, None] == turns.group) & (turns.group >= 0)
-    return alike | ~known
-
-
-def _angles(rotations: Array) -> Array:
-    """Return the angles (N, N) between rotations."""
-    flat = rotations.reshape(-1, 9)
-    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0))
-
-
-def _sizes(matrices: Array) -> Array:
-    return np.asarray(np.linalg.norm(matrices, axis=(1, 2)))
+    known = (loops.group[:, None] == loops.group) & (loops.group >= 0)
+    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
 
 
 def core(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with."""
+    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
+
+    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
+    ICRA, find outliers so).
+    """
     left = np.ones(len(pairs), dtype=bool)
     while True:
         kept = left & (np.sum(pairs[:, left], axis=1) >= count)
@@ -208,11 +223,15 @@ def core(pairs: np.ndarray, count: int) -> np.ndarray:
 
 def likeliest(pairs: np.ndarray) -> np.ndarray:
     """Return the core (N,) of the largest count that leaves any."""
-    return core(pairs, _largest(pairs))
+    counts = range(len(pairs) + 2)
+    return core(pairs, bisect_left(counts, True, key=lambda count: not core(pairs, count).any()) - 1)
 
 
-def likely(pairs: np.ndarray, among: np.ndarray) -> list[np.ndarray]:
-    """Return smaller sets (N,) to begin with, the larger first: of those that one of some goes with, the likeliest."""
+def _likely(pairs: np.ndarray, among: np.ndarray) -> list[np.ndarray]:
+    """Return smaller sets (N,) to begin with, the larger first: the likeliest of those that one of some goes with.
+
+    And, where some are few, all but one of them: turning alike, it may be wrong all the same.
+    """
     sets = []
     members = np.flatnonzero(among)
     for each in members[:: 1 + len(members) // ASKED]:
@@ -224,201 +243,153 @@ def likely(pairs: np.ndarray, among: np.ndarray) -> list[np.ndarray]:
     return sorted(distinct.values(), key=lambda each: -int(np.sum(each)))[:FEW]
 
 
-def _largest(pairs: np.ndarray) -> int:
-    """Return the largest count that has a core, by halving."""
-    low, high = 1, len(pairs) + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if core(pairs, middle).any():
-            low = middle
-        else:
-            high = middle
-    return low
+def _alone(loops: Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
+    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
 
-
-def alone(loops: Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
-    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else."""
-    N = len(agreeing)
+    They cannot if fewer are left over than would have to, or if no other is in a core of that size. One whose square
+    (N,) a good one may have is no other.
+    """
     count = int(np.sum(agreeing))
-    if count >= N // 2 + 2:
+    if count >= len(agreeing) // 2 + 2:
         return True
-    if count < 2:
-        return False
-    pairs = compatible(loops.turns, beyond)
-    strange = ~agreeing & (squares > chdtri(loops.freedom, SURPRISE))
-    others = np.flatnonzero(core(pairs, count) & strange)
-    if not _told_apart(loops, pairs, others, core(pairs, count), beyond):
-        return False
-    rivals: list[list[int]] = []
-    for other in np.flatnonzero(core(pairs, count) & strange):
-        rest = _around(pairs, int(other), count)
-        if len(rivals) + comb(len(rest), count - 1) > MOST_SOLVED:
-            return False
-        rivals += [[int(other), *some] for some in combinations(rest, count - 1)]
-    return not any(_may_agree(loops, rival, beyond) for rival in rivals)
+    strange = ~agreeing & (squares > chdtri(loops.equations, SURPRISE))
+    return count > 1 and not (core(compatible(loops, beyond), count) & strange).any()
 
 
-def _told_apart(loops: Loops, pairs: np.ndarray, others: np.ndarray, among: np.ndarray, beyond: Array) -> bool:
-    """Mark pairs of others whose relaxation shows that they do not go together; return whether they are few enough."""
-    asked = {(min(i, j), max(i, j)) for i in others for j in np.flatnonzero(pairs[i] & among) if i != j}
-    if len(asked) > MOST_SOLVED:
-        return False
-    for i, j in asked:
-        pairs[i, j] = pairs[j, i] = _may_agree(loops, [i, j], beyond)
-    return True
-
-
-def _around(pairs: np.ndarray, other: int, count: int) -> list[int]:
-    """Return what goes with a measurement and with enough of what does; nothing where that is too little."""
-    near = np.flatnonzero(pairs[other])
-    members = near[core(pairs[np.ix_(near, near)], count)].tolist()
-    return [each for each in members if each != other] if other in members else []
-
-
-def _may_agree(loops: Loops, members: list[int], beyond: Array) -> bool:
-    """Return whether the relaxation leaves it open that measurements, and what is expected of translations, agree."""
-    weights = np.zeros(len(loops.rows))
-    weights[members] = 1.0
-    least = undercut(loops.form(loops.triangle(weights)), loops.shared)
-    return least <= float(np.sum(beyond[members]) + chdtri(len(loops.prior), SURPRISE))
-
-
-LOSSES = ("squares", "huber", "truncated")
-QUANTILES = {"huber": 0.90, "truncated": 0.99}
-"""Which part of good measurements a loss leaves as they are: the squares of their errors are chi-squared."""
-FACTOR = 1.6
-"""By which the truncated loss comes nearer to itself from one pass to the next."""
-MOST_PASSES = 100
-FULL = 0.999
-"""Weight from which a measurement agrees."""
-SETTLED = 1e-6
-"""Weights that change by less from pass to pass are found."""
+# Losses
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
     """Where a loss of closed loops is least."""
 
-    v: Array
-    smallest: Smallest
-    weights: Array
-    squares: Array
-    cost: float
-    settled: bool = True
-    alone: bool = True
+    v: Array  # (n,) translations, scale, 1 and rotations, as `Loops` has them
+    smallest: Smallest  # of the last weighted problem
+    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    squares: Array  # (N,) squared residuals
+    cost: float  # the loss, summed, and what is expected of translations
+    settled: bool = True  # whether the weights are those of the residuals
+    alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
 
 
-Weigh = Callable[[Array], Array]
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """The least of a loss of |J_i v|, global where it is the sum of squares and the bound meets it.
+
+    ::
+
+        squares    r^2                                    r = |J_i v|
+        huber      r^2,  2 c r - c^2 beyond c             c^2 a quantile of chi-squared
+        truncated  min(r^2, c^2)
+
+    From the relaxation's optimum of the squares Huber's loss follows repeated weights c / r, and the truncated loss
+    graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127), by Newton's steps; the last weighted problem is the
+    relaxation's again. The truncated loss begins with the largest core of measurements that turn alike, and if not all
+    of that agree, with all of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
+    """
+
+    loops: Loops
+    loss: str
+
+    def solve(self, candidates: Sequence[Array] = ()) -> Solved:
+        """Return the least of the loss."""
+        every = np.ones(len(self.loops.rows))
+        if self.loss == "squares":
+            return self._weighted(every, candidates)
+        if self.loss == "huber":
+            found = self._repeated(self._weighted(every, candidates))
+        else:
+            found = self._truncated(candidates)
+        return replace(found, alone=_alone(self.loops, found.squares, found.weights > FULL, self._beyond))
+
+    @property
+    def _beyond(self) -> Array:
+        """Squares (N,) from which the loss is no square."""
+        return chdtri(self.loops.equations, 1 - QUANTILES[self.loss])
+
+    def _weights(self, squares: Array) -> Array:
+        if self.loss == "huber":
+            return np.sqrt(self._beyond / np.maximum(squares, self._beyond))
+        return (squares <= self._beyond).astype(float)
+
+    def _cost(self, v: Array, squares: Array) -> float:
+        losses = squares
+        if self.loss == "truncated":
+            losses = np.minimum(squares, self._beyond)
+        elif self.loss == "huber":
+            straight = 2 * np.sqrt(self._beyond * squares) - self._beyond
+            losses = np.where(squares > self._beyond, straight, squares)
+        return float(np.sum(losses) + np.sum((self.loops.prior @ v) ** 2))
+
+    def _weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> Solved:
+        """Return the solution of a weighted sum of squares: by the relaxation, or from rotations near it."""
+        triangle = self.loops.triangle(weights)
+        L = self.loops.form(triangle)
+        best = smallest(L, candidates) if near is None else nearest(L, near)
+        v = self.loops.completed(triangle, lifted(best.rotations))
+        squares = self.loops.squares(v)
+        return Solved(v, best, weights, squares, self._cost(v, squares))
+
+    def _repeated(self, solved: Solved) -> Solved:
+        """Return the fixed point of weights and solution, the last of which is the relaxation's."""
+        settled = False
+        for _ in range(MOST_ITERATIONS):
+            weights = self._weights(solved.squares)
+            if np.sum(weights > 0) < FEWEST:
+                break
+            if np.max(np.abs(weights - solved.weights)) >= SETTLED:
+                solved = self._weighted(weights, near=solved.smallest.rotations)
+                continue
+            settled = bool(np.isfinite(solved.smallest.bound))
+            if settled:
+                break
+            solved = self._weighted(weights, [solved.smallest.rotations])
+        if not np.isfinite(solved.smallest.bound):
+            solved = self._weighted(solved.weights, [solved.smallest.rotations])
+        return replace(solved, settled=settled)
+
+    def _truncated(self, candidates: Sequence[Array]) -> Solved:
+        """Return the least of the truncated loss from the likeliest measurements, all of them, and candidates.
+
+        Where too few of the likeliest agree with that, parts of them are begun with, too.
+        """
+        pairs = compatible(self.loops, self._beyond)
+        first = likeliest(pairs)
+        found = [self._graduated(first), *filter(None, map(self._from, candidates))]
+        if not np.array_equal(found[0].weights > 0, first):
+            found.append(self._graduated(np.ones(len(pairs), dtype=bool)))
+        best = _least(found)
+        if best.weights.sum() < first.sum() - 1:
+            best = _least([best, *map(self._graduated, _likely(pairs, first))])
+        return best
+
+    def _graduated(self, among: np.ndarray) -> Solved:
+        """Return a least of the truncated loss: losses of some (N,) from squares to it, each from the last.
+
+        The loss of parameter mu has weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them
+        sqrt(mu (mu + 1) c^2 / r^2) - mu.
+        """
+        solved = self._weighted(among.astype(float))
+        mu = 1 / max(2 * float(np.max(among * solved.squares / self._beyond)) - 1, 1e-3)
+        for _ in range(MOST_ITERATIONS):
+            between = np.sqrt(mu * (mu + 1) * self._beyond / np.maximum(solved.squares, 1e-300)) - mu
+            weights = among * np.clip(between, 0.0, 1.0)
+            if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
+                break
+            solved = self._weighted(weights, near=solved.smallest.rotations)
+            mu *= GRADUATION
+        return self._repeated(solved)
+
+    def _from(self, rotations: Array) -> Solved | None:
+        """Return the least of the truncated loss near rotations; None where fewer than three measurements are near."""
+        triangle = self.loops.triangle(np.ones(len(self.loops.rows)))
+        weights = self._weights(self.loops.squares(self.loops.completed(triangle, lifted(rotations))))
+        if np.sum(weights) < FEWEST:
+            return None
+        return self._repeated(self._weighted(weights, [rotations]))
 
 
-def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
-    """Return the least of a loss of |J_i v|, which is global where it is the sum of squares and the bound meets it."""
-    if loss == "squares":
-        return _weighted(loops, np.ones(len(loops.rows)), loss, candidates)
-    beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
-    if loss == "huber":
-        first = _weighted(loops, np.ones(len(loops.rows)), loss, candidates)
-        found = _repeated(loops, first, loss, lambda squares: _huber_weights(squares, beyond))
-    else:
-        found = _truncated(loops, beyond, candidates)
-    return replace(found, alone=alone(loops, found.squares, found.weights > FULL, beyond))
-
-
-def _truncated(loops: Loops, beyond: Array, candidates: Sequence[Array]) -> Solved:
-    """Return the least of the truncated loss that is found from the likeliest measurements, from all and candidates."""
-    pairs = compatible(loops.turns, beyond)
-    first = likeliest(pairs)
-    found = [_graduated(loops, first, beyond), *(_from(loops, rotations, beyond) for rotations in candidates)]
-    if not np.array_equal(found[0].weights > 0, first):
-        found.append(_graduated(loops, np.ones(len(pairs), dtype=bool), beyond))
-    best = _least(found)
-    if best.weights.sum() < first.sum() - 1:
-        best = _least([best, *(_graduated(loops, part, beyond) for part in likely(pairs, first))])
-    return best
-
-
-def _least(found: Sequence[Solved | None]) -> Solved:
+def _least(found: Sequence[Solved]) -> Solved:
     """Return the first of those that cost least, up to rounding."""
-    known = [each for each in found if each is not None]
-    least = min(each.cost for each in known)
-    return next(each for each in known if each.cost * (1 - SETTLED) <= least)
-
-
-def _weighted(loops: Loops, weights: Array, loss: str, candidates: Sequence[Array] = ()) -> Solved:
-    """Return the solution of a weighted sum of squares, by the relaxation."""
-    triangle = loops.triangle(weights)
-    return _solved(loops, weights, loss, triangle, smallest(loops.form(triangle), candidates, loops.shared))
-
-
-def _followed(loops: Loops, weights: Array, loss: str, solved: Solved) -> Solved:
-    """Return the solution of a weighted sum of squares near that of other weights."""
-    triangle = loops.triangle(weights)
-    return _solved(loops, weights, loss, triangle, nearest(loops.form(triangle), solved.smallest.rotations))
-
-
-def _solved(loops: Loops, weights: Array, loss: str, triangle: Array, best: Smallest) -> Solved:
-    v = loops.completed(triangle, lifted(best.rotations))
-    squares = loops.squares(v)
-    return Solved(v, best, weights, squares, _cost(loops, v, squares, loss))
-
-
-def _cost(loops: Loops, v: Array, squares: Array, loss: str) -> float:
-    expected = float(np.sum((loops.prior @ v) ** 2))
-    if loss == "squares":
-        return float(np.sum(squares)) + expected
-    beyond = chdtri(loops.freedom, 1 - QUANTILES[loss])
-    if loss == "truncated":
-        return float(np.sum(np.minimum(squares, beyond))) + expected
-    straight = 2 * np.sqrt(beyond * squares) - beyond
-    return float(np.sum(np.where(squares > beyond, straight, squares))) + expected
-
-
-def _huber_weights(squares: Array, beyond: Array) -> Array:
-    return np.sqrt(beyond / np.maximum(squares, beyond))
-
-
-def _truncated_weights(squares: Array, beyond: Array) -> Array:
-    return (squares <= beyond).astype(float)
-
-
-def _repeated(loops: Loops, solved: Solved, loss: str, weigh: Weigh) -> Solved:
-    """Return the fixed point of weights and solution, the last of which is the relaxation's."""
-    for _ in range(MOST_PASSES):
-        weights = weigh(solved.squares)
-        if np.sum(weights > 0) < FEWEST:
-            break
-        if np.max(np.abs(weights - solved.weights)) >= SETTLED:
-            solved = _followed(loops, weights, loss, solved)
-            continue
-        if np.isfinite(solved.smallest.bound):
-            return replace(solved, settled=True)
-        solved = _weighted(loops, weights, loss, [solved.smallest.rotations])
-    if not np.isfinite(solved.smallest.bound):
-        solved = _weighted(loops, solved.weights, loss, [solved.smallest.rotations])
-    return replace(solved, settled=False)
-
-
-def _graduated(loops: Loops, among: np.ndarray, beyond: Array) -> Solved:
-    """Return a least of the truncated loss: losses of some measurements (N,) from squares to it, each from the last."""
-    solved = _weighted(loops, among.astype(float), "truncated")
-    ratio = float(np.max(among * solved.squares / beyond))
-    mu = 1 / max(2 * ratio - 1, 1e-3)
-    for _ in range(MOST_PASSES):
-        between = np.sqrt(mu * (mu + 1) * beyond / np.maximum(solved.squares, 1e-300)) - mu
-        weights = among * np.clip(between, 0.0, 1.0)
-        if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
-            break
-        solved = _followed(loops, weights, "truncated", solved)
-        mu *= FACTOR
-    return _repeated(loops, solved, "truncated", lambda squares: _truncated_weights(squares, beyond))
-
-
-def _from(loops: Loops, rotations: Array, beyond: Array) -> Solved | None:
-    """Return the least of the truncated loss near rotations; None where fewer than three measurements are near."""
-    triangle = loops.triangle(np.ones(len(loops.rows)))
-    squares = loops.squares(loops.completed(triangle, lifted(rotations)))
-    weights = _truncated_weights(squares, beyond)
-    if np.sum(weights) < FEWEST:
-        return None
-    solved = _weighted(loops, weights, "truncated", [rotations])
-    return _repeated(loops, solved, "truncated", lambda squares: _truncated_weights(squares, beyond))
+    least = min(each.cost for each in found)
+    return next(each for each in found if each.cost * (1 - SETTLED) <= least)
