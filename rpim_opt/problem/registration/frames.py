@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -63,7 +64,11 @@ class Located(NamedTuple):
 
 
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
-    """Return the base and the reflectors by marker, from positions and poses on the nominal robot."""
+    """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
+
+    All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where that does
+    not determine the rotations, closed forms say what they can.
+    """
     seen = _positions(data, ENOUGH)
     if not seen:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
@@ -72,8 +77,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     try:
         return _certified(seen, flanges, places)
     except InputError as error:
-        base, found = _closed_forms(seen, flanges, places)
-        return Located(base, found, f"by closed forms: {error.found}")
+        return _closed_forms(seen, flanges, places, error.found)
 
 
 def _positions(data: Dataset, most: int) -> list[Block]:
@@ -89,9 +93,12 @@ def _positions(data: Dataset, most: int) -> list[Block]:
 
 def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
     """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
-    turning = _most([block for block in seen if block.measurement.name == "pose"], MOST_TURNING)
+    rows = Counter(block.markers[0] for block in seen for _ in block.row)
+    posed_rows = Counter(b.markers[0] for b in seen if b.measurement.name == "pose" for _ in b.row)
+    turning = {marker for marker, _ in posed_rows.most_common(MOST_TURNING)}
+    some = turning | {marker for marker, _ in rows.most_common(MOST_PLACING)}
     try:
-        start = _started(seen, flanges, places, turning | _most(seen, MOST_PLACING), turning)
+        start = _started(seen, flanges, places, some, turning)
     except InputError:  # where every configuration shows other markers, it takes all of them
         if len(places) <= MOST_PLACING:
             raise
@@ -103,6 +110,32 @@ def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[
     _turn(found, base, seen, flanges)
     verdict = "certified" if start.certified else "not certified"
     return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+
+
+def _started(
+    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
+) -> CertifiedStart:
+    """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
+    chosen = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
+    measured = []
+    for block, _ in chosen:
+        T = np.tile(np.eye(4), (len(block.y), 1, 1))
+        T[:, :3, :3] = np.nan  # where positions alone count
+        T[:, :3, 3] = block.y[:, :3]
+        turned = block.markers[0] in turning and block.measurement.name == "pose"
+        measured.append(transforms(block.y) if turned else T)
+    sigma = np.concatenate([_deviations(block) for block, _ in chosen])
+    start = certified_hand_eye(
+        np.concatenate([flange for _, flange in chosen]),
+        np.concatenate(measured),
+        marker=[block.markers[0] for block, _ in chosen for _ in block.row],
+        sigma=(sigma[:, 0], sigma[:, 1]),
+        expected=places,
+        spread=TOOL_ERROR,
+    )
+    if start.uncertainty > FREE:
+        raise InputError("the data", start.reason, "turns about two axes")
+    return start
 
 
 def _turn(tools: dict[str, Array], base: Array, seen: Sequence[Block], flanges: Sequence[Array]) -> None:
@@ -117,7 +150,7 @@ def _turn(tools: dict[str, Array], base: Array, seen: Sequence[Block], flanges: 
 
 
 def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located | None:
-    """Return base and reflectors in closed form, from positions alone; None where they do not fit."""
+    """Return base and reflectors in closed form, from positions alone; None where they do not fit the nominal robot."""
     seen = _positions(data, FEW // max(len(data.blocks), 1) + 3)
     if not seen:
         return None
@@ -127,37 +160,17 @@ def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Loca
     y = np.concatenate([block.y[:, :3] for block in seen])
     marker = np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in seen])
     places = np.array([tools[name][:3] for name in markers])
-    register(
-        np.einsum("nij,nj->ni", flange[:, :3, :3], places[marker]) + flange[:, :3, 3], y
-    )  # refuses points on a line
+    modelled = np.einsum("nij,nj->ni", flange[:, :3, :3], places[marker]) + flange[:, :3, 3]
+    register(modelled, y)  # refuses points on a line
     q = np.concatenate([block.q[:, 0] for block in seen]) @ robot.joint_map.T
     spread = np.full(len(places), TOOL_ERROR)
-    asked = Candidates(q[None], y[None], marker[None], np.zeros((1, robot.dof)), places[None], places, spread)
-    fit = fit_arms(robot, asked, QUICK_STEPS)
+    given = Candidates(q[None], y[None], marker[None], np.zeros((1, robot.dof)), places[None], places, spread)
+    fit = fit_arms(robot, given, QUICK_STEPS)
     if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
         return None
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
     _turn(found, fit.base[0], seen, flanges)
     return Located(frame_numbers(fit.base[0]), found, "in closed form")
-
-
-def _started(
-    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
-) -> CertifiedStart:
-    """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
-    asked = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
-    sigma = np.concatenate([_deviations(block) for block, _ in asked])
-    start = certified_hand_eye(
-        np.concatenate([flange for _, flange in asked]),
-        np.concatenate([_measured(block, block.markers[0] in turning) for block, _ in asked]),
-        marker=[block.markers[0] for block, _ in asked for _ in block.row],
-        sigma=(sigma[:, 0], sigma[:, 1]),
-        expected=places,
-        spread=TOOL_ERROR,
-    )
-    if start.uncertainty > FREE:
-        raise InputError("the data", start.reason, "turns about two axes")
-    return start
 
 
 def _seen_from(
@@ -178,24 +191,6 @@ def _seen_from(
     return found
 
 
-def _most(blocks: Sequence[Block], count: int) -> set[str]:
-    """Return so many markers of those with the most rows, for each makes the relaxation larger."""
-    rows: Counter[str] = Counter()
-    for block in blocks:
-        rows[block.markers[0]] += len(block.row)
-    return {marker for marker, _ in rows.most_common(count)}
-
-
-def _measured(block: Block, turning: bool) -> Array:
-    """Return poses (N, 4, 4), their rotations NaN where positions alone count."""
-    if turning and block.measurement.name == "pose":
-        return transforms(block.y)
-    T = np.full((len(block.y), 4, 4), np.nan)
-    T[:, :3, 3] = block.y[:, :3]
-    T[:, 3] = [0.0, 0.0, 0.0, 1.0]
-    return T
-
-
 def _deviations(block: Block) -> Array:
     """Return standard deviations (N, 2) of a position [m] and a turn [rad]: the instrument's and the robot's."""
     variance = np.full((len(block.row), 2), NOMINAL_ERROR**2)
@@ -206,22 +201,18 @@ def _deviations(block: Block) -> Array:
     return np.sqrt(variance)
 
 
-def _closed_forms(
-    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
-) -> tuple[Array, dict[str, Array]]:
-    """Return the base and the reflectors, of which the first whose poses tell decide alone."""
+def _closed_forms(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], reason: str) -> Located:
+    """Return the base and the reflectors: of the first poses that tell, or positions by distances and registration."""
     found = {marker: place.copy() for marker, place in places.items()}
+    how = f"by closed forms: {reason}"
     source, target, weight = [], [], []
     for block, flange in zip(seen, flanges, strict=True):
         marker = block.markers[0]
         if block.measurement.name == "pose":
-            try:
+            with suppress(InputError):  # too few turns: positions and the stated tool have to do
                 base, tool = hand_eye(flange, transforms(block.y), found[marker][:3])
-            except InputError:
-                pass  # too few turns: positions and the stated tool have to do
-            else:
                 found[marker] = frame_numbers(tool)
-                return frame_numbers(base), found
+                return Located(frame_numbers(base), found, how)
         if len(flange) > 3:
             found[marker][:3] = tool_from_distances(flange, block.y[:, :3], found[marker][:3], TOOL_ERROR)
         source.append(flange[:, :3, :3] @ found[marker][:3] + flange[:, :3, 3])
@@ -229,85 +220,59 @@ def _closed_forms(
         variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
         weight.append(1 / np.broadcast_to(variance, len(flange)))
     q = np.concatenate(weight)
-    return frame_numbers(register(np.concatenate(source), np.concatenate(target), q / q.max())), found
+    base = register(np.concatenate(source), np.concatenate(target), q / q.max())
+    return Located(frame_numbers(base), found, how)
 
 
 APART = 0.1
 """How far nominal robots may be from each other at a point that both have touched [m], until it is another point."""
-Places = Mapping[str, Array]
 
 
 def met(problem: CalibrationProblem) -> dict[str, Array]:
-    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them."""
+    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them.
+
+    The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
+    that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
+    """
     known: dict[str, Array] = {}
     found = {}
     for robot, places in _touched(problem):
-        base, placed = _standing(problem, robot, places, known)
-        if placed:
-            found[robot] = frame_numbers(base)
+        p = problem.parameters.of_robot(robot)
+        k = _frame_of(p, "base_")
+        base = numeric_frame(p.nominal[k])
+        common = {name: place for name, place in places.items() if name in known}
+        seen = any(block.touched is None for block in problem.data.blocks if block.robot == robot)
+        if p.identified[k].all() and not seen:
+            with suppress(InputError):  # too few, or on a line
+                base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
+                found[robot] = frame_numbers(base)
         for name, place in places.items():
-            known.setdefault(name, _in_instrument(base, place))
+            there = base[:3, :3] @ place + base[:3, 3]
+            distance = float(np.linalg.norm(there - known.setdefault(name, there)))
+            # of a base that touches do not place, too few of them say nothing
+            placed = robot in found or seen or not p.identified[k].all()
+            if placed and distance > APART:
+                what = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
+                accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
+                raise InputError(f"together, problem '{robot}'", what, accepted)
     return found
 
 
-def _standing(problem: CalibrationProblem, robot: str, places: Places, known: Places) -> tuple[Array, bool]:
-    """Return where a base (4, 4) is, and whether known places say so; refuse touches that are elsewhere."""
-    p = problem.parameters.of_robot(robot)
-    stated = numeric_frame(p.nominal[_frame_of(p, "base_")])
-    common = {name: place for name, place in places.items() if name in known}
-    if not _placed_by_touches(problem, robot, p):
-        _require_near(robot, stated, common, known)
-        return stated, False
-    try:
-        base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
-    except InputError:  # too few, or on a line
-        return stated, False
-    _require_near(robot, base, common, known)
-    return base, True
-
-
-def _in_instrument(base: Array, place: Array) -> Array:
-    return base[:3, :3] @ place + base[:3, 3]
-
-
-def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, Places]]:
+def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, dict[str, Array]]]:
     """Yield the nominal positions (3,) [m] of touched points by name in a robot's own frame, robot by robot."""
     for robot, arm in problem.arms.items():
         p = problem.parameters.of_robot(robot)
         all_of: dict[str, list[Array]] = {}
         for block in problem.data.blocks:
-            names = _points(block)
-            if block.robot == robot and len(names):
-                T = forward_kinematics(arm, block.q[:, 0]) @ numeric_frame(
-                    p.nominal[_frame_of(p, tool_prefix(block.markers[0]))]
-                )
-                for name, position in zip(names, T[:, :3, 3], strict=True):
-                    all_of.setdefault(name, []).append(position)
+            kind = block.measurement
+            if block.robot != robot or block.touched is None or not kind.touching or kind.planar:
+                continue
+            tool = numeric_frame(p.nominal[_frame_of(p, tool_prefix(block.markers[0]))])
+            T = forward_kinematics(arm, block.q[:, 0]) @ tool
+            for name, position in zip(block.touched[:, 0], T[:, :3, 3], strict=True):
+                all_of.setdefault(str(name), []).append(position)
         if all_of:
             yield robot, {name: np.mean(positions, axis=0) for name, positions in all_of.items()}
-
-
-def _points(block: Block) -> list[str]:
-    """Return the points that rows touched; none where they touched planes, or nothing."""
-    if block.touched is None or not block.measurement.touching or block.measurement.planar:
-        return []
-    return [str(name) for name in block.touched[:, 0]]
-
-
-def _placed_by_touches(problem: CalibrationProblem, robot: str, p: Parameters) -> bool:
-    """Whether a robot's base is sought, and nothing but touches tells where it is."""
-    sought = p.identified[_frame_of(p, "base_")].all()
-    return bool(sought) and all(block.touched is not None for block in problem.data.blocks if block.robot == robot)
-
-
-def _require_near(robot: str, base: Array, places: Places, known: Places) -> None:
-    """Refuse touches of one point that nominal robots put into different places."""
-    for name, place in places.items():
-        distance = float(np.linalg.norm(_in_instrument(base, place) - known[name]))
-        if distance > APART:
-            found = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
-            accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
-            raise InputError(f"together, problem '{robot}'", found, accepted)
 
 
 MISPLACED = 3.0
@@ -421,16 +386,10 @@ def starting_parameters(
         given = _own_values(robot, block, base, places[block.markers[0]], own)
         for name, dimension in block.measurement.parameters.items():
             entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
-    reference = _reference(data, temperature)
+    if temperature is None and len(data.temperatures):
+        temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
-    return model_parameters(robot, base, tools, entries, own_frames(data), named, reference)
-
-
-def _reference(data: Dataset, stated: float | None) -> float | None:
-    """Return the temperature at which lengths are as on the drawing [K]; None where nothing is known of it."""
-    if stated is None and len(data.temperatures):
-        return float(data.temperatures.mean())
-    return stated
+    return model_parameters(robot, base, tools, entries, own_frames(data), named, temperature)
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
@@ -498,14 +457,9 @@ def relocated(problem: Source) -> Source | None:
             nominal[k[free]] = place[free]
     except InputError:
         return None
-    return _moved(problem, nominal)
-
-
-def _moved(problem: Source, nominal: Array) -> Source | None:
-    """Return the problem with other nominal values (P,); None if they are the same."""
-    if (nominal == problem.parameters.nominal).all():
+    if (nominal == p.nominal).all():
         return None
-    return problem.with_parameters(replace(problem.parameters, nominal=nominal))
+    return problem.with_parameters(replace(p, nominal=nominal))
 
 
 def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
@@ -538,7 +492,9 @@ def _each_relocated(problem: Source) -> Source | None:
         base = _frame_of(own, "base_")
         if _misplaced(own, base, place):
             nominal[p.places_of(name)[base]] = place
-    return _moved(problem, nominal)
+    if (nominal == p.nominal).all():
+        return None
+    return problem.with_parameters(replace(p, nominal=nominal))
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:
@@ -579,7 +535,10 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
 
 def settled(alone: Source) -> Array:
-    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated."""
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated.
+
+    Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
+    """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
     z = np.zeros(len(scale))
@@ -587,10 +546,9 @@ def settled(alone: Source) -> Array:
     damping = 0.0
     for _ in range(MOST_STEPS):
         R = model.triangle[:, :-1]
-        b = model.triangle[:, -1] - R @ z
         A = np.vstack([R, np.eye(len(z))])
         size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
-        right = np.concatenate([b, -z, np.zeros(len(z))])
+        right = np.concatenate([model.triangle[:, -1] - R @ z, -z, np.zeros(len(z))])
         step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), right, rcond=None)[0]
         candidate = source.linearize(scale * (z + step))
         if _objective(candidate, z + step) > _objective(model, z) * (1 + ROUNDING):
