@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Block
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import posed
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, transforms
@@ -42,14 +42,14 @@ SHORT = 1e-9
 class Points:
     """N measured points of a robot."""
 
-    q: Array
-    y: Array
-    marker: np.ndarray
-    tools: Array
-    turns: Array | None
-    row: np.ndarray
-    seen: bool = False
-    names: tuple[str, ...] = ("",)
+    q: Array  # (N, dof) joint values of the controller [rad or m]
+    y: Array  # (N, 3) positions [m]
+    marker: np.ndarray  # (N,) numbers of the reflectors
+    tools: Array  # (M, 3) where these are stated in the flange frame [m]
+    turns: Array | None  # (N, 3, 3) orientations
+    row: np.ndarray  # (N,) of the dataset
+    seen: bool = False  # whether they are poses of a camera's views
+    names: tuple[str, ...] = ("",)  # of the reflectors
 
     def take(self, index: Sequence[int] | np.ndarray) -> Points:
         """Return the points at ``index``."""
@@ -72,14 +72,9 @@ class Points:
         """Joint values (K, dof), positions (K, 3) and reflectors (K,): of poses also the tips of their axes."""
         if self.turns is None:
             return self.q, self.y, self.marker
-        tips = self.y[:, None] + self.lever * np.swapaxes(self.turns, 1, 2)
+        tips = self.y[:, None] + LEVER * self.extent * np.swapaxes(self.turns, 1, 2)
         y = np.concatenate([self.y[:, None], tips], axis=1).reshape(-1, 3)
         return np.repeat(self.q, 4, axis=0), y, (4 * self.marker[:, None] + np.arange(4)).ravel()
-
-    @property
-    def lever(self) -> float:
-        """Length of the axes [m] whose tips are fitted."""
-        return LEVER * self.extent
 
     @property
     def stated(self) -> tuple[Array, Array]:
@@ -100,30 +95,24 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
     blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
     if sum(len(block.row) for block in blocks) < FEWEST_ROWS:
         return None
-    whole = _together(blocks, own)
-    number = {label: i for i, label in enumerate(problem.data.label)}
-    row = np.array([number[data.label[i]] for i in whole.row])
-    ordered = replace(whole, row=row, seen=data is not problem.data).take(np.argsort(row, kind="stable"))
-    return ordered.evenly(most)
-
-
-def _together(blocks: Sequence[Block], own: Mapping[str, float]) -> Points:
-    """Return the points of all blocks, reflectors where the parameters' values by name put them."""
     markers = list(dict.fromkeys(block.markers[0] for block in blocks))
     tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers])
     tools[np.linalg.norm(tools, axis=1) > LONGEST] = 0.0  # where a fit to lengths in another unit put them
     turns = None
     if len(markers) == 1 and all(block.measurement.name == "pose" for block in blocks):
         turns = np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
-    return Points(
+    number = {label: i for i, label in enumerate(problem.data.label)}
+    whole = Points(
         q=np.concatenate([block.q[:, 0] for block in blocks]),
         y=np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
         tools=tools,
         turns=turns,
-        row=np.concatenate([block.row for block in blocks]),
+        row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
+        seen=data is not problem.data,
         names=tuple(markers),
     )
+    return whole.take(np.argsort(whole.row, kind="stable")).evenly(most)
 
 
 def mirrored(points: Points) -> Points:
@@ -138,12 +127,12 @@ def mirrored(points: Points) -> Points:
 class Fit(NamedTuple):
     """Where base, reflectors and joint zeros fit positions best: of B sets of N points, M reflectors."""
 
-    modelled: Array
-    error: Array
-    cost: Array
-    base: Array
-    tools: Array
-    zero: Array
+    modelled: Array  # (B, N, 3) [m]
+    error: Array  # (B, N) [m]
+    cost: Array  # (B,) weighted [m^2]
+    base: Array  # (B, 4, 4) in the instrument's frame
+    tools: Array  # (B, M, 3) in the flange frame [m]
+    zero: Array  # (B, dof) joint zeros [rad or m]
 
     def take(self, index: np.ndarray) -> Fit:
         """Return the fits at ``index``."""
@@ -153,13 +142,13 @@ class Fit(NamedTuple):
 class Candidates(NamedTuple):
     """B sets of N points to be fitted at once."""
 
-    q: Array
-    y: Array
-    marker: np.ndarray
-    zero: Array
-    tools: Array
-    stated: Array
-    spread: Array
+    q: Array  # (B, N, dof) joint values of the model
+    y: Array  # (B, N, 3) positions [m]
+    marker: np.ndarray  # (B, N) reflectors
+    zero: Array  # (B, dof) start values of joint zeros
+    tools: Array  # (B, M, 3) start values of reflectors
+    stated: Array  # (M, 3) their stated places
+    spread: Array  # (M,) standard deviations of these [m]
 
     @classmethod
     def of(cls, robot: Robot, tries: Sequence[Points]) -> Candidates:
@@ -195,20 +184,8 @@ def fit_arms(
     the registration in closed form (`proper`), and the Jacobian loses its mean over the rows and carries three columns
     for a turn of the base, whose step is dropped.
 
-    Parameters
-    ----------
-    robot
-        The nominal robot; joint values are those of its model.
-    asked
-        The candidates.
-    steps
-        At most so many.
-    zeros
-        Whether joint zeros are fitted.
-    robust
-        Whether weights w fall as 1 / error beyond three medians of a candidate's errors; otherwise they are one.
-    noise
-        Error of a point [m] that the spread of the reflectors is weighed against.
+    Joint zeros are fitted where ``zeros``; weights w fall as 1 / error beyond three medians of a candidate's errors
+    where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
     """
     B, N, _ = asked.y.shape
     columns = 3 + 3 * len(asked.stated) + zeros * robot.dof
@@ -218,33 +195,26 @@ def fit_arms(
 
 
 class _State(NamedTuple):
-    """Candidates at one point: flange columns R (3, 3, B, N) and points p, joint axes and origins, residuals, cost."""
+    """Candidates at one point: numbers of a candidate (B, ...), and of its points (..., B, N)."""
 
     zero: Array
     tools: Array
-    points: Array
-    turn: Array
-    axes: Array
-    origins: Array
-    base: Array
-    mean: Array
-    residual: Array
+    base: Array  # (B, 3, 3) from the instrument's frame to the robot's
     cost: Array
+    points: Array  # (3, B, N)
+    turn: Array  # (3, 3, B, N) columns of the flange's rotation
+    axes: Array  # (dof, 3, B, N) of joints
+    origins: Array  # (dof, 3, B, N) of joints
+    mean: Array  # (3, B, 1)
+    residual: Array  # (3, B, N)
 
     def where(self, better: np.ndarray, other: _State) -> _State:
         """Return the other's candidates where they are better."""
         each = []
-        for name, mine, theirs in zip(self._fields, self, other, strict=True):
-            axis = _BATCH[name]
-            shape = [1] * mine.ndim
-            shape[axis] = -1
-            each.append(np.where(better.reshape(shape), theirs, mine))
+        for k, (mine, theirs) in enumerate(zip(self, other, strict=True)):
+            of_candidate = better.reshape(-1, *[1] * (mine.ndim - 1))
+            each.append(np.where(of_candidate if k < 4 else better[:, None], theirs, mine))
         return _State(*each)
-
-
-_BATCH = {"zero": 0, "tools": 0, "points": 1, "turn": 2, "axes": 2, "origins": 2, "base": 0, "mean": 1, "residual": 1,
-          "cost": 0}  # fmt: skip
-"""The axis of a state's arrays that counts the candidates."""
 
 
 def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
@@ -253,8 +223,8 @@ def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bo
     weights = np.ones((B, N))
     pull = (noise / asked.spread) ** 2
     y = np.moveaxis(asked.y, -1, 0)
-    asking = (robot, asked, y, pull)
-    state = _at(*asking, weights, asked.zero, asked.tools)
+    at = partial(_at, robot, asked, y, pull)
+    state = at(weights, asked.zero, asked.tools)
     size = asked.tools[0].size
     quiet = 0
     for k in range(steps):
@@ -262,13 +232,13 @@ def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bo
             error = np.linalg.norm(state.residual, axis=0)
             limit = TRUSTED * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
-            state = _at(*asking, weights, state.zero, state.tools)
+            state = at(weights, state.zero, state.tools)
         step = _step(robot, asked, pull, weights, state, damping, zeros)
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
         if zeros:
             zero = zero + step[:, size:-3]
-        candidate = _at(*asking, weights, zero, tools)
+        candidate = at(weights, zero, tools)
         better = candidate.cost < state.cost
         before = state.cost
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
@@ -298,7 +268,7 @@ def _at(robot: Robot, asked: Candidates, y: Array, pull: Array, weights: Array, 
     residual = centred - np.einsum("bij,jbn->ibn", base, target)
     off = tools - asked.stated
     cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-    return _State(zero, tools, points, turn, axes, origins, base, mean, residual, cost)
+    return _State(zero, tools, base, cost, points, turn, axes, origins, mean, residual)
 
 
 def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
@@ -342,11 +312,12 @@ def _step(
         for k in range(3):
             J[:, 3 * m + k] = np.moveaxis(state.turn[k] * seen, 0, 1)
     for j in range(dof):
-        J[:, 3 * M + j] = np.moveaxis(_moved(robot, state, j), 0, 1)
-    centred = np.moveaxis(state.points - state.mean, 0, 1)
-    J[:, -3, 1], J[:, -3, 2] = -centred[:, 2], centred[:, 1]
-    J[:, -2, 0], J[:, -2, 2] = centred[:, 2], -centred[:, 0]
-    J[:, -1, 0], J[:, -1, 1] = -centred[:, 1], centred[:, 0]
+        slope = state.axes[j]
+        if robot.joint_types[j] == "revolute":
+            slope = np.cross(slope, state.points - state.origins[j], axis=0)
+        J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
+    for k, axis in enumerate(np.eye(3)):
+        J[:, k - 3] = np.moveaxis(np.cross(axis[:, None, None], state.points - state.mean, axis=0), 0, 1)
     share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
     root = np.sqrt(weights)[:, None, None]
     J -= (J * share).sum(axis=-1, keepdims=True)
@@ -361,18 +332,3 @@ def _step(
     largest = diagonal.max(axis=1, keepdims=True)
     extra = damping[:, None] * (diagonal + 1e-3 * largest) + 1e-12 * largest
     return -np.linalg.solve(H + extra[:, :, None] * np.eye(H.shape[1]), g[..., None])[..., 0]
-
-
-def _moved(robot: Robot, state: _State, j: int) -> Array:
-    """Return how points (3, B, N) move by the zero of joint j."""
-    axis = state.axes[j]
-    if robot.joint_types[j] == "prismatic":
-        return axis
-    away = state.points - state.origins[j]
-    return np.stack(
-        [
-            axis[1] * away[2] - axis[2] * away[1],
-            axis[2] * away[0] - axis[0] * away[2],
-            axis[0] * away[1] - axis[1] * away[0],
-        ]
-    )
