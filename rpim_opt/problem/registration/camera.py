@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -83,13 +84,17 @@ def view_pose(points: Array, xy: Array) -> Array:
            [0.  , 0.  , 1.  , 0.5 ]])
     """
     middle, axes, planar = _plane(points)
+    local = (points - middle) @ axes.T
     if planar:
-        H = _linear((points - middle) @ axes[:2].T, xy)
-        first = _of_homography(H)
+        first = _of_homography(_linear(local[:, :2], xy))
         starts = [first, _mirrored(first)]
     else:
-        starts = [_of_space((points - middle) @ axes.T, xy)]
-    local = (points - middle) @ axes.T
+        P = _linear(local, xy)
+        P *= np.sign(np.linalg.det(P[:, :3]))
+        start = np.eye(4)
+        start[:3, :3] = proper(P[:, :3])
+        start[:3, 3] = P[:, 3] / np.linalg.svd(P[:, :3])[1].mean()
+        starts = [start]
     T = min((_refined(start, local, xy) for start in starts), key=lambda found: found[1])[0]
     board = np.eye(4)
     board[:3, :3] = axes
@@ -155,15 +160,6 @@ def _mirrored(T: Array) -> Array:
     return found
 
 
-def _of_space(points: Array, xy: Array) -> Array:
-    P = _linear(points, xy)
-    P *= np.sign(np.linalg.det(P[:, :3]))
-    T = np.eye(4)
-    T[:3, :3] = proper(P[:, :3])
-    T[:3, 3] = P[:, 3] / np.linalg.svd(P[:, :3])[1].mean()
-    return T
-
-
 def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
     """Return the pose that fits best near a first one, and its sum of squares."""
 
@@ -207,7 +203,8 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
             seen = np.hstack([block.y[view], np.ones((len(view), 1))]) @ unit.T
             H = _linear((points[view] - middle) @ axes[:2].T, seen[:, :2])
             H = H / np.linalg.norm(H[:, 0])
-            rows += [_product(H, 0, 1), _product(H, 0, 0) - _product(H, 1, 1)]
+            g, h = H[:, 0], H[:, 1]
+            rows += [_of_conic(g, h), _of_conic(g, g) - _of_conic(h, h)]
     accepted = (
         f"a table [camera] with fx_px, fy_px, cx_px, cy_px, or {LEAST_VIEWS} views of a flat board from several sides"
     )
@@ -226,16 +223,9 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     return {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
 
 
-def _product(H: Array, i: int, j: int) -> Array:
-    """Return the row (5,) of h_i' B h_j in B11, B22, B13, B23, B33: the image of the absolute conic without skew."""
-    g = H[:, i]
-    h = H[:, j]
+def _of_conic(g: Array, h: Array) -> Array:
+    """Return the row (5,) of g' B h in B11, B22, B13, B23, B33: the image of the absolute conic without skew."""
     return np.array([g[0] * h[0], g[1] * h[1], g[0] * h[2] + g[2] * h[0], g[1] * h[2] + g[2] * h[1], g[2] * h[2]])
-
-
-def camera_of(block: Block, own: Mapping[str, float]) -> dict[str, float]:
-    """Return the intrinsics of a block from the values [SI] of all own parameters by name."""
-    return {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
 
 
 def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
@@ -248,7 +238,8 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     for block in data.blocks:
         seen, found = block, block.row
         if block.measurement in CAMERAS.values():
-            seen, found = _posed(data, block, camera_of(block, own))
+            camera = {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
+            seen, found = _posed(data, block, camera)
         blocks.append(replace(seen, row=len(labels) + np.arange(len(found))))
         labels += [data.label[i] for i in found]
         configuration += data.configuration[found].tolist()
@@ -266,32 +257,27 @@ def _posed(data: Dataset, block: Block, camera: Mapping[str, float]) -> tuple[Bl
     size = float(np.ptp(points, axis=0).max())
     entries = []
     poses = []
-    spread = []
+    deviation = []
     covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
     for view in views(data, block):
         if len(view) < FEWEST[planar]:
             continue
-        try:
+        with suppress(InputError):  # points on a line
             T = view_pose(points[view], xy[view])
-        except InputError:  # points on a line
-            continue
-        entries.append(int(view[0]))
-        poses.append(T)
-        spread.append(UNCERTAIN * np.sqrt(np.trace(covariance[view[0]]) / 2) / f * T[2, 3])
+            entries.append(int(view[0]))
+            poses.append(T)
+            deviation.append(UNCERTAIN * np.sqrt(np.trace(covariance[view[0]]) / 2) / f * T[2, 3])
     if not poses:
         raise InputError("the camera", "no view that shows a pose", f"views of {FEWEST[planar]} points or more")
     whole = np.array(poses)
     if block.measurement is eye_in_hand:
         whole = np.linalg.inv(whole)
-    deviation = np.array(spread)
-    variance = np.zeros((len(poses), 6))
-    variance[:, :3] = deviation[:, None] ** 2
-    variance[:, 3:] = (deviation[:, None] / size) ** 2
+    sigma = np.array(deviation)[:, None] * [1, 1, 1, *[1 / size] * 3]
     index = np.array(entries)
     quaternion = scipy.spatial.transform.Rotation.from_matrix(whole[:, :3, :3]).as_quat()
     y = np.hstack([whole[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
     taken = block.take(index, index)
     seen = replace(
-        taken, measurement=pose, y=y, covariance=variance[:, :, None] * np.eye(6), fixture="", point=None, columns={}
+        taken, measurement=pose, y=y, covariance=sigma[:, :, None] ** 2 * np.eye(6), fixture="", point=None, columns={}
     )
     return seen, block.row[index]

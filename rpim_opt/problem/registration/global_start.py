@@ -66,8 +66,8 @@ class Alternative:
 
     sign: Array
     zero: Array
-    apart: float
-    told_by: Array
+    apart: float  # RMS distance of their predictions at unseen configurations [m]
+    told_by: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +78,16 @@ class JointMapping:
 
         q_model = joint_map (sign * q) + zero
 
-    Parameters
-    ----------
-    joint_types
-        Of the robot.
-    sign, zero
-        (dof,) +1 or -1; [rad or m].
-    nominal, left
-        RMS error of the best three quarters of the points [m]: with joints as stated, and with the mapping.
-    starts
-        Random starts of the search.
-    alternatives
-        Mappings that the data cannot tell from this one though they predict otherwise elsewhere.
-    mirrored
-        Whether a left-handed measured frame and joints as stated fit as well.
     """
 
     joint_types: tuple[str, ...]
-    sign: Array
-    zero: Array
-    nominal: float
-    left: float
-    starts: int
-    alternatives: tuple[Alternative, ...] = ()
-    mirrored: bool = False
+    sign: Array  # (dof,) +1 or -1
+    zero: Array  # (dof,) [rad or m]
+    nominal: float  # RMS error of the best three quarters of the points with joints as stated [m]
+    left: float  # and with the mapping
+    starts: int  # random starts of the search
+    alternatives: tuple[Alternative, ...] = ()  # that the data cannot tell from it though they predict otherwise
+    mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
 
     @property
     def missed(self) -> float:
@@ -143,24 +129,25 @@ def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
     reversed_ = [f"{i + 1}" for i in np.flatnonzero(sign < 0)]
     if reversed_:
         parts.append(f"joint{'s' * (len(reversed_) > 1)} {joined(reversed_)} reversed (sign = -1)")
-    shifts = [
-        f"joint {i + 1} {_value(kind, zero[i], '+')}" for i, kind in enumerate(joint_types) if abs(zero[i]) > 1e-9
-    ]
+    shifts = [f"joint {i + 1} {_value(joint_types[i], zero[i], '+')}" for i in np.flatnonzero(np.abs(zero) > 1e-9)]
     if shifts:
         parts.append(f"zero of {joined(shifts)}")
     return ", ".join(parts) or "joints as stated"
 
 
 def _value(kind: str, value: float, plus: str = "") -> str:
-    """Return a joint value with its unit."""
     if kind == "prismatic":
         return f"{1e3 * value:{plus}.1f} mm"
     return f"{np.degrees(value):{plus}.1f} deg"
 
 
+def _turning(robot: Robot) -> np.ndarray:
+    return np.array(robot.joint_types) == "revolute"
+
+
 def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
     """Return a robot whose joints are counted with signs (dof,) of the controller and zeros (dof,) of the model."""
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    turning = _turning(robot)
     mdh = robot.mdh.copy()
     mdh[:, 2] += np.where(turning, zero, 0.0)
     mdh[:, 2] = np.where(turning & (zero != 0), np.angle(np.exp(1j * mdh[:, 2])), mdh[:, 2])
@@ -169,8 +156,16 @@ def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
 
 
 def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | None:
-    """Return signs and zeros of the joints where the nominal robot fails, and the mapped problem."""
-    if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1 or not _placed(problem):
+    """Return signs and zeros of the joints where the nominal robot fails, and the mapped problem.
+
+    Sought where base and all reflectors' positions are identified: otherwise their statements decide what joints are.
+    None where nominal signs and small zeros explain the data, no mapping does, or a left-handed measured frame.
+    """
+    if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1:
+        return None
+    prefixes = {tool_prefix(marker) for block in problem.data.blocks for marker in block.markers}
+    frames = {f"base_{c}" for c in FRAME} | {prefix + c for prefix in prefixes for c in FRAME[:3]}
+    if not frames <= set(problem.parameters.free.names):
         return None
     points = points_of(problem)
     if points is None or explained(problem.robot, points):
@@ -179,14 +174,6 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
     if found is None or found.mirrored:
         return None
     return found, with_mapping(problem, points, found)
-
-
-def _placed(problem: CalibrationProblem) -> bool:
-    """Whether base and reflectors are identified: otherwise their statements decide what joints are."""
-    p = problem.parameters
-    prefixes = {tool_prefix(marker) for block in problem.data.blocks for marker in block.markers}
-    frames = {f"base_{c}" for c in FRAME} | {prefix + c for prefix in prefixes for c in FRAME[:3]}
-    return frames <= set(p.free.names)
 
 
 def explained(robot: Robot, points: Points) -> bool:
@@ -206,8 +193,8 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     robot = mapped(problem.robot, mapping.sign, mapping.zero)
     fit = fit_arms(robot, Candidates.of(robot, [points]), LONG, robust=True)
     p = problem.parameters
-    values = {f"theta{i + 1}": row[2] for i, row in enumerate(robot.mdh)}
-    values |= {f"d{i + 1}": row[3] for i, row in enumerate(robot.mdh)}
+    values = {f"theta{i}": theta for i, theta in enumerate(robot.mdh[:, 2], start=1)}
+    values |= {f"d{i}": d for i, d in enumerate(robot.mdh[:, 3], start=1)}
     places = {"base_": fit.base[0]}
     several = len(fit.tools[0]) // len(points.names)
     for name, tool in zip(points.names, fit.tools[0].reshape(len(points.names), several, 3), strict=True):
@@ -216,14 +203,11 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
         if several > 1:
             T[:3, :3] = proper((tool[1:] - tool[0]).T)
         places[tool_prefix(name)] = T
-    nominal = p.nominal.copy()
-    for i, name in enumerate(p.names):
-        nominal[i] = values.get(name, nominal[i])
-    index = {name: i for i, name in enumerate(p.names)}
+    free = set(p.free.names)
     for prefix, T in places.items():
-        for c, value in zip(FRAME, frame_numbers(T), strict=True):
-            if p.identified[index[prefix + c]]:
-                nominal[index[prefix + c]] = value
+        of_frame = {prefix + c: value for c, value in zip(FRAME, frame_numbers(T), strict=True)}
+        values |= {name: value for name, value in of_frame.items() if name in free}
+    nominal = np.array([values.get(name, value) for name, value in zip(p.names, p.nominal, strict=True)])
     return replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
 
 
@@ -237,7 +221,7 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
     """Return the mapping that explains points, None where the nominal one does as well, or none does."""
     rng = np.random.default_rng(seed)
     n = robot.dof
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    turning = _turning(robot)
     few = points.evenly(FEW)
     base = Candidates.of(robot, [few])
     free = few.y.size - max(n - 2, 0) - base.tools.size - 6
@@ -320,7 +304,7 @@ def _judged(
     cost = (fits.error[:, kept] ** 2).sum(axis=1)
     chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
     near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    turning = _turning(robot)
     low, high = points.q.min(axis=0), points.q.max(axis=0)
     unseen = np.where(
         turning, rng.uniform(-np.pi, np.pi, (UNSEEN, robot.dof)), rng.uniform(low, high, (UNSEEN, robot.dof))
@@ -330,42 +314,40 @@ def _judged(
     said: list[Array] = []
     for i in near:
         there = _predicted(robot, sign[i], fits.take(np.array([i])), unseen)
-        gaps = [float(np.sqrt(((there - other) ** 2).sum(axis=-1).mean())) for other in said]
+        gaps = [_apart(there, other) for other in said]
         if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
             classes[int(np.argmin(gaps))].append(i)
         else:
             classes.append([i])
             said.append(there)
-    plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
-    first = plainest[0]
+    first, *plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
     others = []
-    for k, i in enumerate(plainest[1:], start=1):
-        far = np.linalg.norm(said[k] - said[0], axis=-1).max(axis=-1)
-        apart = float(np.sqrt(((said[k] - said[0]) ** 2).sum(axis=-1).mean()))
-        others.append(Alternative(sign[i], zeros[i], apart, unseen[int(np.argmax(far))]))
+    for i, there in zip(plainest, said[1:], strict=True):
+        far = np.linalg.norm(there - said[0], axis=-1).max(axis=-1)
+        others.append(Alternative(sign[i], zeros[i], _apart(there, said[0]), unseen[int(np.argmax(far))]))
     nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
+    left_handed = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), SHORT, zeros=True, robust=True)
+    small_zeros = np.abs(_gauged(robot, left_handed.zero[0])).max() < NEAR_ZERO
+    left_first = float(left[first])
     return JointMapping(
         robot.joint_types,
         sign[first],
         zeros[first],
         nominal,
-        float(left[first]),
+        left_first,
         starts,
         tuple(others),
-        _mirrored(robot, points, float(left[first])),
+        bool(small_zeros and rms(left_handed)[0] < MIRRORED * left_first),
     )
 
 
-def _mirrored(robot: Robot, points: Points, left: float) -> bool:
-    """Whether a left-handed measured frame and joints as stated leave as little [m]."""
-    fit = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), SHORT, zeros=True, robust=True)
-    small = np.abs(_gauged(robot, fit.zero[0])).max() < NEAR_ZERO
-    return bool(small and rms(fit)[0] < MIRRORED * left)
+def _apart(one: Array, other: Array) -> float:
+    return float(np.sqrt(((one - other) ** 2).sum(axis=-1).mean()))
 
 
 def _gauged(robot: Robot, zero: Array) -> Array:
     """Return zeros (dof,) that base and tool do not take up, near multiples of a quarter turn these."""
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    turning = _turning(robot)
     zero = np.where(turning, np.angle(np.exp(1j * zero)), zero)
     if turning[0]:
         zero[0] = 0.0
