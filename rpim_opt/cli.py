@@ -750,8 +750,8 @@ def _calibrated(
 
 def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFound:
     """Return the error of a program without solution; where data are likely read wrongly, it says how."""
-    from rpim_opt.calibration.asking import calibrate
     from rpim_opt.calibration.causes import likely_causes, mistakes
+    from rpim_opt.calibration.identify import calibrate
     from rpim_opt.convex.formulation import tikhonov
 
     if error.conflict is not None:

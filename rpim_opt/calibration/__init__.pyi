@@ -1,15 +1,15 @@
 from . import baselines as baselines
 from .acceptance import Acceptance as Acceptance
 from .acceptance import accept as accept
-from .asking import calibrate as calibrate
 from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
 from .expected import Improvement as Improvement
 from .expected import improvement as improvement
 from .held_out_rows import refit_all as refit_all
+from .identify import calibrate as calibrate
 from .leaving_out import Influence as Influence
 from .leaving_out import influence as influence
-from .outcome import Iteration as Iteration
+from .loop import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty

@@ -1,23 +1,31 @@
-"""What a fit says of its data: rows that it distrusts, bounds that hold it back, equations that it rests on."""
+"""What a fit says of its data and its constraints: outlying rows, active bounds, shadow prices, extrapolation."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.trust import RARE, Trusted, outlying, trusted_rows
-from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.parts import in_parts
+from rpim_opt.convex.trust import RARE, outlying
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.source import Source
+
+SLACK = 0.1
+"""Share of a measured joint range by which values may exceed it: its extremes are themselves drawn by chance."""
+SLACK_LEAST = np.radians(1.0)
+"""What they may exceed it by in any case [rad; for prismatic joints 17 mm]."""
+ACTIVE = 1e-6
+"""Relative multiplier from which on, and distance up to which, a constraint is active."""
 
 
 class Flag(NamedTuple):
-    """A row that a calibration distrusts: its residual in sigmas, and its error [mm]."""
+    """An outlying row: its residual in sigmas, and its error [mm]."""
 
     label: str
     sigmas: float
@@ -33,35 +41,35 @@ class Held(NamedTuple):
     gain: float
 
 
-def trust(problem: Source, formulation: Formulation, program: Program, x: Array) -> Trusted | None:
-    """Return what a robust loss trusts of the measurements at x (n,) [SI]; None for a squared loss.
+class Price(NamedTuple):
+    """A statement of a drawing at a solution.
 
-    The program's formulation is another one where triangles stand for its loss.
+    ``slack`` is how far it is from its limit, in ``unit``; ``multiplier`` by how much the misfit (loss + weight
+    penalty) would fall for every ``unit`` by which it is loosened, zero where it is not active; ``gain`` what loosening
+    it by ``step`` would bring, to first order. ``misfit`` is all there is.
     """
-    source = in_parts(problem)
-    if source.keeps_rows or program.formulation is formulation:
-        return program.trust(x / problem.parameters.free.scale)
-    return trusted_rows(source, x, formulation)
 
+    text: str
+    unit: str
+    slack: float
+    multiplier: float
+    step: float
+    gain: float
+    misfit: float
 
-def trusted(problem: Source, program: Program, trust: Trusted | None, x: Array) -> LinearModel:
-    """Return the last linearization, of the equations that a loss trusts at x (n,) [SI]."""
-    if trust is None:
-        return program.squared
-    source = in_parts(problem)
-    if source.keeps_rows:
-        return trust(program.model, x / problem.parameters.free.scale)[0]
-    return source.linearize(x, trust)
+    @property
+    def holds(self) -> bool:
+        """Whether it is active."""
+        return self.multiplier > 0
 
-
-def factor(program: Program, trust: Trusted | None) -> float:
-    """Return by how much the loss weighs the equations that it trusts, against squared residuals in sigmas."""
-    if trust is not None:
-        return trust.factor
-    form = program.loss_form
-    if form is None:
-        return 1.0
-    return form.size
+    def sentence(self) -> str:
+        """Say what it costs."""
+        if not self.holds:
+            return f"'{self.text}' is met with {self.slack:.3g} {self.unit} to spare."
+        return (
+            f"'{self.text}' holds the fit back: loosening it by {self.step:.3g} {self.unit} would lower the misfit "
+            f"by {self.gain:.3g} of {self.misfit:.4g}."
+        )
 
 
 def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
@@ -76,8 +84,8 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)
 
 
-def held(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
-    """Return the parameters that a bound holds back at z (n,), the costliest first."""
+def active_bounds(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
+    """Return the parameters at an active bound at z (n,), the costliest first."""
     box = program.box
     if box is None or not program.formulation.constraints:
         return ()
@@ -85,11 +93,85 @@ def held(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
     multiplier = np.sum(program.beginning(z).solve(weight).duals, axis=0)
     loss = program.value(z)[0]
     rows = program.model.equations
-    near = np.minimum(z - box[0], box[1] - z) < 1e-6 * (1 + np.abs(z))
+    near = np.minimum(z - box[0], box[1] - z) < ACTIVE * (1 + np.abs(z))
     found: list[Held] = []
-    for i in np.flatnonzero((multiplier > 1e-6 * loss / rows) & near & (box[0] < box[1])):
+    for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (box[0] < box[1])):
         bound = float(min((box[0][i], box[1][i]), key=lambda side: abs(z[i] - side)))
         less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
         gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
         found.append(Held(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
     return tuple(sorted(found, key=lambda h: -h.gain))
+
+
+def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
+    """Return what the statements of drawings among a program's constraints cost at its solution z (n,)."""
+    constraints = program.formulation.constraints
+    if not any(isinstance(constraint, Parsed) for constraint in constraints):
+        return ()
+    parameters = program.model.parameters
+    duals = program.beginning(z).solve(weight).duals
+    misfit = program.objective(z, weight)
+    found = []
+    for parsed, multipliers in zip(constraints, duals, strict=True):
+        if not isinstance(parsed, Parsed):
+            continue
+        unit, si = parsed.unit
+        slack = parsed.slack(z, parameters)
+        scale = parsed.scale(parameters)
+        multiplier = parsed.price(multipliers, parameters)
+        met = slack > ACTIVE * scale * (1 + float(np.max(np.abs(z))))
+        if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's multipliers are not zero
+            multiplier = 0.0
+        gain = min(multiplier * parsed.step, misfit)
+        found.append(Price(parsed.text, unit, max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit))
+    return tuple(found)
+
+
+# --- extrapolation ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outside:
+    """Which of ``count`` rows lie outside the measured joint ranges, and how many by each joint (from 1)."""
+
+    count: int = 0
+    rows: tuple[int, ...] = ()
+    joints: Mapping[int, int] = field(default_factory=dict)
+
+    def sentences(self) -> list[str]:
+        """Say how many rows are outside, or nothing."""
+        if not self.rows:
+            return []
+        by = ", ".join(f"joint {joint}: {count}" for joint, count in self.joints.items())
+        lie = "lies" if len(self.rows) == 1 else "lie"
+        return [
+            f"{len(self.rows)} of {self.count} rows {lie} well outside the measured joint ranges ({by}): no "
+            "measurement checked the model there, and errors may exceed its intervals."
+        ]
+
+
+def measured_ranges(problem: Source) -> dict[str, Array]:
+    """Return the least and largest measured value of every joint (2, dof) [rad or m], by robot."""
+    blocks = (block for part in problem.rows() for block in part.data.blocks)
+    return widest((block.robot, np.stack([block.q.min(axis=(0, 1)), block.q.max(axis=(0, 1))])) for block in blocks)
+
+
+def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
+    """Return the ranges (2, dof) that hold all of some, by robot."""
+    found: dict[str, Array] = {}
+    for robot, (low, high) in ranges:
+        least, most = found.get(robot, (low, high))
+        found[robot] = np.stack([np.minimum(least, low), np.maximum(most, high)])
+    return found
+
+
+def outside(ranges: Mapping[str, Array], data: Dataset) -> Outside:
+    """Return which rows have a point outside of joint ranges (2, dof) by robot."""
+    beyond = np.zeros((len(data), max(block.q.shape[2] for block in data.blocks)), dtype=bool)
+    for block in data.blocks:
+        low, high = ranges[block.robot]
+        slack = np.maximum(SLACK * (high - low), SLACK_LEAST)
+        far = (block.q < low - slack) | (block.q > high + slack)
+        beyond[block.row, : len(low)] = far.any(axis=1)
+    by = {int(j) + 1: int(beyond[:, j].sum()) for j in np.flatnonzero(beyond.any(axis=0))}
+    return Outside(len(data), tuple(np.flatnonzero(beyond.any(axis=1)).tolist()), by)

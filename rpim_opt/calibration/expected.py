@@ -8,7 +8,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.intervals import coverage_factor
+from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.leaving_out import influence
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.identified import Machine, require_robot

@@ -12,8 +12,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import listed
 from rpim_opt.bayes.hyperparameters import sessions_spread
-from rpim_opt.calibration.intervals import UNLIKELY, coverage_factors, row_freedom, scattered
-from rpim_opt.calibration.ranges import SLACK
+from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, row_freedom, scattered
+from rpim_opt.calibration.diagnosis import SLACK
 from rpim_opt.calibration.region import Region, distance_quantile
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
@@ -71,7 +71,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
         sigmas[block.row] = np.where(seen, np.sqrt(squares), np.nan)
         allowed[block.row] = np.where(seen, _limit(k, freedom, N), np.nan)
         lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
-        factor = coverage_factors(freedom, CONFIDENCE)[:, None]
+        factor = coverage_factor(freedom, CONFIDENCE)[:, None]
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
         inside.append(within[seen][:, lengths].ravel())
     covered = np.concatenate(inside)

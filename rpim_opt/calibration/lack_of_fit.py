@@ -13,7 +13,7 @@ from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import sampled
 from rpim_opt.bayes.model_selection import Comparison
-from rpim_opt.calibration.asking import calibrate
+from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.residuals import (
     FEWEST,

@@ -1,4 +1,4 @@
-"""What a calibration found, in numbers: parameters, errors, what the fit trusts, and how sure it is."""
+"""What a calibration found, in numbers: parameters, errors, what the fit rests on, and how certain it is."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration import diagnosis
 from rpim_opt.calibration.certificate import Certificate
-from rpim_opt.calibration.diagnosis import Flag, Held
-from rpim_opt.calibration.intervals import (
+from rpim_opt.calibration.covariance import (
     UNLIKELY,
     Interval,
     NoiseTest,
     Spread,
-    checked,
     noise_test,
     position_noise,
+    require_interval,
     row_freedom,
     scattered,
 )
-from rpim_opt.calibration.prices import Price, prices
-from rpim_opt.calibration.ranges import Outside, measured_ranges, outside, widest
+from rpim_opt.calibration.diagnosis import Flag, Held, Outside, Price
+from rpim_opt.calibration.loop import Iteration
 from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.select import Selection
-from rpim_opt.convex.trust import Trusted
+from rpim_opt.convex.trust import trusted_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.global_start import JointMapping
@@ -49,38 +49,6 @@ from rpim_opt.problem.row_functions import bearing, transform
 from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameter_names import own_name
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """One pass of the loop.
-
-    Parameters
-    ----------
-    objective
-        The nonlinear objective after it.
-    step
-        Length of the step, in units of the scales.
-    weight
-        Of the penalty.
-    damping
-        Weight of Levenberg and Marquardt's term; zero for a full step.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
-    >>> for passed in result.history[:2]:
-    ...     print(f"{passed.objective:.3f} {passed.step:.2f} {passed.weight:g} {passed.damping:g}")
-    111.417 3.57 1 0
-    109.557 0.31 1 0
-    """
-
-    objective: float
-    step: float
-    weight: float
-    damping: float
-
 
 COVERAGE_FACTOR = 2.0
 """Of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution."""
@@ -126,7 +94,7 @@ class Prediction(NamedTuple):
 class Kept(NamedTuple):
     """What the functions of a script said of a result, in whose file they are not.
 
-    Parameters at bounds; the equations (m, n) that the loss trusts (None where there were none), the loss's factor on
+    Active bounds; the equations that a robust loss keeps (None where there were none), the weight that it gives to
     them, and the numbers of those that it left out; what statements of a drawing cost.
     """
 
@@ -160,20 +128,14 @@ class Outcome:
 
     @property
     def z(self) -> Array:
-        """The deviations (n,) in units of their scales.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
-        >>> bool(abs(result.z * result.problem.parameters.free.scale - result.x).max() == 0)
-        True
-        """
+        """The deviations (n,) in units of their scales."""
         return self.x / self.problem.parameters.free.scale
 
     # --- the robot that was found ------------------------------------------------------------------------------
 
     @property
     def robot(self) -> Robot:
-        """The robot with its identified MDH parameters; ratios, eccentricities and compliances are no part of it.
+        """The robot with its identified MDH parameters; gears and compliances are no part of it.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
@@ -185,15 +147,7 @@ class Outcome:
 
     @property
     def robots(self) -> Mapping[str, Robot]:
-        """The robots with their identified MDH parameters by name, ``""`` for the only one, as of `robot`.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
-        >>> found = ro.calibrate(both, ro.tikhonov, weight=1.0).robots
-        >>> list(found), bool(abs(found["left"].mdh - found["right"].mdh).max() < 1e-9)
-        (['left', 'right'], True)
-        """
+        """The robots with their identified MDH parameters by name, ``""`` for the only one, as of `robot`."""
         free = self.problem.parameters.free
         found = {}
         for robot, nominal in self.problem.arms.items():
@@ -286,7 +240,7 @@ class Outcome:
         >>> where.position.round(3), (1e3 * where.standard).round(3)  # [m], [mm]
         (array([[ 1.522, -0.347,  0.972]]), array([[0.013, 0.014, 0.012]]))
         """
-        of = checked(of)
+        require_interval(of)
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
@@ -306,28 +260,14 @@ class Outcome:
         return Prediction(problem.modelled(self.x)[0], covariance, COVERAGE_FACTOR, self.outside(problem.data), freedom)
 
     def outside(self, data: Dataset) -> Outside:
-        """Return which rows are beyond the measured joint ranges, where no measurement checked the model.
-
-        >>> import rpim_opt as ro
-        >>> instance = ro.load("position")
-        >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1.0)
-        >>> result.outside(instance.validation).rows
-        ()
-        """
-        return outside(self.ranges, data)
+        """Return which rows are beyond the measured joint ranges, where no measurement checked the model."""
+        return diagnosis.outside(self.ranges, data)
 
     @cached_property
     def ranges(self) -> Mapping[str, Array]:
-        """The least and largest measured value of every joint (2, dof) [rad or m], by robot, ``""`` for the only one.
-
-        Also of the calibrations that this one carries on: what they measured checked the model, too.
-
-        >>> import rpim_opt as ro
-        >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).ranges[""].shape
-        (2, 6)
-        """
+        """The measured range of every joint (2, dof) [rad or m], by robot, that of earlier calibrations included."""
         earlier = [(robot, np.array(r)) for each in self.record.earlier for robot, r in each.ranges.items()]
-        return widest([*measured_ranges(self.problem).items(), *earlier])
+        return diagnosis.widest([*diagnosis.measured_ranges(self.problem).items(), *earlier])
 
     def _at(
         self,
@@ -375,13 +315,7 @@ class Outcome:
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
-        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("cable").problem, ro.tikhonov, weight=1.0)
-        >>> result.measured_positions()[0].round(2)  # [m]
-        array([0.41, 0.35, 1.53])
-        """
+        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
         source = self.problem
         if data is not None:
             source = source.on(data)
@@ -424,10 +358,10 @@ class Outcome:
         return source.errors(self.x, dimension)
 
     def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
-        """Return the error of every row before calibration, (N,) [m]; arguments as for `errors`.
+        """Return the error of every row with the nominal robot, (N,) [m]; arguments as for `errors`.
 
-        The robot is as its drawing says. Frames (base, reflectors, anchors, ...) that the calibration identifies
-        are fitted to the identification data first: before that they say nothing about the robot.
+        Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
+        first: before that they say nothing about the robot.
         """
         source, x = self._nominal
         if data is not None:
@@ -441,15 +375,7 @@ class Outcome:
 
     @cached_property
     def stated(self) -> Source:
-        """The problem as it was stated: without what was learned of scales, noise and families.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> result = ro.calibrate(problem)
-        >>> scales = [p.parameters.free.scale for p in (problem, result.stated, result.problem)]
-        >>> bool((scales[0] == scales[1]).all()), bool((scales[0] == scales[2]).all())
-        (True, False)
-        """
+        """The problem as it was stated: without estimated scales, noise and model extensions."""
         learned = self.learned
         if learned is None:
             return self.problem
@@ -474,32 +400,43 @@ class Outcome:
 
     @property
     def squared_loss(self) -> bool:
-        """Whether the loss that was asked for is a square; triangles may have stood for another one."""
+        """Whether the loss that was asked for is a square; QR factors may have stood for another one."""
         return self.program.formulation is self.formulation and self.program.loss_form is not None
 
     @property
     def linear_penalty(self) -> bool:
-        """Whether the penalty is a quadratic, or there is none: the estimate is then linear in the data."""
+        """Whether the penalty is quadratic, or there is none: the estimate is then linear in the data."""
         return self.program.linear_penalty
 
     @cached_property
-    def linear(self) -> LinearModel:
-        """The last linearization, of the rows that a robust loss trusts (`Program.trusted`).
-
-        >>> import rpim_opt as ro
-        >>> ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3).linear.A.shape
-        (27, 26)
-        """
+    def _squares(self) -> tuple[LinearModel, float]:
+        """The equations whose squares the fit amounts to, and the weight that the loss gives to them."""
         if self.kept is not None and self.kept.linear is not None:
-            return self.kept.linear
-        return diagnosis.trusted(self.problem, self.program, self._trust, self.x)
+            return self.kept.linear, self.kept.factor
+        program = self.program
+        source = in_parts(self.problem)
+        if source.keeps_rows or program.formulation is self.formulation:
+            trust = program.trust(self.z)
+        else:
+            trust = trusted_rows(source, self.x, self.formulation)
+        if trust is None:
+            form = program.loss_form
+            return program.squared, 1.0 if form is None else form.size
+        if source.keeps_rows:
+            return trust(program.model, self.z)[0], trust.factor
+        return source.linearize(self.x, trust), trust.factor
 
-    @cached_property
+    @property
+    def linear(self) -> LinearModel:
+        """The last linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
+        return self._squares[0]
+
+    @property
     def equations(self) -> int:
-        """How many equations the fit rests on: all m, with a robust loss those that it trusts."""
+        """How many equations the fit rests on: all m, with a robust loss those that it keeps."""
         return self.linear.equations
 
-    @cached_property
+    @property
     def degrees_of_freedom(self) -> float:
         """Degrees of freedom of the fit, sum s_i^2 / (s_i^2 + weight) with the singular values s_i of `linear`.
 
@@ -512,79 +449,56 @@ class Outcome:
 
     @cached_property
     def spread(self) -> Spread:
-        """What the uncertainty rests on: the equations that the fit trusts, and its penalty.
+        """What the uncertainty rests on: the equations that the fit keeps, and its penalty.
 
         Raises
         ------
         InputError
-            For a penalty that is no squared norm (it stands for no normal prior), or a loss that no squared one stands
-            for.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> spread = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).spread
-        >>> spread.noise.shape, round(spread.noise_variance, 2)
-        ((34, 34), 1.04)
+            For a penalty that is no squared norm, or a loss that no squared one stands for.
         """
         if not self.linear_penalty:
             found = f"formulation '{self.formulation.name}'"
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
-        linear = self.linear
+        linear, factor = self._squares
         form = ridge(linear, self.program.penalty_form)
         moves = None if self.kept is not None else self.program.tangent(self.z, self.penalty_weight)
         if moves is not None:  # conditional on the active constraints
             form = ridge_within(linear, self.program.penalty_form, moves, self.z)
-        if self.learned is None:
-            return Spread(linear, form, self.penalty_weight, self.z, self._factor)
-        return Spread(linear, form, self.penalty_weight, self.z, self._factor, 1.0, self.learned.drift)
-
-    @cached_property
-    def declared_squares(self) -> float:
-        """Sum of the squared residuals of the rows that the fit trusts, in units of the instrument's declared noise."""
-        if self.problem.scatter is None:
-            return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self._factor
-        bare = self.problem.scattered(None)
-        return float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
+        level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
+        return Spread(linear, form, self.penalty_weight, self.z, factor, level, drift)
 
     @property
     def noise_level(self) -> float:
-        """The noise's variance over the declared one, where it is larger than chance would have it, and otherwise 1."""
+        """The noise's variance over the stated one, where it is larger than chance would have it, and otherwise 1."""
         if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
             return 1.0
         return max(self.noise_variance, 1.0)
 
     def noise_test(self) -> NoiseTest:
-        """Compare the scatter of the residuals with the instrument's noise as declared.
+        """Compare the residuals with the instrument's stated noise.
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
         'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
-        spare = self.equations - self.degrees_of_freedom
-        return noise_test(self.declared_squares, spare, self.problem.scatter is not None)
+        linear, factor = self._squares
+        if self.problem.scatter is None:
+            squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / factor
+        else:
+            bare = self.problem.scattered(None)
+            squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
+        return noise_test(squares, self.equations - self.degrees_of_freedom, self.problem.scatter is not None)
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the noise: learned with it, or what equations are left over, m - sum f."""
+        """Degrees of freedom of the noise: estimated with it, or what equations are left over, m - sum f."""
         if self.learned is not None:
             return self.learned.freedom
         return max(self.equations - self.degrees_of_freedom, 0.0)
 
-    @cached_property
-    def _factor(self) -> float:
-        """By how much a robust loss weighs the rows that it trusts, against the squared loss."""
-        if self.kept is not None:
-            return self.kept.factor
-        return diagnosis.factor(self.program, self._trust)
-
-    @cached_property
-    def _trust(self) -> Trusted | None:
-        return diagnosis.trust(self.problem, self.formulation, self.program, self.x)
-
-    @cached_property
+    @property
     def noise_variance(self) -> float:
-        """sigma^2 = RSS / (m - dof) in units of the declared variance, or 1 where no equation is left over.
+        """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -593,13 +507,13 @@ class Outcome:
         """
         return self.spread.noise_variance
 
-    @cached_property
+    @property
     def covariance(self) -> Array:
         """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S.
 
         That is the Bayesian covariance with the prior that the penalty stands for (`Uncertainty` takes it apart).
-        It holds for a squared loss, or for what a robust loss trusts, a squared penalty and inactive bounds.
-        Directions that neither data nor penalty see are infinite.
+        It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty, conditional on
+        the active constraints. Variances that neither data nor penalty decide are infinite.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -612,11 +526,10 @@ class Outcome:
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
-        """Rows that the fit distrusts, the worst first.
+        """Outlying rows, the worst first: those beyond `trust.outlying`, with the noise that the other rows show.
 
-        Those beyond `trust.outlying`, with the noise that the other rows show; after a robust loss of these those that
-        a fit without them contradicts, because it may sacrifice half of few rows to the other half. After a squared
-        loss blunders may hide behind each other: a robust loss finds them.
+        After a robust loss those of them that a fit without them contradicts, because it may sacrifice half of few rows
+        to the other half. After a squared loss outliers may hide behind each other: a robust loss finds them.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
@@ -628,13 +541,13 @@ class Outcome:
         if not found or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
             return found
         model = self.program.model
-        if len(model.b) != sum(len(part.owners) for part in problem.rows()):  # reduced to a triangle
+        if len(model.b) != sum(len(part.owners) for part in problem.rows()):  # reduced to a QR factor
             return found
         number = dict(zip(problem.labels, problem.data.configuration, strict=True))
         groups = np.array([number[flag.label] for flag in found])
         p = problem.parameters
         width = (default_widths(p) / p.scale)[p.identified]
-        weight = self.penalty_weight / self._factor
+        weight = self.penalty_weight / self._squares[1]
         sure = contradicted(model, self.program.penalty_form, weight, width, groups)
         return tuple(flag for flag, certain in zip(found, sure, strict=True) if certain)
 
@@ -642,12 +555,7 @@ class Outcome:
     def kept_together(self) -> tuple[str, ...]:
         """Labels of flagged rows that err together with their neighbours in joint space or in time.
 
-        They are no blunders of their own: the model lacks something there, or the set-up moved. `without_flagged` keeps
-        them.
-
-        >>> import rpim_opt as ro
-        >>> ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0).kept_together
-        ()
+        They are no outliers: the model lacks something there, or the set-up moved. `without_flagged` keeps them.
         """
         problem = self.problem
         if not self.flagged or not isinstance(problem, CalibrationProblem):
@@ -659,7 +567,7 @@ class Outcome:
 
     @property
     def doubted(self) -> list[str]:
-        """Labels of all rows that are not trusted: left out as blunders before the fit, and flagged after it."""
+        """Labels of all outliers: excluded before the fit, and flagged after it."""
         before: list[str] = []
         if self.learned is not None:
             before = [row.label for row in self.learned.left_out]
@@ -669,11 +577,6 @@ class Outcome:
         """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
 
         Rows that are `kept_together` stay: without them the robot would be extrapolated where the model fails.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
-        >>> [len(result.problem.labels) - len(result.without_flagged().problem.labels), len(result.flagged)]
-        [5, 5]
         """
         out = [flag for flag in self.flagged if flag.label not in self.kept_together]
         kept = self.stated.without({flag.label for flag in out})
@@ -683,7 +586,7 @@ class Outcome:
 
     @cached_property
     def held(self) -> tuple[Held, ...]:
-        """What the tolerances cost: the parameters that a bound holds back, the costliest first.
+        """The parameters at an active bound, the costliest first.
 
         ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong
@@ -698,7 +601,7 @@ class Outcome:
         """
         if self.kept is not None:
             return self.kept.held
-        return diagnosis.held(self.program, self.z, self.weight)
+        return diagnosis.active_bounds(self.program, self.z, self.weight)
 
     @cached_property
     def prices(self) -> tuple[Price, ...]:
@@ -715,11 +618,11 @@ class Outcome:
         """
         if self.kept is not None:
             return self.kept.prices
-        return prices(self.program, self.z, self.weight)
+        return diagnosis.prices(self.program, self.z, self.weight)
 
     @cached_property
     def held_back(self) -> tuple[str, ...]:
-        """Names of the parameters of which a bound, or a statement of a drawing, holds back; intervals ignore that."""
+        """Names of the parameters at an active bound, or of an active statement of a drawing."""
         names = [held.name for held in self.held]
         holding = {price.text for price in self.prices if price.holds}
         for constraint in self.formulation.constraints:

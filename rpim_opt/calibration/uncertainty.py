@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -14,26 +13,25 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.intervals import Interval, NoiseTest, coverage_factor, coverage_factors
-from rpim_opt.calibration.result import Calibration, Prediction
+from rpim_opt.calibration.covariance import Interval, NoiseTest, coverage_factor
+from rpim_opt.calibration.outcome import Outcome, Prediction
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(Tabled):
     """The uncertainty of a calibration, by the law of propagation (JCGM 100) on its last linearization.
 
-    With A = U diag(s) V' whitened and scaled, weight w, filter f = s^2 / (s^2 + w) and the noise level sigma::
+    With A = U diag(s) V' whitened and scaled, weight w and the noise level sigma::
 
         noise      sigma^2 S V diag(s^2 / (s^2 + w)^2) V' S          what other data of this kind would change
         prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            what the penalty holds back: its bias, in the mean
         total      noise + prior = sigma^2 S (A'A + w)^-1 S          if deviations are as large as the penalty expects
 
-    Where sizes were learned, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), and by how much
-    Student's tails are wider than the normals that stand for them (`Learned.drift`).
+    Where hyperparameters were estimated, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), and
+    by how much Student's tails are wider than the normals that stand for them (`Learned.drift`).
 
-    It holds for a squared loss, or for what a robust loss trusts, and a squared penalty. A parameter at an active
-    bound is not known better for it: such parameters are listed in ``at_bound``, and their intervals are those
-    without the bound. Other penalties (lasso) have no such covariance and are refused.
+    It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty. Parameters at an
+    active bound are listed in ``at_bound``: their intervals do not know of it. Other penalties (lasso) are refused.
 
     Parameters
     ----------
@@ -61,39 +59,8 @@ class Uncertainty(Tabled):
     ((34, 2), (), 1.02)
     """
 
-    result: Calibration
+    result: Outcome
     confidence: float = 0.95
-
-    def _short(self) -> str:
-        return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
-
-    def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""
-        free = self.result.problem.parameters.free
-        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
-        values = free.values(self.result.x)
-        rows: list[dict[str, Any]] = []
-        for i, name in enumerate(free.names):
-            unit, si = display(free.dimensions[i])
-            rows.append(
-                {
-                    "parameter": name,
-                    "unit": unit,
-                    "value": float(values[i] / si),
-                    "u_noise": float(noise[i] / si),
-                    "u_prior": float(prior[i] / si),
-                    "u": float(both[i] / si),
-                    "U": float(self.coverage_factor * both[i] / si),
-                    "held_back": name in self.at_bound,
-                }
-            )
-        return rows
-
-    def _notes(self) -> list[str]:
-        lines = [self.noise_test().verdict, f"k = {self.coverage_factor:.2f}; {self.freedom:.1f} degrees of freedom."]
-        if self.at_bound:
-            lines.append("What is held back by a bound or a statement has an interval that does not know of it.")
-        return lines
 
     def __post_init__(self) -> None:
         if not 0 < self.confidence < 1:
@@ -104,18 +71,18 @@ class Uncertainty(Tabled):
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the noise: m - sum f, or what was learned with it."""
+        """Degrees of freedom of the noise: m - sum f, or what was estimated with it."""
         return self.result.freedom
 
-    @cached_property
+    @property
     def noise_level(self) -> float:
-        """Sigma = sqrt(RSS / (m - dof)), in units of the declared noise; 1 where no equation is left over."""
+        """Sigma = sqrt(RSS / (m - dof)), in units of the stated noise; 1 where no equation is left over."""
         return float(np.sqrt(self.result.noise_variance))
 
     @property
     def coverage_factor(self) -> float:
         """Quantile k of Student's t at (1 + confidence) / 2, with `freedom` degrees of freedom, at least one."""
-        return coverage_factor(self.freedom, self.confidence)
+        return float(coverage_factor(self.freedom, self.confidence))
 
     @property
     def noise(self) -> Array:
@@ -124,7 +91,7 @@ class Uncertainty(Tabled):
 
     @property
     def prior(self) -> Array:
-        """Mean square (n, n) [SI] of what the penalty holds back; directions that the data do not see are here."""
+        """Mean square (n, n) [SI] of what the penalty holds back, in unidentifiable directions above all."""
         return self.result.spread.prior
 
     @property
@@ -132,9 +99,9 @@ class Uncertainty(Tabled):
         """Covariance (n, n) [SI]: noise and prior together."""
         return self.result.covariance
 
-    @cached_property
+    @property
     def at_bound(self) -> tuple[str, ...]:
-        """Parameters that a bound or a statement holds back: their intervals do not know of it."""
+        """Parameters at an active bound, or of an active statement: their intervals do not know of it."""
         return self.result.held_back
 
     def intervals(self) -> Array:
@@ -143,7 +110,7 @@ class Uncertainty(Tabled):
         return np.column_stack([self.result.x - half, self.result.x + half])
 
     def noise_test(self) -> NoiseTest:
-        """Compare the observed noise with the declared: RSS against chi^2 with m - dof degrees of freedom.
+        """Compare the residuals with the stated noise: RSS against chi^2 with m - dof degrees of freedom.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -162,21 +129,10 @@ class Uncertainty(Tabled):
         columns: Mapping[str, Array] = MappingProxyType({}),
         robot: str = "",
     ) -> Prediction:
-        """Return what `Calibration.predict` does, with the confidence's coverage factor.
+        """Return what `Calibration.predict` does, with the confidence's coverage factor; arguments as for it.
 
-        It is larger for readings of a session that is not known, where few sessions told how far they lie apart.
+        The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
 
-        Parameters
-        ----------
-        q
-            (N, dof) joint values of the controller [rad or m].
-        marker, torque, payload, columns, robot
-            As for `Calibration.forward`; torques (N, dof) [Nm].
-        of
-            ``"mean"``, ``"reached"`` or ``"reading"``, as for `Calibration.predict`.
-
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -187,7 +143,7 @@ class Uncertainty(Tabled):
         found = self.result.predict(q, marker, torque, payload, of, columns, robot)
         factor: float | Array = self.coverage_factor
         if isinstance(found.freedom, np.ndarray):
-            factor = coverage_factors(found.freedom, self.confidence)[:, None]
+            factor = coverage_factor(found.freedom, self.confidence)[:, None]
         return found._replace(coverage_factor=factor)
 
     def budget(self) -> str:
@@ -203,32 +159,48 @@ class Uncertainty(Tabled):
         """
         rows: list[list[str]] = []
         for row in self._frame_rows():
-            name = row["parameter"]
-            if row["held_back"]:
-                name += " *"
+            name = row["parameter"] + (" *" if row["held_back"] else "")
             rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
-        head = [
-            "parameter",
-            "unit",
-            "value",
-            "u, noise",
-            "u, prior",
-            "u, combined",
-            f"U, k = {self.coverage_factor:.2f}",
-        ]
+        expanded = f"U, k = {self.coverage_factor:.2f}"
+        head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
         lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.freedom:.1f}."]
-        return "\n".join(lines + (["* held by a bound, of which the interval does not know."] if self.at_bound else []))
+        if self.at_bound:
+            lines.append("* at an active bound, of which the interval does not know.")
+        return "\n".join(lines)
+
+    def _short(self) -> str:
+        return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""
+        free = self.result.problem.parameters.free
+        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
+        values = free.values(self.result.x)
+        rows: list[dict[str, Any]] = []
+        for i, name in enumerate(free.names):
+            unit, si = display(free.dimensions[i])
+            row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
+            row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
+            row |= {"U": float(self.coverage_factor * both[i] / si), "held_back": name in self.at_bound}
+            rows.append(row)
+        return rows
+
+    def _notes(self) -> list[str]:
+        lines = [self.noise_test().verdict, f"k = {self.coverage_factor:.2f}; {self.freedom:.1f} degrees of freedom."]
+        if self.at_bound:
+            lines.append("Parameters at an active bound have an interval that does not know of it.")
+        return lines
 
 
-def known_covariance(result: Calibration) -> Array | None:
+def known_covariance(result: Outcome) -> Array | None:
     """Return the covariance (n, n) [SI] of the deviations; None for a penalty or loss that has none."""
     try:
-        return Uncertainty(result).total
+        return result.covariance
     except InputError:
         return None
 
 
-def monte_carlo(result: Calibration, draws: int = 200, seed: int = 0) -> Array:
+def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     """Return deviations (draws, n) [SI] identified from data drawn anew around the fit, noise at the observed level.
 
     The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
@@ -238,10 +210,8 @@ def monte_carlo(result: Calibration, draws: int = 200, seed: int = 0) -> Array:
     ----------
     result
         The calibration.
-    draws
-        How many.
-    seed
-        Of the draws.
+    draws, seed
+        How many, and of which random numbers.
 
     Examples
     --------
@@ -253,10 +223,10 @@ def monte_carlo(result: Calibration, draws: int = 200, seed: int = 0) -> Array:
     >>> bool(np.abs(spread / stated - 1).max() < 0.2)  # 500 draws tell each to 3 %
     True
     """
-    rng, program = np.random.default_rng(seed), result.program
-    z = result.x / result.problem.parameters.free.scale
+    rng = np.random.default_rng(seed)
+    program = result.program
     level = np.sqrt(result.noise_variance)
-    fitted = program.model.A @ z
+    fitted = program.model.A @ result.z
     found = []
     for _ in range(draws):
         b = fitted + level * rng.normal(size=len(fitted))

@@ -17,7 +17,7 @@ from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.basics.text import Tabled, shortened
 from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.calibration import asking
+from rpim_opt.calibration import identify
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import Box, Constraint, Parsed
 from rpim_opt.convex.formulation import Formulation
@@ -150,7 +150,7 @@ class Instance(Tabled):
         """
         asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
         asked |= {"model": self.model, "noise": self.noise}
-        return replace(asking.calibrate(self.problem, **{**asked, **changes}), record=self.record)
+        return replace(identify.calibrate(self.problem, **{**asked, **changes}), record=self.record)
 
     @property
     def record(self) -> Record:
@@ -257,7 +257,7 @@ def _also_of_folders(
     return calibrate
 
 
-calibrate = _also_of_folders(asking.calibrate)
+calibrate = _also_of_folders(identify.calibrate)
 """Identify the parameters of a problem, an `Instance`, or one that `load` finds by its name or folder.
 
 Arguments and errors as for `calibration.calibrate`; what is not stated is as the instance has it.

@@ -17,10 +17,9 @@ from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.basics.text import version_of
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import believed
-from rpim_opt.calibration.asking import calibrate, mapped_as
 from rpim_opt.calibration.certificate import Certificate
-from rpim_opt.calibration.diagnosis import Held
-from rpim_opt.calibration.prices import Price
+from rpim_opt.calibration.diagnosis import Held, Price
+from rpim_opt.calibration.identify import calibrate, mapped_as
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
 from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM

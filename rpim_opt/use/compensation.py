@@ -19,8 +19,8 @@ from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
-from rpim_opt.calibration.intervals import position_noise, scattered
-from rpim_opt.calibration.ranges import Outside
+from rpim_opt.calibration.covariance import position_noise, scattered
+from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset

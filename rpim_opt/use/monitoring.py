@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed
 from rpim_opt.calibration.causes import misread
-from rpim_opt.calibration.intervals import scattered
+from rpim_opt.calibration.covariance import scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.convex.structure import Quadratic, identity

@@ -12,7 +12,6 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
 from rpim_opt.bayes.group_weights import Grouped, members, reml_groups
-from rpim_opt.calibration.group_weights import grouped
 
 POSITION = ro.load("position")
 PROBLEM = POSITION.problem
@@ -31,7 +30,7 @@ def weights_of(result: ro.calibration.Calibration, asked: dict[str, object]) -> 
 
 def test_given_weights_are_those_of_a_weighted_penalty() -> None:
     asked = {"alpha? theta?": 4.0, "a? d?": 0.1, "base": 1e-3}
-    result = grouped(PROBLEM, ro.tikhonov, asked)
+    result = ro.calibrate(PROBLEM, ro.tikhonov, asked)
     root = np.sqrt(weights_of(result, asked))
     mine = ro.Formulation("weighted", penalty=lambda z: cp.sum_squares(cp.multiply(root, z)))
     wanted = ro.calibrate(PROBLEM, mine, weight=1.0)
@@ -47,7 +46,7 @@ def test_given_weights_are_those_of_a_weighted_penalty() -> None:
 @pytest.mark.parametrize("name", ["position", "paper_arm", "distance"])
 def test_one_group_ends_where_the_single_weight_does(name: str) -> None:
     instance = ro.load(name)
-    result = grouped(instance.problem, ro.tikhonov, {"*": ro.reml})
+    result = ro.calibrate(instance.problem, ro.tikhonov, {"*": ro.reml})
     single = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
     assert result.selection is not None
     assert np.log(result.selection.groups["*"] / single.weight) == pytest.approx(0, abs=2e-3)  # both settle at 0.1 %
@@ -56,7 +55,7 @@ def test_one_group_ends_where_the_single_weight_does(name: str) -> None:
 
 
 def test_the_weights_are_their_own_answer() -> None:
-    result = grouped(PROBLEM, ro.tikhonov, ASKED)
+    result = ro.calibrate(PROBLEM, ro.tikhonov, ASKED)
     assert result.converged
     values = weights_of(result, ASKED)
     model = PROBLEM.linearize(result.x)
@@ -73,21 +72,21 @@ def test_scales_that_are_wrong_by_kind_are_made_good() -> None:
     scale[angles] *= 30.0
     wrong = PROBLEM.with_parameters(replace(table, scale=scale))
     asked = {"alpha theta beta": ro.reml, "a d": ro.reml}
-    results = [grouped(problem, ro.tikhonov, asked) for problem in (PROBLEM, wrong)]
+    results = [ro.calibrate(problem, ro.tikhonov, asked) for problem in (PROBLEM, wrong)]
     assert results[0].x == pytest.approx(results[1].x, abs=1e-4 * np.abs(results[0].x).max())
     ratio = results[1].selection.groups["alpha theta beta"] / results[0].selection.groups["alpha theta beta"]
     assert ratio == pytest.approx(900.0, rel=0.01)
 
 
 def test_the_text_says_every_weight() -> None:
-    text = str(grouped(PROBLEM, ro.tikhonov, ASKED))
+    text = str(ro.calibrate(PROBLEM, ro.tikhonov, ASKED))
     assert "Weights alpha? theta? 1." in text
     assert ", tool 2, others 1 (reml by group: largest restricted likelihood), formulation 'Tikhonov'." in text
-    assert "given by group: as stated" in str(grouped(PROBLEM, ro.tikhonov, {"a?": 2.0}))
+    assert "given by group: as stated" in str(ro.calibrate(PROBLEM, ro.tikhonov, {"a?": 2.0}))
 
 
 def test_a_file_holds_the_weights(tmp_path: Path) -> None:
-    result = grouped(PROBLEM, ro.tikhonov, ASKED)
+    result = ro.calibrate(PROBLEM, ro.tikhonov, ASKED)
     ro.store.save_result(result, tmp_path)
     again = ro.load_result(tmp_path)
     assert again.selection.groups == result.selection.groups
@@ -99,9 +98,9 @@ def test_a_file_holds_the_weights(tmp_path: Path) -> None:
 def test_without_flagged_rows_it_is_asked_anew_and_not_weighted_twice() -> None:
     problem = ro.load("blunders").problem
     asked = {"alpha? theta?": ro.reml, "a? d?": ro.reml}
-    result = grouped(problem, ro.robust, asked)
+    result = ro.calibrate(problem, ro.robust, asked)
     clean = result.without_flagged()
-    wanted = grouped(problem.without({flag.label for flag in result.flagged}), ro.robust, asked)
+    wanted = ro.calibrate(problem.without({flag.label for flag in result.flagged}), ro.robust, asked)
     assert len(result.flagged) >= 5
     assert clean.x == pytest.approx(wanted.x, abs=1e-5 * np.abs(wanted.x).max())
     assert clean.selection.groups == pytest.approx(wanted.selection.groups, rel=1e-2)
@@ -109,7 +108,7 @@ def test_without_flagged_rows_it_is_asked_anew_and_not_weighted_twice() -> None:
 
 def test_bounds_hold_in_their_own_units() -> None:
     problem = PROBLEM.with_parameters(PROBLEM.parameters.toleranced({"length_mm": 0.3, "angle_mrad": 0.5}))
-    result = grouped(problem, ro.bounded, ASKED)
+    result = ro.calibrate(problem, ro.bounded, ASKED)
     assert result.converged
     free = problem.parameters.free
     assert (np.abs(result.x) <= free.tolerance * (1 + 1e-9)).all()
@@ -119,7 +118,7 @@ def test_bounds_hold_in_their_own_units() -> None:
 def test_a_prior_stands_beside_the_weights() -> None:
     prior = Prior(centre={"d5_mm": 0.2}, scale={"a?_mm": 0.1}) & Prior.known("a2 + a3 = nominal + 0.3 +- 0.0001 mm")
     asked = {"alpha? theta?": 2.0, "a? d?": 0.5}
-    result = grouped(PROBLEM, ro.tikhonov, asked, prior=prior)
+    result = ro.calibrate(PROBLEM, ro.tikhonov, asked, prior=prior)
     values = weights_of(result, asked)
     stated = prior.stated(PROBLEM.parameters, widened=False)
 
@@ -131,7 +130,7 @@ def test_a_prior_stands_beside_the_weights() -> None:
     assert result.x == pytest.approx(wanted.x, abs=1e-6 * np.abs(wanted.x).max())
     a2, a3 = (result.x[FREE.names.index(name)] for name in ("a2", "a3"))
     assert a2 + a3 == pytest.approx(3e-4, abs=2e-6)
-    chosen = grouped(PROBLEM, ro.tikhonov, ASKED, prior=prior)
+    chosen = ro.calibrate(PROBLEM, ro.tikhonov, ASKED, prior=prior)
     assert chosen.converged
 
 
@@ -146,12 +145,12 @@ def test_a_prior_stands_beside_the_weights() -> None:
 )
 def test_what_cannot_be_is_refused(formulation: ro.Formulation, asked: dict[str, object], says: str) -> None:
     with pytest.raises(ro.InputError) as error:
-        grouped(PROBLEM, formulation, asked)
+        ro.calibrate(PROBLEM, formulation, asked)
     assert says in str(error.value)
 
 
 def test_numbers_serve_any_penalty() -> None:
-    result = grouped(PROBLEM, ro.lasso, {"a?": 4.0})
+    result = ro.calibrate(PROBLEM, ro.lasso, {"a?": 4.0})
     wanted = ro.Formulation(
         "by hand",
         penalty=lambda z: cp.norm1(

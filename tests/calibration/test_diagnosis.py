@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.bayes.outliers import error_vectors
-from rpim_opt.calibration.diagnosis import Flag, factor, flagged
+from rpim_opt.calibration.diagnosis import Flag, flagged
 from rpim_opt.convex.trust import limits
 from tests.simulate import simulated
 
@@ -116,14 +116,14 @@ def test_a_fixed_parameter_is_not_held_by_a_tolerance() -> None:
 
 def test_the_factor_of_a_loss_is_its_weight_against_squares() -> None:
     problem, _ = simulated(noise=5e-5)
-    program = ro.calibrate(problem, ro.tikhonov, 1.0).program
-    assert factor(program, None) == 1.0
     tripled = ro.Formulation("tripled", loss=lambda r: 3 * cp.sum_squares(r), penalty=cp.sum_squares)
-    assert factor(ro.calibrate(problem, tripled, 1.0).program, None) == pytest.approx(3.0, rel=1e-9)
-    robust = ro.calibrate(problem, ro.robust, 1.0)
+    results = {each.name: ro.calibrate(problem, each, 1.0) for each in (ro.tikhonov, tripled, ro.robust)}
+    assert results["Tikhonov"].spread.factor == 1.0
+    assert results["tripled"].spread.factor == pytest.approx(3.0, rel=1e-9)
+    robust = results["Huber"]
     trust = robust.program.trust(robust.z)
     assert trust is not None
-    assert factor(robust.program, trust) == trust.factor
+    assert robust.spread.factor == trust.factor
 
 
 @pytest.mark.parametrize("name", ["mixed", "markers", "pose"])

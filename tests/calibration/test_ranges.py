@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.ranges import Outside, measured_ranges, outside
+from rpim_opt.calibration.diagnosis import Outside, measured_ranges, outside
 
 RANGES = {"": np.array([[-1.0, 0.0, 0.5], [1.0, 2.0, 0.5]])}
 

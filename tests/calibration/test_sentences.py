@@ -14,8 +14,8 @@ from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, _wide
 from rpim_opt.calibration.certificate import Certificate, certified
+from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.held_out_rows import Checked
-from rpim_opt.calibration.intervals import checked as interval
 from rpim_opt.calibration.lack_of_fit import LackOfFit
 from rpim_opt.calibration.region import Share, share
 from rpim_opt.calibration.residuals import Alike, Effect, alike

@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 import rpim_opt as ro
 from rpim_opt.calibration import Uncertainty
-from rpim_opt.calibration.intervals import noise_test
+from rpim_opt.calibration.covariance import noise_test
 from rpim_opt.data.measurements.position import position
 from tests.simulate import simulated
 

@@ -58,7 +58,7 @@ def test_what_active_bounds_do_is_said() -> None:
     u = ro.calibration.Uncertainty(instance.calibrate())
     assert "a5" in u.at_bound
     assert "a5 *" in u.budget()
-    assert "held by a bound" in u.budget()
+    assert "at an active bound" in u.budget()
     with pytest.raises(ro.InputError, match="uncertainty: found formulation 'lasso'"):
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.lasso, 1.0))
     with pytest.raises(ro.InputError, match="confidence: found 95"):

@@ -11,9 +11,10 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import words
+from rpim_opt.calibration.at_weight import ending
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held
-from rpim_opt.calibration.loop import _message
+from rpim_opt.calibration.loop import Ended, State
 from tests.calibration.test_loop import state
 
 RESULT = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1e-3)
@@ -99,16 +100,18 @@ def test_a_weight_is_said_with_where_it_came_from() -> None:
 
 @pytest.mark.parametrize(("count", "said"), [(0, "0 passes"), (1, "1 pass"), (2, "2 passes")])
 def test_passes_are_counted(count: int, said: str) -> None:
-    evidence = Certificate(None, 0.0, 0.0, 0.0)
+    good, bad = Certificate(None, 0.0, 0.0, 0.0), Certificate(None, 0.0, 0.0, 0.5)
     before = state(history=(None,) * count, outcome="rest")
-    assert _message(before, evidence, True, 500) == f"Converged after {said}."
+
+    def said_of(at: State, evidence: Certificate = good, most: int = 500) -> str:
+        return ending(Ended(at, at.z, evidence), most)
+
+    assert said_of(before) == f"Converged after {said}."
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
-    assert _message(noted, evidence, True, 500) == f"Converged after {said}. It alternates."
-    stuck = _message(replace(before, outcome="stuck"), evidence, False, 500)
-    assert "no step lowers the nonlinear objective" in stuck
-    doubted = _message(before, Certificate(None, 0.0, 0.0, 0.5), False, 500)
-    assert "still promises 0.5 of the objective" in doubted
-    ended = _message(replace(before, outcome="", history=()), evidence, False, 7)
+    assert said_of(noted) == f"Converged after {said}. It alternates."
+    assert "no step lowers the nonlinear objective" in said_of(replace(before, outcome="stuck"))
+    assert "still promises 0.5 of the objective" in said_of(before, bad)
+    ended = said_of(replace(before, outcome="", history=()), most=7)
     assert ended == "Not converged: 7 passes were not enough; give more (max_iterations)."
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.prices import Price
+from rpim_opt.calibration.diagnosis import Price
 from rpim_opt.calibration.result import Calibration
 
 HOME = np.zeros((1, 6))

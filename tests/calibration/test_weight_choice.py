@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import loop
-from rpim_opt.calibration.choosing import PATIENCE, SETTLED, Choosing, choosing
+from rpim_opt.calibration.weight_choice import MOST_ANSWERS, SETTLED, WeightChoice, weight_choice
 
 PROGRAM: Any = SimpleNamespace(closed_form=True)
 DEAR: Any = SimpleNamespace(closed_form=False)
@@ -42,29 +42,29 @@ def ending(*answers: float) -> Callable[[Any], ro.select.Selection]:
     return mine
 
 
-def followed(*answers: float) -> Choosing:
+def followed(*answers: float) -> WeightChoice:
     """The choice after all answers about a program without a formula, or after the one that ended it."""
-    choice = choosing(ending(*answers), True).asked(DEAR)
+    choice = weight_choice(ending(*answers), True).asked(DEAR)
     for _ in answers[1:]:
         choice = choice.confirmed(DEAR)
     return choice
 
 
-def asked(count: int, *answers: float) -> Choosing:
+def asked(count: int, *answers: float) -> WeightChoice:
     """The choice after so many answers."""
-    choice = choosing(rule(*answers), True)
+    choice = weight_choice(rule(*answers), True)
     for _ in range(count):
         choice = choice.asked(PROGRAM)
     return choice
 
 
 def test_a_number_is_final_and_asks_nobody() -> None:
-    choice = choosing(3, True)
+    choice = weight_choice(3, True)
     assert (choice.weight, choice.settled, choice.final, choice.note) == (3.0, True, True, "")
     assert choice.asked(PROGRAM) is choice
     assert choice.confirmed(PROGRAM) is choice
-    assert choosing(np.float64(0.5), True).weight == 0.5
-    assert choosing(0, True).weight == 0.0
+    assert weight_choice(np.float64(0.5), True).weight == 0.5
+    assert weight_choice(0, True).weight == 0.0
 
 
 def test_a_rule_is_asked_until_it_settles() -> None:
@@ -79,7 +79,7 @@ def test_a_rule_is_asked_until_it_settles() -> None:
 
 
 def test_of_a_program_without_formula_every_answer_is_followed_to_its_end() -> None:
-    first = choosing(rule(2.0, 5.0, 5.0), True).asked(DEAR)
+    first = weight_choice(rule(2.0, 5.0, 5.0), True).asked(DEAR)
     assert (first.weight, first.settled, first.final) == (2.0, True, False)
     assert first.asked(DEAR) is first
     second = first.confirmed(DEAR)
@@ -89,14 +89,14 @@ def test_of_a_program_without_formula_every_answer_is_followed_to_its_end() -> N
 
 
 def test_without_a_penalty_a_rule_is_not_asked() -> None:
-    choice = choosing(rule(), False)
+    choice = weight_choice(rule(), False)
     assert (choice.settled, choice.final, choice.weight) == (True, True, 0.0)
     assert choice.asked(PROGRAM) is choice
 
 
 def test_a_ready_rule_goes_by_its_name() -> None:
-    assert choosing("reml", True).rule is ro.reml
-    assert not choosing("reml", True).settled
+    assert weight_choice("reml", True).rule is ro.reml
+    assert not weight_choice("reml", True).settled
 
 
 def test_a_weight_settles_when_steps_are_short() -> None:
@@ -115,11 +115,11 @@ def test_without_a_formula_answers_are_the_same_within_what_a_search_tells_apart
 
 
 def test_what_a_search_tells_apart_is_no_more_than_its_weights_are_apart() -> None:
-    def near(weight: float, refined: float, ratio: float) -> Choosing:
+    def near(weight: float, refined: float, ratio: float) -> WeightChoice:
         """The choice after an answer of 2 and another one, of a grid of that ratio, refined by that factor."""
         grid = weight / refined * np.array([1 / ratio, 1.0, ratio])
         answers = [rule(2.0)(None), ro.select.Selection(weight, "mine", grid, np.ones(3), interior=True)]
-        return choosing(lambda _: answers.pop(0), True).asked(DEAR).confirmed(DEAR)
+        return weight_choice(lambda _: answers.pop(0), True).asked(DEAR).confirmed(DEAR)
 
     assert near(2.0 * 1.029, 1.0, 1.03).final
     assert not near(2.0 * 1.031, 1.0, 1.03).final
@@ -221,18 +221,18 @@ def test_an_alternation_counts_from_the_last_answers() -> None:
 
 
 def test_a_rule_that_never_comes_to_rest_is_ended() -> None:
-    answers = [2.0**k for k in range(PATIENCE)]
-    assert not asked(PATIENCE - 1, *answers).final
-    end = asked(PATIENCE, *answers)
+    answers = [2.0**k for k in range(MOST_ANSWERS)]
+    assert not asked(MOST_ANSWERS - 1, *answers).final
+    end = asked(MOST_ANSWERS, *answers)
     assert end.final
     assert end.weight == pytest.approx(np.sqrt(answers[-2] * answers[-1]), rel=1e-12)
-    assert PATIENCE == 10
+    assert MOST_ANSWERS == 10
 
 
 @pytest.mark.parametrize("weight", [True, None, [1.0], -1.0, float("inf"), float("nan"), "lcurve"])
 def test_what_is_no_weight_is_refused(weight: Any) -> None:
     with pytest.raises(ro.InputError, match=r"^weight: found "):
-        choosing(weight, True)
+        weight_choice(weight, True)
 
 
 @pytest.mark.parametrize("answer", [-1e-9, float("inf"), float("nan")])
@@ -247,18 +247,18 @@ def test_a_weight_of_zero_is_an_answer() -> None:
 
 def test_of_a_robust_loss_a_rule_is_first_asked_where_weight_one_leads() -> None:
     seen: Any = SimpleNamespace(closed_form=False)
-    robust = replace(choosing(rule(5.0), True), robust=True)
+    robust = replace(weight_choice(rule(5.0), True), robust=True)
     begun = robust.begun()
     assert (begun.weight, begun.settled, begun.final, begun.answers) == (1.0, True, False, ())
     first = begun.confirmed(seen)
     assert (first.weight, first.final, first.answers) == (5.0, False, (5.0,))
-    same = replace(choosing(rule(1.0), True), robust=True).begun().confirmed(seen)  # its own answer, to be shown
+    same = replace(weight_choice(rule(1.0), True), robust=True).begun().confirmed(seen)  # its own answer, to be shown
     assert (same.weight, same.final) == (1.0, False)
     assert same.selection is not None
 
 
 def test_other_programs_are_asked_at_once() -> None:
-    for choice in (choosing(rule(5.0), True), choosing("reml", True), choosing(3.0, True)):
+    for choice in (weight_choice(rule(5.0), True), weight_choice("reml", True), weight_choice(3.0, True)):
         assert choice.begun() is choice
 
 

@@ -1,4 +1,4 @@
-"""The weight while the loop goes on: a number, or what a selector answers until it answers the same."""
+"""The weight while the loop goes on: a number, or what a rule answers until it answers the same."""
 
 from __future__ import annotations
 
@@ -14,45 +14,28 @@ from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
 from rpim_opt.convex.select import Selection, Selector
 
 SETTLED = 1e-3
-"""The weight is chosen anew while a step is longer than this part of the solution, then stays."""
+"""The weight is chosen anew while a step is longer than this share of the solution, then stays."""
 SAME = 0.01
 """Two weights are the same when their logarithms differ by no more."""
 NEUTRAL = 1.0
-"""The weight that takes declared noise and scales at their word."""
-TOLD = float(np.log(SAME_WEIGHT))
-"""By how much logarithms of weights differ that searches tell apart."""
+"""The weight that takes stated noise and scales at their word."""
+SAME_SEARCH = float(np.log(SAME_WEIGHT))
+"""The same of weights from a search."""
 SAME_ROBUST = 1e-6
-"""The same of a robust loss, whose fit does not depend on how the measurements are stored: nor does its weight."""
-RUNS = 0.1
-"""A lower end of weights below this part of the last one has run away."""
-PATIENCE = 10
-"""How many different answers a selector may give in turn."""
+"""The same of a robust loss, whose weight does not depend on how the measurements are stored."""
+RUNAWAY = 0.1
+"""A lower end of weights below this share of the last one has run away."""
+MOST_ANSWERS = 10
+"""How many different answers a rule may give in turn."""
 
 
 @dataclass(frozen=True, eq=False)
-class Choosing:
-    """The weight of a pass, and what is known of its choice.
+class WeightChoice:
+    """The weight of an iteration, and what is known of its choice.
 
-    Parameters
-    ----------
-    rule
-        The selector; None for a number.
-    weight
-        Now.
-    selection
-        The selector's last answer.
-    answers
-        All its answers, in turn.
-    inside
-        The last of them that was inside the weights that it tried.
-    settled
-        Whether the weight stays while the loop comes to rest.
-    final
-        Whether it stays for good: a number, an answer that was confirmed, or one that ended a quarrel.
-    note
-        What a reader must know of it.
-    robust
-        Whether the loss is a sum over rows, but no square.
+    ``rule`` is None for a number; ``answers`` are all of its answers in turn, ``selection`` the last one, ``inside``
+    the last that was inside the weights that it tried. ``settled``: the weight stays while the loop comes to rest;
+    ``final``: for good. ``robust``: the loss is a sum over rows, but no square.
     """
 
     rule: Selector | None
@@ -65,8 +48,8 @@ class Choosing:
     note: str = ""
     robust: bool = False
 
-    def begun(self) -> Choosing:
-        """Return the choice where the loop begins: of a robust loss, a rule is asked where weight 1 leads.
+    def begun(self) -> WeightChoice:
+        """Return the choice at the start: of a robust loss, a rule is asked where weight 1 leads.
 
         At nominal its answer would be about outliers that no fit has shown yet.
         """
@@ -76,11 +59,11 @@ class Choosing:
 
     @property
     def waiting(self) -> bool:
-        """Whether a selector is to be asked where the weight that the loop began with leads."""
+        """Whether a rule is to be asked where the weight that the loop began with leads."""
         return self.settled and not self.final and not self.answers
 
-    def asked(self, program: Program) -> Choosing:
-        """Return what the selector makes of a program, unless the weight is settled."""
+    def asked(self, program: Program) -> WeightChoice:
+        """Return what the rule makes of a program, unless the weight is settled."""
         if self.settled or self.rule is None:
             return self
         with phase("selection"):
@@ -88,10 +71,10 @@ class Choosing:
         if not isinstance(selection, Selection):
             name = getattr(self.rule, "__name__", "selector")
             raise InputError(f"selector {name}", f"a {type(selection).__name__}", "a Selection with a weight")
-        if not (np.isfinite(selection.weight) and selection.weight >= 0):
-            raise InputError(f"selector {selection.name}", f"weight {selection.weight}", "a number, zero or more")
-        answers = (*self.answers, float(selection.weight))
-        chosen = replace(self, weight=float(selection.weight), selection=selection, answers=answers)
+        weight = float(selection.weight)
+        if not (np.isfinite(weight) and weight >= 0):
+            raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")
+        chosen = replace(self, weight=weight, selection=selection, answers=(*self.answers, weight))
         if selection.interior:
             chosen = replace(chosen, inside=selection)
         if program.closed_form:
@@ -102,43 +85,43 @@ class Choosing:
         # whose paths are dear: the next answer is asked for where this one leads
         return replace(chosen, settled=True)._checked()
 
-    def after(self, step: float) -> Choosing:
+    def after(self, step: float) -> WeightChoice:
         """Return the choice after a step of that length, relative to the solution."""
         if self.settled or step > SETTLED:
             return self
         return replace(self, settled=True)
 
-    def confirmed(self, program: Program) -> Choosing:
-        """Return the choice after the selector was asked about the program at the end: final, or another weight."""
+    def confirmed(self, program: Program) -> WeightChoice:
+        """Return the choice after the rule was asked about the program at the end: final, or another weight."""
         if self.final:
             return self
         again = replace(self, settled=False).asked(program)
-        apart = SAME_ROBUST if self.robust and program.closed_form else _told_apart(again.selection)
+        apart = SAME_ROBUST if self.robust and program.closed_form else _resolution(again.selection)
         if self.answers and _same(again.weight, self.weight, apart):
             return replace(self, settled=True, final=True, note=again.note)
         return again
 
-    def _checked(self) -> Choosing:
-        """Settle a rule that goes round in circles, or never comes to rest, on the safer of its answers."""
+    def _checked(self) -> WeightChoice:
+        """Settle a rule that alternates, or never comes to rest, on the safer of its answers."""
         turns = [self.answers[0]]
         turns += [b for a, b in zip(self.answers, self.answers[1:], strict=False) if not _same(a, b)]
         last = turns[-4:]
         if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
             return self._settled_between(last[2], last[3])
-        if self.settled and len(last) >= 3 and _same(last[-1], last[-3], TOLD):  # it would lead where it led before
+        if self.settled and len(last) >= 3 and _same(last[-1], last[-3], SAME_SEARCH):  # leads where it led before
             return self._settled_between(last[-2], last[-1])
-        if len(turns) >= PATIENCE:
+        if len(turns) >= MOST_ANSWERS:
             return self._settled_between(last[-2], last[-1])
         return self
 
-    def _ended(self, selection: Selection) -> Choosing | None:
+    def _ended(self, selection: Selection) -> WeightChoice | None:
         """End a rule that left an answer inside its weights for their lower end, and then does not stay there."""
         if self.inside is None or self.selection is None or not _lowest(self.selection):
             return None
         before = self.selection.weight
         if _same(selection.weight, self.inside.weight):
             return replace(self._settled_between(selection.weight, before), selection=selection)
-        if not _lowest(selection) or selection.weight > RUNS * before:
+        if not _lowest(selection) or selection.weight > RUNAWAY * before:
             return None
         weight = self.inside.weight
         note = (
@@ -147,12 +130,13 @@ class Choosing:
         )
         return replace(self, weight=weight, selection=self.inside, settled=True, final=True, note=note)
 
-    def _settled_between(self, one: float, other: float) -> Choosing:
+    def _settled_between(self, one: float, other: float) -> WeightChoice:
         low, high = sorted((one, other))
         name = self.selection.name if self.selection else "selector"
         weight, which = high, "the larger one, which holds back more, is used"
         if low > 0 and high <= 10 * low:
-            weight, which = float(np.sqrt(low * high)), f"their geometric mean, {np.sqrt(low * high):.2g}, is used"
+            weight = float(np.sqrt(low * high))
+            which = f"their geometric mean, {weight:.2g}, is used"
         note = f"The rule {name} alternates between {one:.2g} and {other:.2g}: {which}."
         return replace(self, weight=weight, settled=True, final=True, note=note)
 
@@ -163,7 +147,7 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
     return abs(np.log(one / other)) <= apart
 
 
-def _told_apart(selection: Selection | None) -> float:
+def _resolution(selection: Selection | None) -> float:
     """Return by how much logarithms of weights differ that a rule tells apart: an answer from a grid is no closer."""
     if selection is None or not selection.interior:
         return SAME
@@ -172,7 +156,7 @@ def _told_apart(selection: Selection | None) -> float:
     if not 0 < place < len(order) - 1 or order[place] != selection.weight or order[place - 1] <= 0:
         return SAME
     between = 0.5 * float(np.log(order[place + 1] / order[place - 1]))
-    return float(np.clip(between, SAME, TOLD))
+    return float(np.clip(between, SAME, SAME_SEARCH))
 
 
 def _lowest(selection: Selection) -> bool:
@@ -180,18 +164,12 @@ def _lowest(selection: Selection) -> bool:
     return not selection.interior and selection.weight <= np.min(selection.weights)
 
 
-def choosing(weight: float | str | Selector, penalized: bool) -> Choosing:
-    """Return how a weight is to be found: a number, a selector, or a ready selector's name.
-
-    Raises
-    ------
-    InputError
-        For anything else.
-    """
+def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
+    """Return how a weight is to be found: a number, a selector, or a ready selector's name; or refuse it."""
     if isinstance(weight, str):
         weight = selector_of(weight, also="a number, a selector, ")
     if callable(weight):
-        return Choosing(weight, settled=not penalized, final=not penalized)
+        return WeightChoice(weight, settled=not penalized, final=not penalized)
     if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):
         raise InputError("weight", f"{weight!r}", "a number, zero or more, or a selector")
-    return Choosing(None, require_weight(weight, "weight"), settled=True, final=True)
+    return WeightChoice(None, require_weight(weight, "weight"), settled=True, final=True)

@@ -1,4 +1,4 @@
-"""What a user asks: identify the parameters of a problem."""
+"""Calibration: identify the parameters of a problem at a weight, or at estimated hyperparameters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.calibration.loop import nearby, require_finite, require_start
-from rpim_opt.calibration.outcome import Iteration
+from rpim_opt.calibration.at_weight import calibrated
+from rpim_opt.calibration.loop import Iteration, Options, nearby, require_finite, require_start
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.weighed import calibrated, require_passes
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.convex.named import formulation_of, weight_of
 from rpim_opt.convex.select import Selector
@@ -33,12 +32,9 @@ NOISE = {
     "level": ("instrument",),
     "declared": (),
 }
-"""Parts of the noise that are learned: the robot's beside the instrument as declared, that at a level of its own, one
-level for all, or none."""
+"""Parts of the noise that are estimated, by the option's name."""
 MODELS = ("geometry", "auto")
-ROUGHLY = 1e-3
-"""Tolerance of fits between two estimates of hyperparameters: the last fit is exact."""
-ELSEWHERE = " Frames were stated far from where the data put them; their deviations count from there."
+ELSEWHERE = "Frames were stated far from where the data put them; their deviations count from there."
 
 
 @one_blas_thread
@@ -60,44 +56,43 @@ def calibrate(
 ) -> Calibration:
     """Identify the parameters of a problem.
 
-    Without a weight, sizes are learned from the data first (`Evidence` has the formulas): how large deviations are,
-    each with heavy tails, joint offsets expected three times as large, frames nearly free; and what noise there is
-    beside the instrument's. They are laid into an ordinary problem, as scales and `Scatter`, that any formulation
-    solves at weight 1.
+    Without a weight, hyperparameters are estimated from the data first, by marginal likelihood (`Evidence` has the
+    formulas): prior scales of the deviations, with heavy tails, joint offsets three times as large, frames nearly free;
+    and the robot's repeatability beside the stated measurement noise. Any formulation then solves the problem with
+    these scales and noise (`Scatter`) at weight 1.
 
-    Every pass linearizes at the current deviations, solves for the *total* deviation and takes the step; a step that
-    bends follows the curve of the residual, and where the nonlinear objective falls by less than a quarter of what the
-    convex program promises, a term of Levenberg's and Marquardt's kind shortens the next one. The loop ends when the
-    undamped program promises no decrease beyond its solver's accuracy, or its step is shorter than
-    ``tolerance * (1 + ||z||)``. The result has converged if a `Certificate` computed anew agrees: then it is a
-    stationary point of the nonlinear problem.
+    Every iteration linearizes at the current deviations and solves for the *total* deviation; a curved step follows the
+    curve of the residual (geodesic acceleration), and where the nonlinear objective falls by less than a quarter of
+    what the convex program promises, Levenberg-Marquardt damping shortens the next one. The loop ends when the undamped
+    program promises no decrease beyond its solver's accuracy, or its step is shorter than ``tolerance * (1 + ||z||)``.
+    The result has converged if a `Certificate` computed anew agrees: then it is a stationary point of the nonlinear
+    problem.
 
     Parameters
     ----------
     problem
-        What was measured, and what is to be identified. ``ro.calibrate`` takes an instance of `load` as well, or the
+        The measurements, and the parameters to identify. ``ro.calibrate`` takes an instance of `load` as well, or the
         name or folder that it loads: what is not stated here is then as its file has it.
     formulation
-        The convex program of a pass, or the name of a ready one (``"robust"``); its functions are asked now.
+        Loss, penalty and constraints, or the name of a ready one (``"robust"``); its functions are called anew.
     weight
-        None or ``"learned"``: sizes are learned. A number, or a selector (or its name) over the stated scales, which
-        sees identification data only; it is asked anew until the steps become small, then the weight stays, and one
-        that takes turns between weights is answered, with a sentence. Several weights by patterns, kinds or links of
-        parameters: ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
+        None or ``"learned"``: hyperparameters are estimated. A number, or a selection rule (or its name) over the
+        stated scales, which sees identification data only; it is asked anew until the steps become small, then the
+        weight stays. Several weights by patterns, kinds or links of parameters:
+        ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
     prior
         Of the deviations, beyond the scales of the parameters.
     model
-        ``"geometry"``, or ``"auto"``: families of parameters that geometry lacks (compliance under gravity,
-        eccentric joints, ...) are added where the evidence wants them.
+        ``"geometry"``, or ``"auto"``: model extensions (compliance under gravity, gear eccentricity, ...) are added
+        where the evidence supports them.
     noise
-        What is learned of it: ``"robot"``, the robot's scatter beside the instrument's noise as declared; ``"free"``,
-        that of the instrument too; ``"level"``, one factor on what was declared; ``"declared"``, nothing.
+        What is estimated of it: ``"robot"``, the robot's repeatability beside the stated measurement noise; ``"free"``,
+        the measurement noise too; ``"level"``, one factor on the stated noise; ``"declared"``, nothing.
     start
         (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
         nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from
-        where the data put them count from there (`frames.relocated`). The answer does not depend on
-        a given start, as long as the loop converges: the deviations count from nominal all the same, angles within
-        half a turn.
+        where the data put them count from there (`frames.relocated`). The answer does not depend on a given start, as
+        long as the loop converges.
     max_iterations, tolerance
         When to stop: linearizations, and length of a step. A calibration that did not converge says so in ``converged``
         and ``message``.
@@ -127,22 +122,25 @@ def calibrate(
     """
     formulation = formulation_of(formulation)
     weight = weight_of(weight)
-    how = {
-        "max_iterations": max_iterations,
-        "tolerance": tolerance,
-        "progress": _logged(progress),
-        "solver": solver,
-        "settings": settings,
-        "verbose": verbose,
-    }
+    options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     kinds = _noise(noise, model)
     if isinstance(weight, Mapping):
         from rpim_opt.calibration.group_weights import grouped
 
-        return grouped(problem, formulation, weight, prior=prior, start=start, **how)
-    given = {**how, "prior": prior, "model": model, "noise": noise, "progress": None}
-    asked = partial(calibrate, formulation=formulation, weight=weight, **given)
-    require_passes(max_iterations)
+        return grouped(problem, formulation, weight, prior=prior, start=start, options=options)
+    asked = partial(
+        calibrate,
+        formulation=formulation,
+        weight=weight,
+        prior=prior,
+        model=model,
+        noise=noise,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+        solver=solver,
+        settings=settings,
+        verbose=verbose,
+    )
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
     mapping: JointMapping | None = None
@@ -156,24 +154,21 @@ def calibrate(
     problem = elsewhere or problem
     if weight is None and formulation.penalty is None:
         weight = 0.0
-    believed = prior or Prior()
+    estimator = Estimator(prior or Prior(), kinds, nearby)
     if weight is None:
-        found = estimate(problem, Estimator(believed, kinds, _refit), model, start)
-        formulation = believed.penalized(formulation, found.stated)
-        result = calibrated(found.problem, formulation, 1.0, start=found.x, **how)
+        found = estimate(problem, estimator, model, start)
+        formulation = estimator.prior.penalized(formulation, found.stated)
+        result = calibrated(found.problem, formulation, 1.0, start=found.x, options=options)
         result = replace(result, learned=found.learned)
     else:
         if model == "auto":
-            found = estimate(problem, Estimator(believed, kinds, _refit), model, start)
-            problem = with_extensions(problem, found)
+            problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
             formulation = prior.penalized(formulation, prior.stated(problem.parameters, widened=False))
-        result = calibrated(problem, formulation, weight, start=start, **how)
-    message = result.message
-    if elsewhere is not None:
-        message += ELSEWHERE
-    if mapping is not None:
-        message += f" {mapping.sentence}"
+        result = calibrated(problem, formulation, weight, start=start, options=options)
+    message = " ".join(
+        filter(None, [result.message, ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""])
+    )
     LOGGER.info(message)
     return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
 
@@ -197,19 +192,8 @@ def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration
     return report
 
 
-def _refit(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:
-    """Return deviations (n,) [SI] near a minimum at weight 1: what hyperparameters need between two linearizations."""
-    return nearby(problem, formulation, 1.0, start, ROUGHLY, steps)
-
-
 def _noise(noise: str, model: str) -> tuple[str, ...]:
-    """Return which parts of the noise are learned.
-
-    Raises
-    ------
-    InputError
-        For an unknown word.
-    """
+    """Return which parts of the noise are estimated."""
     if model not in MODELS:
         raise InputError("model", f"'{model}'", choices(model, MODELS))
     if noise not in NOISE:

@@ -1,0 +1,205 @@
+"""Covariance of deviations and of positions, three intervals of a position, and the test of the measurement noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy.special import chdtrc, stdtrit
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.several import unknown_sessions
+from rpim_opt.problem.source import Source
+
+Interval = Literal["mean", "reached", "reading"]
+UNDECIDED = 1e-9
+"""A position depends on an undecided direction where it moves by more than this share of what it moves by in all."""
+UNLIKELY = 0.01
+"""Probability below which the noise is said to be another than stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """The uncertainty of a squared fit with a squared penalty, noise and prior apart (`Uncertainty` has the formulas).
+
+    Parameters
+    ----------
+    linear, form, weight
+        The equations that the fit rests on, their closed form with the penalty, and its weight.
+    z
+        (n,) the solution in units of the scales.
+    factor
+        The weight that a robust loss gives to the equations, against squared residuals in sigmas.
+    level
+        The noise's variance in units of the equations', where it was estimated with the scatter; None: from residuals.
+    drift
+        (n, k) what estimated hyperparameters and heavy tails add: D with D D' a covariance of the deviations [SI].
+    """
+
+    linear: LinearModel
+    form: Ridge
+    weight: float
+    z: Array
+    factor: float
+    level: float | None = None
+    drift: Array | None = None
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Degrees of freedom of the fit: unpenalized directions, and sum s^2 / (s^2 + weight) over the others."""
+        return self.form.degrees_of_freedom(self.weight)
+
+    @cached_property
+    def noise_variance(self) -> float:
+        """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over."""
+        if self.level is not None:
+            return self.level
+        spare = self.linear.equations - self.degrees_of_freedom
+        if spare <= 1e-6:
+            return 1.0
+        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / spare / self.factor
+
+    def _in_si(self, C: Array) -> Array:
+        scale = self.linear.parameters.scale
+        return self.noise_variance * self.factor * C * np.outer(scale, scale)
+
+    @cached_property
+    def noise(self) -> Array:
+        """Covariance (n, n) [SI] from the noise alone."""
+        return self._in_si(self.form.noise(self.weight))
+
+    @cached_property
+    def prior(self) -> Array:
+        """Mean square (n, n) [SI] of what the penalty holds back, in unidentifiable directions above all."""
+        found = self._in_si(self.form.prior(self.weight))
+        if self.drift is not None:
+            found = found + self.drift @ self.drift.T
+        return found
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (n, n) [SI]; infinite variances where something moves that neither data nor penalty decide."""
+        C = self.noise + self.prior
+        open_ended = np.sum(self.form.undecided(self.weight) ** 2, axis=1) > 1e-12
+        C[open_ended, open_ended] = np.inf
+        return C
+
+    def of_positions(self, J: Array) -> Array:
+        """Return the covariances (N, 3, 3) [m^2] of positions with slopes J (N, 3, n) by the deviations [SI].
+
+        Variances are infinite where an undecided direction moves the position; where none does they are finite, even
+        if no parameter alone is known.
+        """
+        found = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
+        slopes = J * self.linear.parameters.scale
+        moved = np.linalg.norm(slopes @ self.form.undecided(self.weight), axis=2)
+        size = np.linalg.norm(slopes, axis=(1, 2))
+        for i, axis in zip(*np.nonzero(moved > UNDECIDED * size[:, None]), strict=True):
+            found[i, axis, axis] = np.inf
+        return found
+
+
+# --- noise of readings ------------------------------------------------------------------------------------------------
+
+
+class Scattered(NamedTuple):
+    """What adds to the covariance of a row's model, block by block (N, k, k) [SI].
+
+    ``robot`` is the robot's repeatability, ``reading`` this and the instrument's noise, with ``session``, the offset of
+    a session that the problem does not know.
+    """
+
+    robot: list[Array]
+    reading: list[Array]
+    session: list[Array]
+
+
+def scattered(problem: CalibrationProblem, level: float) -> Scattered:
+    """Return what robot and instrument add to the model of some measurements.
+
+    A problem whose repeatability was estimated knows its parts. Of another one the robot's is what the residuals show
+    beyond the stated noise, (level - 1) Sigma, with ``level`` the noise's variance over the stated one, at least 1.
+    """
+    session = unknown_sessions(problem)
+    if problem.scatter is not None:
+        robot = problem.covariances(reading=False)
+        reading = problem.covariances()
+    else:
+        robot = [(level - 1) * V for V in problem.covariances()]
+        reading = [level * V for V in problem.covariances()]
+    return Scattered(robot, [V + more for V, more in zip(reading, session, strict=True)], session)
+
+
+def position_noise(source: Source) -> Array:
+    """Return the median covariance (3, 3) [m^2] of a reading of a position; zero where no position was measured."""
+    for part in source.rows():
+        seen = [b.covariance[:, :3, :3] for b in part.data.blocks if b.measurement.name in ("position", "pose")]
+        if seen:
+            return np.asarray(np.median(np.concatenate(seen), axis=0), dtype=float)
+    return np.zeros((3, 3))
+
+
+def require_interval(of: str) -> None:
+    """Refuse what is no `Interval`."""
+    if of not in get_args(Interval):
+        raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
+
+
+def coverage_factor(freedom: float | Array, confidence: float) -> Array:
+    """Return the quantile k of Student's t at (1 + confidence) / 2, with at least one degree of freedom."""
+    return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + confidence) / 2), dtype=float)
+
+
+def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> Array:
+    """Return the degrees of freedom (N,) of rows' variances, at least one; fewer where a few sessions told a part.
+
+    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``freedom`` that of what no session adds,
+    ``spread`` the standard deviation of the logarithm of the session offsets' size, and covariances (N, k, k) of a row
+    and of what an unknown session adds to it.
+    """
+    freedom = max(freedom, 1.0)
+    V = np.einsum("nkk->n", whole)
+    part = np.broadcast_to(np.einsum("nkk->n", session), V.shape)
+    variance = 2 * (V - part) ** 2 / freedom + (2 * spread * part) ** 2
+    return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), freedom), 1.0)
+
+
+# --- the noise test ---------------------------------------------------------------------------------------------------
+
+
+class NoiseTest(NamedTuple):
+    """Observed over stated standard deviation, its two-sided probability under the stated noise, and a verdict."""
+
+    ratio: float
+    probability: float
+    verdict: str
+
+    @property
+    def overstated(self) -> bool:
+        """Whether residuals are so much smaller that the noise is stated too large."""
+        return self.probability < UNLIKELY and self.ratio < 1
+
+
+def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTest:
+    """Compare a sum of squared residuals in sigmas with chi^2; ``learned``: the repeatability is known beside it."""
+    if freedom < 1:
+        return NoiseTest(1.0, 1.0, "No degree of freedom is left to test the stated measurement noise.")
+    ratio = float(np.sqrt(squares / freedom))
+    upper = float(chdtrc(freedom, squares))
+    probability = 2 * min(upper, 1 - upper)
+    if probability >= UNLIKELY:
+        return NoiseTest(ratio, probability, f"Residuals agree with the stated measurement noise (ratio {ratio:.2f}).")
+    cause = "noise is larger, rows are wrong, or the model lacks an effect (backlash, elasticity)"
+    if upper >= 0.5:
+        cause = "it is stated too large"
+        if learned:
+            cause += ' (noise = "free" estimates it)'
+    elif learned:
+        cause = "the difference is the robot's repeatability"
+    return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the stated measurement noise: {cause}.")
