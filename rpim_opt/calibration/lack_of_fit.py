@@ -3,47 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
+from scipy.special import fdtri
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import sampled
-from rpim_opt.bayes.model_selection import Comparison
+from rpim_opt.bayes.model_selection import FIRST, OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
+from rpim_opt.bayes.prior import family_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.residuals import (
-    FEWEST,
-    PATTERNS,
-    Alike,
-    Effect,
-    errors_alike,
-    excess,
-    narrow,
-    parts,
-    present,
-    repeated,
-    upward,
-)
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.select import reml
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.row_functions import measured_torques, repeatable
 from rpim_opt.problem.source import Source
 
 QUICK = 60
 """Configurations that are looked at before calibrating."""
-ALIKE = 4.0
+FEWEST = 6
+"""Equations that must be left over, or repeated, to judge by."""
+CORRELATED = 4.0
 """z-score from which on residuals are said to be autocorrelated."""
 ROUGH, FINE = 2.0, 0.3
 """Repeatability over measurement noise above which the robot is the limit, and below which the instrument is."""
 GROSS = 300.0
-"""Scatter over the instrument's noise above which data are wrong."""
+"""Repeatability over measurement noise above which data are wrong."""
 NEGLIGIBLE = 0.1
 """Parts below this share of a larger one are not worth a word."""
+NOTABLE = 0.5
+"""Effect of a joint's compliance over the largest, below which wrong masses explain its sign."""
+SURE = 3.0
+"""Standard deviations by which a compliance is below zero before a joint is said to bend upwards."""
+UNIDENTIFIABLE = 1e-10
+"""Relative singular value of an unidentifiable direction of the geometry."""
+RARE = 1e-3
+"""Probability that residuals exceed the scatter of repeated readings by chance."""
+PERMUTATIONS = 300
+"""Permutations that an autocorrelation is compared with."""
+FEWEST_NEIGHBOURS = 8
+"""Configurations below which there is no autocorrelation."""
 UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
-"""Unit in which what is left is said, and its size in SI."""
+"""Unit in which residuals are said, and its size in SI."""
+PATTERNS = {
+    "gravity": ("compliance?",),
+    "first harmonic": ("ecc_cos?", "ecc_sin?"),
+    "second harmonic": ("ecc2_cos?", "ecc2_sin?"),
+    "moments": ("bend*",),
+    SESSIONS: ("session_*",),
+    WARMTH: ("expansion",),
+}
+"""What `identify` says for the model extensions."""
 WHAT = {
     "gravity": "gravity",
     "first harmonic": "unevenly turning joints (eccentric encoders or gears)",
@@ -61,58 +77,57 @@ DOES = {
 }
 
 
+class Effect(NamedTuple):
+    """An extension that the model has: by how much -2 ln L falls with it, and the RMS [m] that no geometry can imitate.
+
+    The RMS is None where too few equations are left over to tell.
+    """
+
+    gain: float
+    rms: float | None
+
+
+class Autocorrelation(NamedTuple):
+    """Correlation of the residuals of nearest configurations, and its z-score among permutations."""
+
+    correlation: float
+    z: float
+
+
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
-    """What a calibration's residuals consist of.
-
-    RMS values are lengths of vectors [m], root of the mean square over the rows; [rad] or [px] where no length
-    was measured.
+    """What a calibration's residuals consist of, as RMS of vectors over the rows [m; rad or px without lengths].
 
     Parameters
     ----------
-    configurations
-        How many were looked at.
-    equations, spare
-        How many equations there are, and how many the deviations leave over; with fewer than 6 nothing else is judged.
+    configurations, equations, spare
+        How many were looked at, and how many equations the deviations leave over; with fewer than 6 nothing else is
+        judged.
     dimension
         ``"length"``, ``"angle"`` or ``"pixel"``.
     left
         RMS of the errors of the rows.
     instrument, position, joint
-        RMS of the noise's parts: the instrument's as declared (or learned), the robot's scatter in position (in
+        RMS of the noise's parts: the instrument's as stated (or estimated), the robot's repeatability in position (in
         orientation without lengths), and what comes from its joints.
     repeatable
         RMS of what `missing` would explain.
-    missing
-        Families that the data want beside those of the model; empty: none.
-    parameters
-        Patterns that identify them.
-    gain
-        By how much -2 ln L falls with them.
-    share
-        Part of the variance of what is left that they would explain, 0 to 1.
+    missing, parameters
+        Model extensions that the data support beside those of the model, and the patterns that identify them.
+    gain, share
+        By how much -2 ln L falls with them, and the share of the mean square residual that they would explain.
     present
-        Families of the model that earn their parameters.
+        Extensions of the model that the data support.
     alike
-        Whether similar configurations err alike in the model with all that `missing` names; None for too few.
-    upward
-        Joints whose compliance is significantly negative, which gravity cannot do.
-    narrow
-        Joints that turned so little that nothing of their gears can be told.
-    repeated
-        RMS of repeated readings of a configuration about their mean; None without enough of them.
-    excess
-        RMS of what is left beyond that, where it is more than chance.
+        Autocorrelation of the residuals of the model with all that `missing` names; None for too few.
+    upward, narrow
+        Joints whose compliance is significantly negative, which gravity cannot do; joints that turned so little that
+        nothing of their gears can be told.
+    repeated, excess
+        RMS of repeated readings of a configuration about their mean, None without enough of them; RMS of the residuals
+        beyond that, where it is more than chance.
     overstated
         Whether the residuals are smaller than the stated measurement noise, by the chi-squared test (`NoiseTest`).
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.lack_of_fit import lack_of_fit
-    >>> found = lack_of_fit(ro.calibrate(ro.load("position").problem))
-    >>> found.missing, found.alarming, round(1e3 * found.instrument, 3)
-    ((), False, 0.052)
     """
 
     configurations: int
@@ -129,7 +144,7 @@ class LackOfFit:
     gain: float = 0.0
     share: float = 0.0
     present: Mapping[str, Effect] = field(default_factory=dict)
-    alike: Alike | None = None
+    alike: Autocorrelation | None = None
     upward: tuple[int, ...] = ()
     narrow: tuple[int, ...] = ()
     repeated: float | None = None
@@ -138,17 +153,17 @@ class LackOfFit:
 
     @property
     def robot(self) -> float:
-        """RMS of the robot's scatter."""
+        """RMS of the robot's repeatability."""
         return float(np.hypot(self.position, self.joint))
 
     @property
     def correlated(self) -> bool:
-        """Whether similar configurations err alike, beyond what chance does."""
-        return self.alike is not None and self.alike.z > ALIKE
+        """Whether neighbouring configurations err alike, beyond what chance does."""
+        return self.alike is not None and self.alike.z > CORRELATED
 
     @property
     def alarming(self) -> bool:
-        """Whether anything is said to lack."""
+        """Whether the model is said to lack anything."""
         return bool(self.missing or self.upward or self.correlated)
 
     def sentences(self) -> list[str]:
@@ -162,32 +177,23 @@ class LackOfFit:
     def content(self) -> dict[str, Any]:
         """Return the same as a document [mm, mrad or px]."""
         unit, si = UNITS[self.dimension]
-        milli = ("left", "instrument", "position", "joint", "repeatable", "excess")
-        repeated = None
-        if self.repeated is not None:
-            repeated = self.repeated / si
-        likeness = None
-        if self.alike is not None:
-            likeness = self.alike._asdict()
-        own = {}
+        lengths = ("left", "instrument", "position", "joint", "repeatable", "excess")
+        present = {}
         for family, effect in self.present.items():
-            size = None
-            if effect.rms is not None:
-                size = effect.rms / si
-            own[family] = {"gain": effect.gain, f"rms_{unit}": size}
+            present[family] = {"gain": effect.gain, f"rms_{unit}": None if effect.rms is None else effect.rms / si}
         return {
             "configurations": self.configurations,
             "equations": self.equations,
             "spare": self.spare,
             "dimension": self.dimension,
-            **{f"{key}_{unit}": getattr(self, key) / si for key in milli},
-            f"repeated_{unit}": repeated,
+            **{f"{key}_{unit}": getattr(self, key) / si for key in lengths},
+            f"repeated_{unit}": None if self.repeated is None else self.repeated / si,
             "missing": list(self.missing),
             "identify": list(self.parameters),
             "gain": self.gain,
             "share": self.share,
-            "present": own,
-            "alike": likeness,
+            "present": present,
+            "alike": None if self.alike is None else self.alike._asdict(),
             "upward": list(self.upward),
             "narrow": list(self.narrow),
             "alarming": self.alarming,
@@ -197,61 +203,54 @@ class LackOfFit:
 
 @one_blas_thread
 def lack_of_fit(result: Outcome) -> LackOfFit:
-    """Return what a calibration leaves, and what it is made of.
+    """Return what a calibration's residuals consist of.
 
-    The evidence of families is computed at the linearization of the result, whatever its weight; of large data at
-    most 1000 configurations are looked at, and rows that the fit distrusts are left out.
-
-    Parameters
-    ----------
-    result
-        Any calibration, just made or read from a file.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.lack_of_fit import lack_of_fit
-    >>> found = lack_of_fit(ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml))
-    >>> print(found.sentences()[0].partition(" (")[0])
-    Residual RMS 0.0468 mm
+    The evidence of model extensions is computed at the linearization of the result, whatever its weight; of large data
+    at most 1000 configurations are looked at, and outlying rows are left out.
     """
     compared = Comparison(result)
-    errors = compared.problem.errors(result.x, compared.dimension)
-    left = float(np.sqrt(np.nanmean(errors**2)))
+    problem, dimension = compared.problem, compared.dimension
     known: dict[str, Any] = {
         "configurations": compared.configurations,
         "equations": len(compared.row),
         "spare": compared.spare,
-        "dimension": compared.dimension,
-        "left": left,
+        "dimension": dimension,
+        "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
     }
     if compared.spare < FEWEST:
         return LackOfFit(**known)
     best = compared.best
-    after = parts(compared, best)
-    total = _square(parts(compared, compared.plain))
-    explained = max(total - _square(after), 0.0)
+    after = _parts(compared, best)
+    total = _square(_parts(compared, compared.plain))
     share = 0.0
     if best.families:
-        share = explained / total
-    again = repeated(compared.problem, result.x, compared.dimension)
+        share = max(total - _square(after), 0.0) / total
+    present = _present(compared)
+    again, freedom = _repeated(problem, result.x, dimension)
+    excess = 0.0
+    if again is not None:
+        within = max(again**2, 1e-24)
+        if total / within >= fdtri(compared.spare, freedom, 1 - RARE):
+            excess = float(np.sqrt(total - within))
+    try:
+        overstated = result.noise_test().overstated
+    except InputError:  # no covariance
+        overstated = False
     return LackOfFit(
         **known,
-        instrument=after["instrument"],
-        position=after["position"],
-        joint=after["joint"],
+        **after,
         repeatable=float(np.sqrt(share * total)),
         missing=best.families,
         parameters=tuple(p for family in best.families for p in PATTERNS[family]),
         gain=compared.gain,
         share=share,
-        present=present(compared),
-        alike=errors_alike(compared, best),
-        upward=upward(compared),
-        narrow=narrow(compared.problem),
-        repeated=again.rms,
-        excess=excess(again, total, compared.spare),
-        overstated=_overstated(result),
+        present=present,
+        alike=_residual_autocorrelation(compared, best),
+        upward=_upward(compared, present),
+        narrow=_narrow(problem),
+        repeated=again,
+        excess=excess,
+        overstated=overstated,
     )
 
 
@@ -266,24 +265,32 @@ def judged(result: Outcome) -> LackOfFit | None:
 
 
 def foreseen(problem: Source) -> LackOfFit | None:
-    """Return what a quick fit of the geometry would leave, of at most 60 configurations; None where none succeeds.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.lack_of_fit import foreseen
-    >>> foreseen(ro.load("position").problem).alarming
-    False
-    """
+    """Return what a quick fit of the geometry would leave, of at most 60 configurations; None where none succeeds."""
     try:
         return judged(calibrate(sampled(problem, QUICK), tikhonov, reml))
     except (InputError, NoSolutionFound, np.linalg.LinAlgError):
         return None
 
 
-def _overstated(result: Outcome) -> bool:
-    try:
-        return result.noise_test().overstated
-    except InputError:  # no covariance
-        return False
+# --- parts of the residuals -------------------------------------------------------------------------------------------
+
+
+def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
+    """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
+    scatter = model.evidence.scatter(model.point.logs)
+    only = replace(scatter, instrument=0.0, joint=0.0)
+    own = scatter.orientation if compared.dimension == "angle" else scatter.position
+    squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}
+    for stack in model.evidence.data.stacks:
+        which = stack.of(compared.dimension)
+        stated = np.einsum("nkk->nk", stack.instrument)
+        squares["instrument"] += scatter.instrument**2 * float(np.sum(stated[which]))
+        squares["joint"] += scatter.joint**2 * float(np.sum(np.sum(stack.joint**2, axis=2)[which]))
+        if compared.dimension == "pixel":
+            squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
+        else:
+            squares["position"] += own**2 * float(np.sum(which))
+    return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
 
 def _square(parts: Mapping[str, float]) -> float:
@@ -291,22 +298,177 @@ def _square(parts: Mapping[str, float]) -> float:
     return sum(value**2 for value in parts.values())
 
 
+def _present(compared: Comparison) -> Mapping[str, Effect]:
+    """Return the extensions of the result's own model that are worth more than `SPEAK`, with what they do."""
+    found = {}
+    for family, members in compared.owned().items():
+        gain = compared.rise_without(members)
+        if gain > SPEAK:
+            found[family] = Effect(gain, _beyond_geometry(compared, members))
+    return found
+
+
+def _beyond_geometry(compared: Comparison, members: np.ndarray) -> float | None:
+    """Return the RMS of a row that some parameters (n,) move and geometry and frames cannot.
+
+    What the projection leaves is divided by the equations that the others leave over, so that many of them do not make
+    it small.
+    """
+    model = compared.plain
+    X = model.evidence.data.X[compared.equations]
+    terms = {term for terms in OWNED.values() for term in terms}
+    extension = np.array([family_of(name) in terms for name in model.names])
+    moved = X[:, members] @ model.point.z[members]
+    geometry = X[:, ~extension]
+    geometry = geometry / np.maximum(np.linalg.norm(geometry, axis=0), 1e-300)
+    U, s, _ = np.linalg.svd(geometry, full_matrices=False)
+    U = U[:, s > UNIDENTIFIABLE * s[0]]
+    spare = len(moved) - U.shape[1]
+    if spare < FEWEST:
+        return None
+    left = moved - U @ (U.T @ moved)
+    return float(np.sqrt(left @ left / spare * len(moved) / compared.rows))
+
+
+def _upward(compared: Comparison, present: Mapping[str, Effect]) -> tuple[int, ...]:
+    """Return the joints that surely turn against gravity, where gravity is worth its parameters."""
+    model = compared.best
+    # signs of measured torques are the table's, and numbers of joints would not say of which robot
+    if measured_torques(compared.problem.data) or len(compared.problem.arms) > 1:
+        return ()
+    if "gravity" not in {*model.families, *present}:
+        return ()
+    z = model.point.z
+    sd = np.sqrt(np.diag(model.point.C))
+    moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
+    joint = {i: int(name[10:]) for i, name in enumerate(model.names) if family_of(name) == "compliance"}
+    largest = max((moves[i] for i in joint), default=0.0)
+    return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
+
+
+def _narrow(problem: CalibrationProblem) -> tuple[int, ...]:
+    """Return the revolute joints that turned by less than harmonics need."""
+    if len(problem.arms) > 1:
+        return ()
+    travel = np.ptp(problem.joint_values, axis=0)
+    kinds = problem.robot.joint_types
+    return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED[FIRST])
+
+
+def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:
+    """Return the RMS [m or rad] of repeated readings about their mean, None for too few, and its freedom."""
+    residual = problem.residual(x)
+    start = 0
+    squares = 0.0
+    rows = 0
+    freedom = 0
+    for block in problem.data.blocks:
+        components = list(block.measurement.components.values())
+        end = start + len(components) * len(block.row)
+        r = residual[start:end].reshape(-1, len(components))
+        start = end
+        r = r[:, [d == dimension for d in components]]
+        same = np.unique(repeatable(block).round(7), axis=0, return_inverse=True)[1].ravel()
+        count = np.bincount(same)
+        mean = np.array([np.bincount(same, column) / count for column in r.T]).reshape(-1, len(count)).T
+        squares += float(np.sum((r - mean[same]) ** 2))
+        rows += len(r) - len(count)
+        freedom += (len(r) - len(count)) * r.shape[1]
+    if freedom < FEWEST:
+        return None, freedom
+    return float(np.sqrt(squares / rows)), freedom
+
+
+def _residual_autocorrelation(compared: Comparison, model: Judged) -> Autocorrelation | None:
+    """Return that of a model's residuals in units of their noise; None where points were touched."""
+    if compared.problem.touches is not None:
+        return None
+    scatter = model.evidence.scatter(model.point.logs)
+    stacks = model.evidence.data.stacks
+    widest = max(stack.index.shape[1] for stack in stacks)
+    errors, kinds, first = [], [], []
+    for kind, stack in enumerate(stacks):
+        e = model.residual[stack.index] / np.sqrt(np.einsum("nkk->nk", stack.covariance(scatter)))
+        errors.append(np.pad(e, ((0, 0), (0, widest - e.shape[1]))))
+        kinds.append(np.full(len(e), kind))
+        first.append(compared.row[stack.index[:, 0]])
+    q = compared.problem.joint_values[np.concatenate(first)]
+    return autocorrelation(q, np.concatenate(errors), np.concatenate(kinds))
+
+
+def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelation | None:
+    """Return the autocorrelation of residuals with those of nearest neighbours in joint space (Moran).
+
+    ::
+
+        rho = sum_i e_i . e_nearest(i) / sum_i e_i . e_i
+
+    and z = (rho - mean) / std over permutations of the residuals; two that are each other's nearest count twice in
+    both. With N joint values (N, dof), residuals (N, k) in units of their noise, and kinds (N,) among which neighbours
+    are sought. None for fewer than `FEWEST_NEIGHBOURS` of the same kind.
+    """
+    unit = (q - q.mean(axis=0)) / (q.std(axis=0) + 1e-9)
+    groups = [rows for kind in np.unique(kinds) if len(rows := np.flatnonzero(kinds == kind)) >= FEWEST_NEIGHBOURS]
+    squares = sum(float(np.sum(errors[rows] ** 2)) for rows in groups)
+    if not squares > 0:
+        return None
+    rng = np.random.default_rng(0)
+    found = 0.0
+    permuted = np.zeros(PERMUTATIONS)
+    for rows in groups:
+        e = errors[rows]
+        near = scipy.spatial.KDTree(unit[rows]).query(unit[rows], k=2)[1]
+        # of points at the same place either may come first
+        nearest = np.where(near[:, 0] == np.arange(len(rows)), near[:, 1], near[:, 0])
+        found += float(np.sum(e * e[nearest]))
+        products = e @ e.T
+        for k in range(PERMUTATIONS):
+            order = rng.permutation(len(rows))
+            permuted[k] += float(np.sum(products[order, order[nearest]]))
+    spread = float(permuted.std())
+    if not spread > 0:
+        return None
+    return Autocorrelation(found / squares, (found - float(permuted.mean())) / spread)
+
+
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
 def _sentences(found: LackOfFit) -> list[str]:
-    """Return the paragraph, sentence by sentence."""
     rms = f"Residual RMS {_size(found, found.left)}"
     if not found.instrument:
         count = max(round(found.spare), 0)
         degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
         return [f"{rms}; {degrees} too few to tell what it consists of. Measure more configurations."]
     lines = [f"{rms} ({_division(found)})."]
-    lines += _present(found)
-    lines += _missing(found)
-    lines += _upward(found)
-    lines += _likeness(found)
-    lines += _repeated(found)
+    for family, effect in found.present.items():
+        size = ""
+        if effect.rms is not None:
+            size = f": {_size(found, effect.rms)} RMS beyond what geometry can imitate"
+        lines.append(f"{DOES[family]}{size} (-2 ln L falls by {effect.gain:.0f}).")
+    if found.missing:
+        what = joined([WHAT[family] for family in found.missing])
+        lines.append(
+            f"{what[0].upper()}{what[1:]} would explain {found.share:.0%} of the mean square residual (-2 ln L falls "
+            f'by {found.gain:.0f}): add {joined(found.parameters)} to `identify`, or model = "auto".'
+        )
+    if found.upward:
+        named = joined([str(joint) for joint in found.upward])
+        joints = f"Compliance of joint {named} is" if len(found.upward) == 1 else f"Compliances of joints {named} are"
+        lines.append(
+            f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the controller "
+            "compensates sag; do not use such a fit outside the measured joint ranges."
+        )
+    lines += _limit(found)
+    if found.repeated is not None:
+        agree = f"Repeated readings of a configuration agree to {_size(found, found.repeated)} RMS"
+        if found.excess:
+            lines.append(
+                f"{agree}; {_size(found, found.excess)} of the residuals repeat with the configuration, unless the "
+                "robot stood still between them."
+            )
+        else:
+            lines.append(f"{agree}: residuals are no larger.")
     return lines
 
 
@@ -327,88 +489,32 @@ def _division(found: LackOfFit) -> str:
     return ", ".join(said)
 
 
-def _present(found: LackOfFit) -> list[str]:
-    lines = []
-    for family, effect in found.present.items():
-        size = ""
-        if effect.rms is not None:
-            size = f": {_size(found, effect.rms)} RMS beyond what geometry can imitate"
-        lines.append(f"{DOES[family]}{size} (-2 ln L falls by {effect.gain:.0f}).")
-    return lines
-
-
-def _missing(found: LackOfFit) -> list[str]:
-    if not found.missing:
-        return []
-    what = joined([WHAT[family] for family in found.missing])
-    added = joined(found.parameters)
-    return [
-        f"{what[0].upper()}{what[1:]} would explain {found.share:.0%} of the mean square residual (-2 ln L falls by "
-        f'{found.gain:.0f}): add {added} to `identify`, or model = "auto".'
-    ]
-
-
-def _upward(found: LackOfFit) -> list[str]:
-    if not found.upward:
-        return []
-    named = joined([str(joint) for joint in found.upward])
-    joints = f"Compliances of joints {named} are"
-    if len(found.upward) == 1:
-        joints = f"Compliance of joint {named} is"
-    return [
-        f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the controller "
-        "compensates sag; do not use such a fit outside the measured joint ranges."
-    ]
-
-
-def _likeness(found: LackOfFit) -> list[str]:
+def _limit(found: LackOfFit) -> list[str]:
+    """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
     if found.correlated and found.alike is not None:
-        even = "Residuals"
-        if found.missing:
-            even = "Even then residuals"
-        return [
+        even = "Even then residuals" if found.missing else "Residuals"
+        lines = [
             f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
-            f"{found.alike.z:.0f}): the model lacks an effect, which more readings will not average away.",
-            *_reach(found),
+            f"{found.alike.z:.0f}): the model lacks an effect, which more readings will not average away."
         ]
+        if found.narrow:
+            named = joined([str(joint) for joint in found.narrow])
+            lines.append(f"Joints {named} moved too little to identify gear eccentricity.")
+        return lines
+    if found.robot > GROSS * found.instrument:
+        return ["No robot repeats so badly: look for wrong units, signs, frames or rows first (`inspect`)."]
     if found.robot > ROUGH * found.instrument:
-        return _rough(found)
+        limit = "The robot, not the instrument, limits the result"
+        if found.repeated is not None and found.excess:
+            return [f"{limit}."]
+        if found.repeated is not None:
+            return [f"{limit}, by its repeatability, backlash or drift."]
+        return [
+            f"{limit}; the data do not separate repeatability from an effect that the model lacks. Repeat five "
+            "configurations, approached from both sides, before a better instrument is bought."
+        ]
     if found.overstated:
         return ["Repeat one reading ten times, and state its standard deviation as the measurement noise."]
     if found.robot < FINE * found.instrument:
         return ["The instrument limits the result: only a more accurate one would show the robot's repeatability."]
     return []
-
-
-def _rough(found: LackOfFit) -> list[str]:
-    """Say what to do about a robot that is worse than its instrument, and whose errors show no order."""
-    if found.robot > GROSS * found.instrument:
-        return ["No robot repeats so badly: look for wrong units, signs, frames or rows first (`inspect`)."]
-    limit = "The robot, not the instrument, limits the result"
-    if found.repeated is not None and not found.excess:
-        return [f"{limit}, by its repeatability, backlash or drift."]
-    if found.repeated is not None:
-        return [f"{limit}."]
-    return [
-        f"{limit}; the data do not separate repeatability from an effect that the model lacks. Repeat five "
-        "configurations, approached from both sides, before a better instrument is bought."
-    ]
-
-
-def _reach(found: LackOfFit) -> list[str]:
-    if not found.narrow:
-        return []
-    named = joined([str(joint) for joint in found.narrow])
-    return [f"Joints {named} moved too little to identify gear eccentricity."]
-
-
-def _repeated(found: LackOfFit) -> list[str]:
-    if found.repeated is None:
-        return []
-    agree = f"Repeated readings of a configuration agree to {_size(found, found.repeated)} RMS"
-    if not found.excess:
-        return [f"{agree}: residuals are no larger."]
-    return [
-        f"{agree}; {_size(found, found.excess)} of the residuals repeat with the configuration, unless the robot stood "
-        "still between them."
-    ]

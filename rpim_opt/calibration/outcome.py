@@ -426,7 +426,7 @@ class Outcome:
             return trust(program.model, self.z)[0], trust.factor
         return source.linearize(self.x, trust), trust.factor
 
-    @property
+    @cached_property
     def linear(self) -> LinearModel:
         """The last linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
         return self._squares[0]
@@ -496,7 +496,7 @@ class Outcome:
             return self.learned.freedom
         return max(self.equations - self.degrees_of_freedom, 0.0)
 
-    @property
+    @cached_property
     def noise_variance(self) -> float:
         """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over.
 

@@ -9,12 +9,9 @@ from html import unescape
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 import rpim_opt as ro
-from rpim_opt.calibration.lack_of_fit import LackOfFit, foreseen, judged, lack_of_fit
-from rpim_opt.calibration.residuals import FEWEST, alike
-from rpim_opt.calibration.residuals import _nearest as nearest
+from rpim_opt.calibration.lack_of_fit import FEWEST, LackOfFit, autocorrelation, foreseen, judged, lack_of_fit
 from rpim_opt.report.report import page
 from tests.simulate import ALL, ARM, simulated
 
@@ -216,42 +213,29 @@ def test_angles_alone_are_told_in_mrad():
     assert "left_mrad" in found.content()
 
 
-@pytest.mark.parametrize("steps", [None, 3])
-def test_neighbours_are_those_of_a_tree_also_where_several_are_as_near(steps: int | None) -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        points = rng.uniform(size=(rng.integers(8, 60), 3))
-        if steps is not None:
-            points = np.round(steps * points)
-        points[3] = points[5]  # twice the same place
-        near = KDTree(points).query(points, k=2)[1]
-        others = np.where(near[:, 0] == np.arange(len(points)), near[:, 1], near[:, 0])
-        assert (nearest(points) == others).all()
-
-
 def test_neighbours_that_share_an_effect_are_alike_and_others_are_not():
     rng = np.random.default_rng(0)
     q = rng.uniform(-1, 1, (200, 2))
     kinds = np.zeros(200, dtype=int)
     smooth = np.sin(3 * q) + 0.3 * rng.normal(size=(200, 2))
-    found = alike(q, smooth, kinds)
+    found = autocorrelation(q, smooth, kinds)
     assert found is not None
     assert found.z > 6
     assert found.correlation > 0.5
     # dealing out the errors leaves z standard: neighbours that are mutual do not inflate it
-    z = [alike(q, rng.normal(size=(200, 2)), kinds).z for _ in range(100)]
+    z = [autocorrelation(q, rng.normal(size=(200, 2)), kinds).z for _ in range(100)]
     assert np.std(z) == pytest.approx(1.0, abs=0.25)
     assert abs(np.mean(z)) < 0.4
-    assert alike(q[:5], smooth[:5], kinds[:5]) is None
-    assert alike(q, 0 * smooth, kinds) is None
+    assert autocorrelation(q[:5], smooth[:5], kinds[:5]) is None
+    assert autocorrelation(q, 0 * smooth, kinds) is None
 
 
 def test_neighbours_are_sought_among_the_same_kind_only():
     rng = np.random.default_rng(1)
     q = np.repeat(rng.uniform(-1, 1, (50, 2)), 2, axis=0) + 1e-3 * rng.normal(size=(100, 2))
     errors = np.repeat(rng.normal(size=(50, 3)), 2, axis=0)
-    together = alike(q, errors, np.zeros(100, dtype=int))
-    apart = alike(q, errors, np.tile([0, 1], 50))
+    together = autocorrelation(q, errors, np.zeros(100, dtype=int))
+    apart = autocorrelation(q, errors, np.tile([0, 1], 50))
     assert together.correlation == pytest.approx(1.0, abs=0.1)
     assert abs(apart.z) < 4
 

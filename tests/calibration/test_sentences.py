@@ -16,9 +16,8 @@ from rpim_opt.calibration.acceptance import Acceptance, _wide
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.held_out_rows import Checked
-from rpim_opt.calibration.lack_of_fit import LackOfFit
+from rpim_opt.calibration.lack_of_fit import Autocorrelation, Effect, LackOfFit, autocorrelation
 from rpim_opt.calibration.region import Share, share
-from rpim_opt.calibration.residuals import Alike, Effect, alike
 from rpim_opt.data.record import Requirement
 
 LIMIT = Requirement(1e-4)
@@ -94,11 +93,11 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
         "imitate (-2 ln L falls by 30)",
     ),
     "alike": (
-        left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0)),
+        left(2e-4, instrument=1e-4, alike=Autocorrelation(0.5, 9.0)),
         "Residuals of neighbouring configurations are correlated", "moved too little",
     ),
     "alike even then": (
-        left(2e-4, instrument=1e-4, alike=Alike(0.5, 9.0), narrow=(2, 3), **LACKING),
+        left(2e-4, instrument=1e-4, alike=Autocorrelation(0.5, 9.0), narrow=(2, 3), **LACKING),
         "Even then residuals of neighbouring configurations are correlated (0.50, z = 9): the model lacks an effect, "
         "which more readings will not average away. Joints 2 and 3 moved too little to identify gear eccentricity.",
         "Residuals of",
@@ -140,12 +139,12 @@ def test_errors_without_any_size_are_not_alike() -> None:
     rng = np.random.default_rng(0)
     q = rng.normal(size=(60, 3))
     kinds = np.zeros(60, dtype=int)
-    assert alike(q, np.zeros((60, 2)), kinds) is None
-    assert alike(q, np.ones((60, 1)), kinds) is None  # dealt out, they are the same
-    smooth = alike(q, np.sin(q), kinds)
+    assert autocorrelation(q, np.zeros((60, 2)), kinds) is None
+    assert autocorrelation(q, np.ones((60, 1)), kinds) is None  # dealt out, they are the same
+    smooth = autocorrelation(q, np.sin(q), kinds)
     assert smooth is not None
     assert smooth.z > 5
-    noise = alike(q, rng.normal(size=(60, 2)), kinds)
+    noise = autocorrelation(q, rng.normal(size=(60, 2)), kinds)
     assert noise is not None
     assert abs(noise.z) < 4
 
