@@ -238,7 +238,9 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         overstated = False
     return LackOfFit(
         **known,
-        **after,
+        instrument=after["instrument"],
+        position=after["position"],
+        joint=after["joint"],
         repeatable=float(np.sqrt(share * total)),
         missing=best.families,
         parameters=tuple(p for family in best.families for p in PATTERNS[family]),
