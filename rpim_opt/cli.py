@@ -274,7 +274,7 @@ def calibrate(
             say("calibrating without outliers")
             result = result.without_flagged()
         if use_validation:
-            from rpim_opt.calibration.held_out_rows import refit_all
+            from rpim_opt.calibration.held_out import refit_all
 
             say("calibrating from all rows")
             result = refit_all(result)

@@ -5,7 +5,7 @@ from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
 from .expected import Improvement as Improvement
 from .expected import improvement as improvement
-from .held_out_rows import refit_all as refit_all
+from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
 from .leaving_out import Influence as Influence
 from .leaving_out import influence as influence

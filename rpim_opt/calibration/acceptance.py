@@ -1,13 +1,12 @@
-"""Whether a calibrated robot keeps a limit: accepted, rejected, or what is lacking to tell."""
+"""Acceptance: whether a calibrated robot keeps a limit at every configuration of a region."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import bdtrc
+from scipy.special import bdtr, bdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -15,18 +14,88 @@ from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import refuse_misread
-from rpim_opt.calibration.held_out_rows import Checked, checked
-from rpim_opt.calibration.lack_of_fit import judged
-from rpim_opt.calibration.region import Reaching, Region, Share, reaching, region_of, share
+from rpim_opt.calibration.covariance import UNLIKELY
+from rpim_opt.calibration.diagnosis import SLACK
+from rpim_opt.calibration.held_out import CONFIDENCE, judged
+from rpim_opt.calibration.lack_of_fit import judged as judged_fit
+from rpim_opt.calibration.region import Region, distance_quantile, reaching, region_of
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Requirement
 
 Verdict = Literal["accepted", "rejected", "undecided"]
 FEWEST = 5
-"""Rows that were kept apart, below which they say too little of the intervals."""
+"""Held-out rows below which they say too little of the intervals."""
 MOST = 3
 """Joints or rows that a reason names."""
+STATED = 1e9
+"""Degrees of freedom of an uncertainty that is stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """What held-out rows say.
+
+    Parameters
+    ----------
+    count, largest
+        How many rows measure a length in the region, and the largest error of these [m].
+    missing
+        Labels of those that miss by more than the limit and what the instrument may add to it.
+    rows
+        How many rows were held out in all.
+    beyond
+        Labels of those, in the region or not, that the prediction's uncertainty does not explain.
+    coverage
+        Share of their lengths that lie in the 95 % interval of a reading; None where there is none.
+    """
+
+    count: int
+    largest: float
+    missing: tuple[str, ...]
+    rows: int
+    beyond: tuple[str, ...]
+    coverage: float | None
+
+    def sentence(self) -> str:
+        """Return the figures in a sentence."""
+        if not self.count:
+            return f"None of the {self.rows} held-out rows is in the region."
+        text = f"Held out: {self.rows} rows, {self.count} of them in the region, the largest error there "
+        text += f"{1e3 * self.largest:.3f} mm as the instrument reads it"
+        if self.coverage is not None:
+            text += f"; {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals"
+        return f"{text}."
+
+    def lacking(self) -> list[str]:
+        """Return why the rows do not bear the intervals out, a sentence each."""
+        lines: list[str] = []
+        if self.rows < FEWEST:
+            lines.append(f"Lacking: at least {FEWEST} rows that the calibration did not see; there are {self.rows}.")
+        if self.beyond:
+            lines.append(
+                f"Lacking: intervals that hold. Beyond what the prediction's uncertainty allows: "
+                f"{listed(list(self.beyond), MOST)}. Measure again, or find what the model lacks."
+            )
+        # coordinates of a row are not independent of each other: a row counts once
+        if self.coverage is not None and bdtr(np.floor(self.coverage * self.rows), self.rows, CONFIDENCE) < UNLIKELY:
+            lines.append(
+                f"Lacking: intervals that hold. Only {100 * self.coverage:.0f} % of the coordinates lie in their "
+                "95 % intervals."
+            )
+        return lines
+
+    def content(self) -> dict[str, Any]:
+        """Return the figures as a document [mm]."""
+        return {
+            "rows": self.rows,
+            "in_region": self.count,
+            "largest_mm": 1e3 * self.largest,
+            "missing": list(self.missing),
+            "beyond": list(self.beyond),
+            "coverage95": self.coverage,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +107,9 @@ class Acceptance:
     requirement
         The limit and the region.
     verdict
-        ``"accepted"``: at every configuration of the region the bound is within the limit, and rows that were kept
-        apart bear it out. ``"rejected"``: they miss oftener than chance allows, or the robot's own scatter at its
-        least is above the limit. ``"undecided"``: something is lacking, see ``reasons``.
+        ``"accepted"``: at every configuration of the region the bound is within the limit, and held-out rows bear it
+        out. ``"rejected"``: they miss oftener than chance allows, or the robot's repeatability at its least is above
+        the limit. ``"undecided"``: something is lacking, see ``reasons``.
     reasons
         What rejects it, or what is lacking, a sentence each.
     count
@@ -52,9 +121,7 @@ class Acceptance:
     worst, place
         (dof,) joint values [rad or m] and predicted position (3,) [m] of the largest bound.
     checked
-        The rows that were kept apart, beside the limit.
-    drawn
-        The positions that were drawn with their bounds.
+        The held-out rows, beside the limit.
 
     Examples
     --------
@@ -79,7 +146,6 @@ class Acceptance:
     worst: Array | None = None
     place: Array | None = None
     checked: Checked | None = None
-    drawn: Reaching | None = field(default=None, repr=False)
 
     def sentences(self) -> list[str]:
         """Return the verdict and what it rests on, sentence by sentence."""
@@ -172,76 +238,111 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     if data is not None:
         refuse_misread(result, data)
     region = region_of(result, requirement)
+    confidence = requirement.confidence
     q = region.drawn()
     seen = checked(result, region, requirement, data)
+    against = list(result.verdict.reasons)
     lacking = _lacking(result, region, seen)
     try:
-        found = reaching(result, region, q, requirement.confidence)
+        drawn = reaching(result, region, q, confidence).bound
     except InputError as error:
-        verdict = "undecided" if result.verdict.delivered else "rejected"
-        reasons = (*result.verdict.reasons, *lacking, f"No bound: {error}")
-        return Acceptance(requirement, verdict, reasons, len(q), checked=seen)
-    bound = partial(_bound, result, region, requirement.confidence)
-    worst = region.largest(q, found.bound, bound)
-    at = reaching(result, region, worst[None], requirement.confidence)
-    made = share(result, region, worst, requirement.confidence)
-    verdict, reasons = _verdict(result, requirement, float(at.bound[0]), made, seen, lacking)
+        reasons = (*against, *lacking, f"No bound: {error}")
+        return Acceptance(requirement, "rejected" if against else "undecided", reasons, len(q), checked=seen)
+    worst = region.largest(q, drawn, lambda q: reaching(result, region, q, confidence).bound)
+    at = reaching(result, region, worst[None], confidence)
+    bound = float(at.bound[0])
+    scatter, least = scatter_bounds(result, region, worst, confidence)
+    against += _against(requirement, least, seen)
+    lacking += _wide(requirement.limit, bound, scatter)
     return Acceptance(
         requirement,
-        verdict,
-        reasons,
+        "rejected" if against else "undecided" if lacking else "accepted",
+        tuple(against or lacking),
         count=len(q),
-        bound=float(at.bound[0]),
-        typical=float(np.median(found.bound)),
-        scatter=made.scatter,
+        bound=bound,
+        typical=float(np.median(drawn)),
+        scatter=scatter,
         worst=worst,
         place=at.position[0],
         checked=seen,
-        drawn=found,
     )
 
 
-def _bound(result: Calibration, region: Region, confidence: float, q: Array) -> Array:
-    return reaching(result, region, q, confidence).bound
+def checked(result: Calibration, region: Region, requirement: Requirement, data: Dataset | None) -> Checked | None:
+    """Return what held-out rows, of the result's record or other ones, say of a limit; None where there are none."""
+    apart = result.record.validation if data is None else data
+    held = result.record.held_out
+    if apart is not None:
+        error, found = result.errors(apart), judged(result, apart)
+        sigmas, allowed, coverage = found
+    elif held is not None:
+        known = {label: row for row, label in enumerate(result.problem.data.label)}
+        kept = np.array([label in known for label in held.label])
+        apart = result.problem.data.take([known[label] for label in held.label if label in known])
+        error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
+    else:
+        return None
+    inside = np.isfinite(error)
+    instrument = np.zeros(len(apart))
+    for block in apart.blocks:
+        points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
+        inside[block.row] &= np.all(points, axis=0)
+        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
+        stated = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
+        if lengths:
+            of_lengths = stated[:, lengths][:, :, lengths]
+            instrument[block.row] = distance_quantile(of_lengths, STATED, requirement.confidence)
+    missing = np.flatnonzero(inside & (error > requirement.limit + instrument))
+    beyond = np.flatnonzero(np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf))
+    return Checked(
+        count=int(inside.sum()),
+        largest=float(error[inside].max(initial=0.0)),
+        missing=tuple(apart.label[i] for i in missing),
+        rows=len(apart),
+        beyond=tuple(apart.label[i] for i in beyond),
+        coverage=coverage,
+    )
 
 
-def _verdict(
-    result: Calibration,
-    requirement: Requirement,
-    bound: float,
-    made: Share,
-    seen: Checked | None,
-    lacking: list[str],
-) -> tuple[Verdict, tuple[str, ...]]:
-    against = [*result.verdict.reasons, *_against(requirement, made, seen)]
-    if against:
-        return "rejected", tuple(against)
-    reasons = [*lacking, *_wide(requirement.limit, bound, made)]
-    if reasons:
-        return "undecided", tuple(reasons)
-    return "accepted", ()
+def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
+    """Return the bound [m] at q (dof,) if all parameters were known: repeatability as estimated, and at the least.
+
+    Zero where it is not known apart from the noise; at the least where the data know no more than an upper end.
+    """
+    results = [result]
+    scatter = result.problem.scatter
+    if scatter is not None:
+        learned = {} if result.learned is None else result.learned.noise
+        least = {k: 0.0 if s.spread > VAGUE else s.value * float(np.exp(-2 * s.spread)) for k, s in learned.items()}
+        results.append(replace(result, problem=result.problem.scattered(replace(scatter, **least))))
+    found = [0.0, 0.0]
+    for i, each in enumerate(results):
+        mean, reached = (each.predict(q[None], region.marker, of=of).covariance for of in ("mean", "reached"))
+        if np.isfinite(mean).all():
+            found[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
+    return found[0], found[1]
 
 
-def _wide(limit: float, bound: float, made: Share) -> list[str]:
+def _wide(limit: float, bound: float, scatter: float) -> list[str]:
     """Say what would lower a bound that is above the limit."""
     if not np.isfinite(bound):
         return ["Lacking: measurements of directions that neither data nor penalty decide, and that move the robot."]
     if bound <= limit:
         return []
-    if made.scatter > limit:
+    if scatter > limit:
         return [
             f"Lacking: a better known scatter. The robot's own, which this calibration takes for up to "
-            f"{1e3 * made.scatter:.3f} mm, may be above the limit or not: approach some poses repeatedly "
+            f"{1e3 * scatter:.3f} mm, may be above the limit or not: approach some poses repeatedly "
             "(`rpim-opt iso9283`)."
         ]
     return [
         f"Lacking: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's own scatter "
-        f"would leave {1e3 * made.scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` names the "
+        f"would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` names the "
         "configurations that help most."
     ]
 
 
-def _against(requirement: Requirement, made: Share, seen: Checked | None) -> list[str]:
+def _against(requirement: Requirement, least: float, seen: Checked | None) -> list[str]:
     """Return what shows that the limit is not kept."""
     reasons: list[str] = []
     if seen is not None and seen.missing:
@@ -251,36 +352,33 @@ def _against(requirement: Requirement, made: Share, seen: Checked | None) -> lis
                 f"{len(seen.missing)} of {seen.count} rows miss by more than the limit and the instrument's part of "
                 f"it: {listed(list(seen.missing), MOST)}."
             )
-    if made.least_scatter > requirement.limit:
-        least = f"{1e3 * made.least_scatter:.3f} mm"
-        reasons.append(f"The robot's own scatter alone is {least} at the least: no calibration lowers that.")
+    if least > requirement.limit:
+        reasons.append(
+            f"The robot's own scatter alone is {1e3 * least:.3f} mm at the least: no calibration lowers that."
+        )
     return reasons
 
 
 def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[str]:
     """Return what keeps a bound from being believed."""
     lines: list[str] = []
-    lacking = judged(result)
-    if lacking is not None and lacking.alarming:
-        lines.append(f"Lacking: a model that fits. {lacking}")
+    fit = judged_fit(result)
+    if fit is not None and fit.alarming:
+        lines.append(f"Lacking: a model that fits. {fit}")
     if seen is None:
         lines.append(
             "Lacking: rows that the calibration did not see (`new --hold-out`, or a table for `accept --data`)."
         )
     else:
-        lines += seen.doubts(FEWEST)
-    return [*lines, *_beyond(result, region)]
-
-
-def _beyond(result: Calibration, region: Region) -> list[str]:
-    """Say which joints of the region go beyond what was measured."""
+        lines += seen.lacking()
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)
-    found = result.outside(corners)
-    if not found.rows:
-        return []
     named: list[str] = []
-    for joint in found.joints:
+    for joint in result.outside(corners).joints:
         unit, si = display(result.problem.robot.joint_dimensions[joint - 1])
         low, high = region.limits[joint - 1] / si
         named.append(f"joint {joint} from {low:.4g} to {high:.4g} {unit}")
-    return [f"Lacking: measurements with {joined(named)}, as the region has it: nothing checked the model there."]
+    if named:
+        lines.append(
+            f"Lacking: measurements with {joined(named)}, as the region has it: nothing checked the model there."
+        )
+    return lines

@@ -17,7 +17,7 @@ from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import Acceptance
-from rpim_opt.calibration.held_out_rows import judged as predicted
+from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.remarks import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration

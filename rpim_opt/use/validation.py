@@ -13,7 +13,7 @@ from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out_rows import judged
+from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.remarks import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.calibration.held_out_rows import judged
+from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem.parts import PartitionedProblem
 from rpim_opt.problem.several import unknown_sessions

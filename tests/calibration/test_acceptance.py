@@ -209,7 +209,7 @@ def test_all_rows_know_more(result, everything) -> None:
 
 
 def test_nothing_kept_apart_is_refused(instance) -> None:
-    with pytest.raises(ro.InputError, match="kept apart"):
+    with pytest.raises(ro.InputError, match="held-out rows"):
         ro.calibration.refit_all(ro.calibrate(instance.problem))
 
 

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration import influence, likely_causes
 from rpim_opt.calibration.baselines import gradient_descent
-from rpim_opt.calibration.held_out_rows import refit_all
+from rpim_opt.calibration.held_out import refit_all
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.data.record import Requirement
 from rpim_opt.problem.parts import PartitionedProblem
@@ -71,7 +71,7 @@ def test_what_needs_all_rows_says_so_of_measurements_in_parts() -> None:
     held_out = one().data.take(np.arange(3))
     with pytest.raises(ro.InputError, match="measurements in parts, accepted: measurements in memory"):
         refit_all(parts, held_out)
-    with pytest.raises(ro.InputError, match="no rows that were kept apart"):
+    with pytest.raises(ro.InputError, match="no held-out rows"):
         refit_all(result())
 
 

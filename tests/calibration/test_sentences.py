@@ -12,12 +12,10 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, _wide
+from rpim_opt.calibration.acceptance import Acceptance, Checked, _wide, scatter_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.covariance import require_interval as interval
-from rpim_opt.calibration.held_out_rows import Checked
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, Effect, LackOfFit, autocorrelation
-from rpim_opt.calibration.region import Share, share
 from rpim_opt.data.record import Requirement
 
 LIMIT = Requirement(1e-4)
@@ -43,25 +41,25 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     assert whole.sentences()[2:] == [
         "The position reached is within 0.090 mm of the predicted one even at the worst of 500 configurations and a "
         "search from there; 0.050 mm in the middle.",
-        "Kept apart: 4 rows, 3 of them in the region, the largest error there 0.080 mm as the instrument reads it; "
+        "Held out: 4 rows, 3 of them in the region, the largest error there 0.080 mm as the instrument reads it; "
         "90 % of the coordinates lie in their 95 % intervals.",
     ]
 
 
 def test_rows_that_were_kept_apart_may_say_little() -> None:
     none = Checked(0, 0.0, (), 4, (), None)
-    assert none.sentence() == "None of the 4 rows that were kept apart is in the region."
+    assert none.sentence() == "None of the 4 held-out rows is in the region."
     unknown = Checked(2, 1e-4, (), 4, (), None)
     assert unknown.sentence().endswith("0.100 mm as the instrument reads it.")
 
 
 def test_a_bound_above_the_limit_says_what_would_lower_it() -> None:
-    assert _wide(1e-4, 1e-4, Share(5e-5, 1e-5)) == []
-    (open_directions,) = _wide(1e-4, np.inf, Share(5e-5, 1e-5))
+    assert _wide(1e-4, 1e-4, 5e-5) == []
+    (open_directions,) = _wide(1e-4, np.inf, 5e-5)
     assert "directions that neither data nor penalty decide" in open_directions
-    (scatter,) = _wide(1e-4, 3e-4, Share(2e-4, 1e-5))
+    (scatter,) = _wide(1e-4, 3e-4, 2e-4)
     assert scatter.startswith("Lacking: a better known scatter.")
-    (more,) = _wide(1e-4, 3e-4, Share(5e-5, 1e-5))
+    (more,) = _wide(1e-4, 3e-4, 5e-5)
     assert more.startswith("Lacking: measurements. The bound is 0.300 mm")
 
 
@@ -69,8 +67,8 @@ def test_a_share_of_scatter_that_is_not_known_is_zero() -> None:
     """Of a calibration whose noise's level stands for it."""
     problem = ro.load("paper_arm").problem
     region: Any = SimpleNamespace(marker="")
-    found = share(ro.calibrate(problem, ro.tikhonov, 1.0), region, problem.data.q[0], 0.95)
-    assert found == Share(0.0, 0.0)
+    found = scatter_bounds(ro.calibrate(problem, ro.tikhonov, 1.0), region, problem.data.q[0], 0.95)
+    assert found == (0.0, 0.0)
 
 
 # --- what is left --------------------------------------------------------------------------------------------------
