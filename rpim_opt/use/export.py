@@ -17,7 +17,7 @@ from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, w
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.asking import calibrate
+from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration
