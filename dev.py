@@ -16,7 +16,10 @@ import os
 import subprocess
 import sys
 import tempfile
+import tomllib
 import venv
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
@@ -115,6 +118,25 @@ def versions(*pythons: str) -> int:
     return max(len(set(said.values())) - 1, 0)
 
 
+def minima(python: str, *tests: str) -> int:
+    """Run tests with the lowest version of every dependency that ``pyproject.toml`` allows, in a fresh environment."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = [
+        *project["dependencies"],
+        *(each for name in ("tables", "plots", "xacro", "studies") for each in extras[name]),
+    ]
+    wanted += [each for each in extras["dev"] if each.startswith(("hypothesis", "polars", "pytest"))]
+    lowest = sorted({each.replace(">=", "==") for each in wanted})
+    with tempfile.TemporaryDirectory() as scratch:
+        program = Path(scratch, PROGRAMS, "python")
+        subprocess.run([python, "-m", "venv", scratch], check=True)
+        subprocess.run([program, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", *lowest], check=True)
+        # old packages use what newer ones of their own dependencies deprecate; the lock is another test's
+        ignored = ["-W", "ignore::DeprecationWarning", "--ignore", "tests/test_locked.py"]
+        return subprocess.run([program, "-m", "pytest", *ignored, *tests], cwd=ROOT, check=False).returncode
+
+
 def _readme(program: Path, folder: Path) -> str:
     """Return a digest of what two commands print in an empty folder with an empty cache."""
     folder.mkdir()
@@ -125,38 +147,48 @@ def _readme(program: Path, folder: Path) -> str:
     return printed.hexdigest()[:16]
 
 
-def main(arguments: list[str]) -> int:
-    """Carry out one command line."""
-    what, *rest = arguments or ["help"]
-    if what not in ("run", "test", "check", "docs", "pages", "strings", "notebooks", "coverage", "mutants", "versions"):
-        print("usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check")
-        print("       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pages [PAGE...] | strings")
-        print("       | coverage [FOLDER] | mutants [COUNT] [FOLDER] | versions PYTHON...")
-        return 2
-    if what == "notebooks":
-        return notebooks(*rest)
-    if what == "versions":
-        return versions(*rest)
-    environment(tools=what != "run")
-    if what == "run":
-        return command_line(*rest)
-    os.chdir(ROOT)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # pytest has a process a core already
-    if what == "test":
-        return run("pytest", "-n", "auto", *rest)  # on all cores
-    if what == "docs":
-        return docs(*rest)
-    if what == "pages":
-        return run("python", GALLERY / "pages.py", *rest)
-    if what == "strings":
-        return run("python", GALLERY / "strings.py")
-    if what == "coverage":
-        return coverage(*rest)
-    if what == "mutants":
-        return run("python", "-m", "tests.mutants", *rest)
+def test(*arguments: str) -> int:
+    """Run the tests on all cores."""
+    return run("pytest", "-n", "auto", *arguments)
+
+
+def check() -> int:
+    """Run the checks, all of them."""
     failed = [name for name, command in CHECKS.items() if run(*command)]
     print(f"checks failed: {', '.join(failed)}" if failed else "all checks passed")
     return len(failed)
+
+
+USAGE = """usage: python3 dev.py run RPIM-OPT-ARGUMENTS... | test [PYTEST-ARGUMENTS...] | check
+       | docs [FOLDER] | notebooks [FOLDER [PAGE...]] | pages [PAGE...] | strings
+       | coverage [FOLDER] | mutants [COUNT] [FOLDER] | versions PYTHON... | minima PYTHON [PYTEST-ARGUMENTS...]"""
+OWN_ENVIRONMENT: dict[str, Callable[..., int]] = {"notebooks": notebooks, "versions": versions, "minima": minima}
+IN_THE_CHECKOUT: dict[str, Callable[..., int]] = {
+    "test": test,
+    "check": check,
+    "docs": docs,
+    "pages": partial(run, "python", GALLERY / "pages.py"),
+    "strings": partial(run, "python", GALLERY / "strings.py"),
+    "coverage": coverage,
+    "mutants": partial(run, "python", "-m", "tests.mutants"),
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Carry out one command line."""
+    what, *rest = arguments or ["help"]
+    if what in OWN_ENVIRONMENT:
+        return OWN_ENVIRONMENT[what](*rest)
+    if what == "run":
+        environment(tools=False)
+        return command_line(*rest)
+    if what not in IN_THE_CHECKOUT:
+        print(USAGE)
+        return 2
+    environment()
+    os.chdir(ROOT)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # pytest has a process a core already
+    return IN_THE_CHECKOUT[what](*rest)
 
 
 if __name__ == "__main__":
