@@ -45,7 +45,6 @@ from .problem import problem_from as problem_from
 from .problem import together as together
 from .report import plot as plot
 from .robot import Model as Model
-from .robot import read_mdh as read_mdh
 from .robot import read_robot as read_robot
 from .robot import read_urdf as read_urdf
 from .robot import robots as robots

@@ -177,7 +177,7 @@ def test_real_measurements(monkeypatch, tmp_path, name: str, robot: str, limit: 
     assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "results")) == 0
     assert json.loads((folder / "results" / "result.json").read_text())["validation"]["rms_mm"] < limit
     assert run(monkeypatch, "export", str(folder / "results"), "--mdh", str(tmp_path / "arm.csv")) == 0
-    assert ro.read_mdh(tmp_path / "arm.csv").dof == ro.load_result(folder / "results").robot.dof
+    assert ro.read_robot(tmp_path / "arm.csv").dof == ro.load_result(folder / "results").robot.dof
     assert run(monkeypatch, "report", str(folder / "results")) == 0
 
 
@@ -364,7 +364,7 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert run(monkeypatch, "export", str(made / "results"), "--urdf", str(cell / "arm.urdf"), *outs, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["written"] == [str(tmp_path / "o"), str(tmp_path / "arm.json"), str(tmp_path / "dk.csv")]
-    assert np.array_equal(ro.read_mdh(tmp_path / "arm.json").mdh, ro.load_result(made / "results").robot.mdh)
+    assert np.array_equal(ro.read_robot(tmp_path / "arm.json").mdh, ro.load_result(made / "results").robot.mdh)
     (tmp_path / "ros.yaml").write_text(YAML_PLAIN)
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]

@@ -18,7 +18,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
-from rpim_opt.robot.formats.tables import read_mdh
+from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
@@ -434,7 +434,7 @@ def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
 
 def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
     """Return the ready robot with as many joints that fits far better."""
-    tried = [(f"the ready robot {each}", f'write robot = "{each}" in problem.toml', read_mdh(READY / f"{each}.toml"))
+    tried = [(f"the ready robot {each}", f'write robot = "{each}" in problem.toml', read_robot(READY / f"{each}.toml"))
              for each in robots()]  # fmt: skip
     same = [each for each in tried if each[2].joint_types == robot.joint_types]
     size = [misfit(other, points) for _, _, other in (*_conventions(robot), *same)]

@@ -6,7 +6,6 @@ from .extensions import families as families
 from .extensions import family_scales as family_scales
 from .extensions import gravity_torques as gravity_torques
 from .extensions import moment_slopes as moment_slopes
-from .formats.tables import read_mdh as read_mdh
 from .formats.tables import read_robot as read_robot
 from .formats.tables import write_robodk as write_robodk
 from .formats.tables import write_robot as write_robot

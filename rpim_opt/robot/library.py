@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
 from rpim_opt.robot.chain import XACRO, Described
-from rpim_opt.robot.formats.tables import read_mdh, read_sheet
+from rpim_opt.robot.formats.tables import read_robot, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
@@ -58,7 +58,7 @@ def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = No
         return read_sheet(file, convention)
     if convention:
         raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files say their convention")
-    return Described(read_mdh(file), np.zeros(6), np.zeros(6))
+    return Described(read_robot(file), np.zeros(6), np.zeros(6))
 
 
 class RobotSource(NamedTuple):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.robot.formats.tables import read_mdh
+from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.library import READY
 
 NOISE = 5e-5
@@ -18,7 +18,7 @@ SEEDS = range(2, 12)
 
 def simulated_arm(name: str, seed: int = 1, count: int = COUNT, markers: int = 1) -> ro.CalibrationProblem:
     """Return measurements of a ready robot with deviations of 0.5 mm and 0.5 mrad, far from the instrument."""
-    robot = read_mdh(READY / f"{name}.toml")
+    robot = read_robot(READY / f"{name}.toml")
     rng = np.random.default_rng(seed)
     low, high = np.clip(robot.limits, -2.5, 2.5).T
     q = rng.uniform(low, high, (count, robot.dof))

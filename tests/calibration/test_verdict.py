@@ -112,7 +112,7 @@ def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
         target = tmp_path / f"arm.{ending}"
         assert run(monkeypatch, "export", folder, "--mdh", str(target), "--despite-verdict") == 0
         assert "in spite of the verdict" in target.read_text()
-        np.testing.assert_array_equal(ro.read_mdh(target).mdh, result.robot.mdh)
+        np.testing.assert_array_equal(ro.read_robot(target).mdh, result.robot.mdh)
     compensate = ["compensate", folder, str(tmp_path / "targets.csv"), "--position-only"]
     assert run(monkeypatch, *compensate) == 1
     assert run(monkeypatch, *compensate, "--despite-verdict") == 0

@@ -62,7 +62,7 @@ def _robot_file(data: bytes, folder: Path, ending: str, read: Callable[[Path], r
     require(bool(np.isfinite(robot.mdh).all()), "a robot of finite numbers")
     for target in (folder / "again.toml", folder / "again.json"):
         ro.robot.write_robot(robot, target)
-        again = ro.read_mdh(target)
+        again = ro.read_robot(target)
         require(same(robot.mdh, again.mdh), f"{target.suffix}: the same numbers")
         require(same(robot.limits, again.limits), f"{target.suffix}: the same limits")
         require(robot.joint_types == again.joint_types, f"{target.suffix}: the same joints")
@@ -76,12 +76,12 @@ def robot(data: bytes, folder: Path) -> None:
 
 def robot_json(data: bytes, folder: Path) -> None:
     """Read a robot's JSON file."""
-    _robot_file(data, folder, ".json", ro.read_mdh)
+    _robot_file(data, folder, ".json", ro.read_robot)
 
 
 def robot_csv(data: bytes, folder: Path) -> None:
     """Read a robot's CSV file."""
-    _robot_file(data, folder, ".csv", ro.read_mdh)
+    _robot_file(data, folder, ".csv", ro.read_robot)
 
 
 def problem(data: bytes, folder: Path) -> None:

@@ -660,7 +660,7 @@ def test_tables_come_back_to_the_last_bit(tmp_path: Path, ending: str, coupled: 
             ro.robot.write_robot(robot, path)
         return
     ro.robot.write_robot(robot, path)
-    again = ro.read_mdh(path)
+    again = ro.read_robot(path)
     assert equal(again, robot)
     if ending != "csv":
         assert (again.name, again.source) == (robot.name, robot.source)
@@ -698,7 +698,7 @@ def test_bad_tables(tmp_path: Path, name: str, content: str, found: str) -> None
     path = tmp_path / name
     path.write_text(content)
     with pytest.raises(ro.InputError, match=found) as refused:
-        ro.read_mdh(path)
+        ro.read_robot(path)
     assert str(path) in str(refused.value)
 
 

@@ -220,9 +220,9 @@ def test_a_robots_gravity_comes_back_from_its_file(tmp_path: Path, ending: str, 
     robot = random_robot(3)
     robot = replace(robot, gravity=robot.gravity.mounted(mounting))
     ro.robot.write_robot(robot, path)
-    assert ro.read_mdh(path).gravity == robot.gravity
+    assert ro.read_robot(path).gravity == robot.gravity
     ro.robot.write_robot(ARM, path)
-    assert ro.read_mdh(path).gravity == ro.robot.Gravity()
+    assert ro.read_robot(path).gravity == ro.robot.Gravity()
     assert "mounting" not in path.read_text()
 
 
@@ -230,7 +230,7 @@ def test_a_table_of_joints_has_masses_and_no_place_for_the_rest(tmp_path: Path) 
     path = tmp_path / "arm.csv"
     masses = ro.robot.Gravity(masses=(1.0, 0, 2.0, 0, 0, 0.25), centres=((0.01, 0, 0.1), *[(0.0, 0.0, 0.0)] * 5))
     ro.robot.write_robot(replace(ARM, gravity=masses), path)
-    assert ro.read_mdh(path).gravity == masses
+    assert ro.read_robot(path).gravity == masses
     for other, match in ((masses.mounted("wall"), "mounting"), (masses.carrying(1.0), "a payload")):
         with pytest.raises(ro.InputError, match=match):
             ro.robot.write_robot(replace(ARM, gravity=other), path)
@@ -249,7 +249,7 @@ def test_a_robots_file_with_a_wrong_mounting_or_mass_is_refused(tmp_path: Path) 
     for text, match in cases.items():
         path.write_text(text)
         with pytest.raises(ro.InputError, match=match):
-            ro.read_mdh(path)
+            ro.read_robot(path)
 
 
 URDF = """<robot name="arm"><link name="world"/>

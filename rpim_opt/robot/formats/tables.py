@@ -22,6 +22,7 @@ from rpim_opt.robot.chain import Chain, Described, describe, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
+ENDINGS = (".toml", ".json", ".csv")
 LIMITS = ("lower", "upper")
 SI = {"angle": "rad", "length": "m"}
 FAR = 10.0
@@ -108,7 +109,7 @@ def gravity_with(
     file: object,
     base: Array | None = None,
 ) -> Gravity:
-    """Return a robot's gravity with the mounting and the payload that a file states."""
+    """Return gravity with the mounting and the payload that a file states; ``base`` is that of `Gravity.mounted`."""
     try:
         if mounting is not None:
             gravity = gravity.mounted(mounting, base)
@@ -123,15 +124,21 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     """Return the robot that the keys of a ``robot.toml`` describe, whatever file they come from."""
     table = validate(_RobotTable, content, path)
     dof = len(table.joint)
-    coupling = table.coupling
-    if coupling is None:
-        coupling = np.eye(dof).tolist()
+    coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or any(len(row) != dof for row in coupling):
         raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers", path)
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
             raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]", path)
+    gravity = Gravity()
+    if any(joint.mass is not None for joint in table.joint):  # then others weigh nothing
+        masses = tuple(joint.mass or 0.0 for joint in table.joint)
+        centres = tuple((joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint)
+        try:
+            gravity = Gravity(masses=masses, centres=centres)
+        except InputError as error:
+            raise error.within(path) from None
     return Robot(
         name=table.name,
         mdh=np.array([[getattr(joint, column) for column in MDH] for joint in table.joint]),
@@ -139,53 +146,20 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
         joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ np.array(coupling),
         limits=np.array(limits, dtype=float),
         source=table.source,
-        gravity=_gravity(table, path),
+        gravity=gravity_with(gravity, table.mounting, table.payload, path),
     )
-
-
-def _gravity(table: _RobotTable, path: Path) -> Gravity:
-    """Return gravity with the masses of the links that state one; others weigh nothing. Without any, the guess."""
-    masses: tuple[float, ...] = ()
-    centres: tuple[tuple[float, float, float], ...] = ()
-    if any(joint.mass is not None for joint in table.joint):
-        masses = tuple(joint.mass or 0.0 for joint in table.joint)
-        centres = tuple((joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint)
-    try:
-        gravity = Gravity(masses=masses, centres=centres)
-    except InputError as error:
-        raise error.within(path) from None
-    return gravity_with(gravity, table.mounting, table.payload, path)
 
 
 # Reading
 
 
 def read_robot(path: str | Path) -> Robot:
-    """Return the robot of a ``robot.toml`` file (its format: the guide "Your own robot").
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key, what was found and what is accepted.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
-    >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
-    [1.5708, 0.0, 0.0, 0.107, 0.0]
-    """
-    path = Path(path)
-    return _robot(read_toml(path), path)
-
-
-def read_mdh(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
 
-    JSON has the keys of ``robot.toml`` (the guide "Your own robot"). CSV has a row a joint and the keys of a
+    TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has a row a joint and the keys of a
     ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
-    cell is left out. A column ``convention`` says ``modified`` or ``standard`` (`read_sheet`).
+    cell is left out. A column ``convention`` says ``modified`` or ``standard``.
 
     Raises
     ------
@@ -195,56 +169,38 @@ def read_mdh(path: str | Path) -> Robot:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "arm.csv")
-    >>> ro.read_mdh("arm.csv").dof
-    6
+    >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
+    >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
+    [1.5708, 0.0, 0.0, 0.107, 0.0]
     """
     path = Path(path)
-    readers = {".toml": read_robot, ".json": _read_json, ".csv": _read_csv}
-    return _by_ending(readers, path)(path)
-
-
-def _by_ending(known: dict[str, Any], path: Path) -> Any:
-    if path.suffix.lower() not in known:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(known), path)
-    return known[path.suffix.lower()]
-
-
-def _read_json(path: Path) -> Robot:
-    content = read_json(path)
+    ending = _ending(path)
+    if ending == ".csv":
+        described = read_sheet(path)
+        if described.tool.any() or described.base.any():
+            raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new", path)
+        return described.robot
+    content = read_json(path) if ending == ".json" else read_toml(path)
     if not isinstance(content, dict):
         raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
     return _robot(content, path)
 
 
-def _read_csv(path: Path) -> Robot:
-    described = read_sheet(path)
-    if described.tool.any() or described.base.any():
-        raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new", path)
-    return described.robot
+def _ending(path: Path) -> str:
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS), path)
+    return ending
 
 
 def read_sheet(path: Path, convention: str = "") -> Described:
-    r"""Return the robot of a table with a row a joint, as people have them, in the convention that it or somebody says.
+    """Return the robot of a table with a row a joint, as people have them, in the convention that it or somebody says.
 
     ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
     Hayati are converted exactly; what follows the last joint becomes the tool::
 
         modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
-
-    Raises
-    ------
-    InputError
-        Where nobody says the convention, for rows that are no joints, and what `read_mdh` refuses.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from rpim_opt.robot.formats.tables import read_sheet
-    >>> _ = Path("dh.csv").write_text("i;theta [°];d [mm];a [mm];alpha [°]\n1;q1;99,5;0;90\n2;q2-90;0;425;0\n")
-    >>> read_sheet(Path("dh.csv"), "standard").robot.mdh.round(4).tolist()  # alpha, a, theta, d, beta
-    [[0.0, 0.0, 0.0, 0.0995, 0.0], [1.5708, 0.0, -1.5708, 0.0, 0.0]]
     """
     raw = read_table(path)
     lost = next((note for note in raw.notes if "is no row of the table" in note or "sums others up" in note), "")
@@ -254,18 +210,17 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     columns = {named[name]: [str(cell) for cell in cells] for name, cells in raw.columns.items() if named[name]}
     if len(columns) < sum(map(bool, named.values())):
         raise InputError("the header", ", ".join(raw.columns), "every column once", path)
-    said = {cell.lower() for cell in columns.pop("convention", [])} - {""}
+    said = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         said.add("modified")
-    known = {CONVENTIONS.get(each, each) for each in said | ({convention} if convention else set())}
+    known = {CONVENTIONS.get(each, each) for each in said}
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
         accepted = (
             "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
             "or a column convention with one of the words"
         )
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "no word of it", accepted, path)
-    rows = range(len(next(iter(columns.values()))))
-    joints = [_joint({name: cells[i] for name, cells in columns.items()}) for i in rows]
+    joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
     if known == {"modified"}:
         return Described(robot, np.zeros(6), np.zeros(6))
@@ -287,21 +242,23 @@ def _sheet_name(name: str) -> str:
 def _from_standard(robot: Robot) -> Described:
     """Return the arm of numbers in the standard convention, with Hayati's beta behind every link."""
     alpha, a, theta, d, beta = robot.mdh.T
+    shifted = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
     if not beta.any():  # the same numbers, alpha and a one row further
-        mdh = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
-        return Described(replace(robot, mdh=mdh), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
-    links = [
-        numeric_link(theta=theta[i], d=d[i]) @ numeric_link(alpha[i], a[i], beta=beta[i]) for i in range(robot.dof)
-    ]
-    near = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
-    mdh, base, tool, _ = describe(Chain.about_z([np.eye(4), *links[:-1]], links[-1]), near)
+        return Described(replace(robot, mdh=shifted), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
+    turns = [numeric_link(theta=each, d=along) for each, along in zip(theta, d, strict=True)]
+    links = [turn @ numeric_link(alpha[i], a[i], beta=beta[i]) for i, turn in enumerate(turns)]
+    mdh, base, tool, _ = describe(Chain.about_z([np.eye(4), *links[:-1]], links[-1]), shifted)
     return Described(replace(robot, mdh=mdh), frame_numbers(base), frame_numbers(tool))
 
 
 def _joint(cells: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
-    joint = {name: _cell(ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0") if name.startswith("theta") else _cell(text)
-             for name, text in cells.items() if text and name != "note"}  # fmt: skip
+    joint: dict[str, Any] = {}
+    for name, text in cells.items():
+        if text and name != "note":
+            if name.startswith("theta"):
+                text = ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0"
+            joint[name] = _cell(text)
     for unit in UNITS:
         pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
         if any(value is not None for value in pair):
@@ -322,7 +279,7 @@ def _cell(text: str) -> Any:
 
 
 def write_robot(robot: Robot, path: str | Path) -> None:
-    """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_mdh` gives back exactly the same numbers.
+    """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_robot` gives back exactly the same numbers.
 
     Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere.
 
@@ -345,11 +302,25 @@ def write_robot(robot: Robot, path: str | Path) -> None:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
     >>> ro.robot.write_robot(result.robot, "identified.toml")
-    >>> bool((ro.read_mdh("identified.toml").mdh == result.robot.mdh).all())
+    >>> bool((ro.read_robot("identified.toml").mdh == result.robot.mdh).all())
     True
     """
     path = Path(path)
-    _by_ending({".toml": _write_toml, ".json": _write_json, ".csv": _write_csv}, path)(robot, path)
+    ending = _ending(path)
+    content = _content(robot)
+    if ending == ".json":
+        write_json(path, content)
+    elif ending == ".csv":
+        write_text(path, _csv(robot, content, path))
+    else:
+        joints = content.pop("joint")
+        carried = content.pop("payload", None)
+        blocks = [("", content)]
+        if carried:
+            blocks.append(("[payload]\n", carried))
+        blocks += [("[[joint]]\n", joint) for joint in joints]
+        lines = [head + "\n".join(f"{key} = {toml(value)}" for key, value in keys.items()) for head, keys in blocks]
+        write_text(path, "\n\n".join(lines) + "\n")
 
 
 def write_robodk(robot: Robot, path: str | Path) -> list[str]:
@@ -420,7 +391,13 @@ def _content(robot: Robot) -> dict[str, Any]:
     for joint, sign in zip(joints, signs, strict=True):
         if plain and sign < 0:
             joint["sign"] = -1
-    return content | _gravity_keys(robot.gravity) | {"joint": joints}
+    gravity = robot.gravity
+    if gravity.direction != MOUNTINGS["floor"]:
+        words = {direction: word for word, direction in MOUNTINGS.items()}
+        content["mounting"] = words.get(gravity.direction, list(gravity.direction))
+    if gravity.payload or any(gravity.payload_centre):
+        content["payload"] = {"mass_kg": gravity.payload} | _centre_keys(gravity.payload_centre, "")
+    return content | {"joint": joints}
 
 
 def _keys(robot: Robot, i: int, in_si: bool = False) -> dict[str, Any]:
@@ -439,17 +416,6 @@ def _keys(robot: Robot, i: int, in_si: bool = False) -> dict[str, Any]:
         joint["mass_kg"] = robot.gravity.masses[i]
         joint |= _centre_keys(robot.gravity.centres[i], "centre_", in_si)
     return joint
-
-
-def _gravity_keys(gravity: Gravity) -> dict[str, Any]:
-    """Return the keys that state where gravity points and what the flange carries; none for what is usual."""
-    words = {direction: word for word, direction in MOUNTINGS.items()}
-    keys: dict[str, Any] = {}
-    if gravity.direction != MOUNTINGS["floor"]:
-        keys["mounting"] = words.get(gravity.direction, list(gravity.direction))
-    if gravity.payload or any(gravity.payload_centre):
-        keys["payload"] = {"mass_kg": gravity.payload} | _centre_keys(gravity.payload_centre, "")
-    return keys
 
 
 def _centre_keys(centre: tuple[float, ...], prefix: str, in_si: bool = False) -> dict[str, float]:
@@ -472,28 +438,12 @@ def exact(dimension: str, values: Any, in_si: bool = False) -> tuple[str, list[f
     return SI[dimension], [float(v) for v in values]
 
 
-def _write_json(robot: Robot, path: Path) -> None:
-    write_json(path, _content(robot))
-
-
-def _write_toml(robot: Robot, path: Path) -> None:
-    content = _content(robot)
-    joints = content.pop("joint")
-    carried = content.pop("payload", None)
-    blocks = [[f"{key} = {toml(value)}" for key, value in content.items()]]
-    if carried:
-        blocks.append(["[payload]", *(f"{key} = {toml(value)}" for key, value in carried.items())])
-    blocks += [["[[joint]]", *(f"{key} = {toml(value)}" for key, value in joint.items())] for joint in joints]
-    write_text(path, "\n\n".join("\n".join(block) for block in blocks) + "\n")
-
-
 def toml(value: Any) -> str:
     """Return a text, number or list of lists as TOML, which writes them as JSON does."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _write_csv(robot: Robot, path: Path) -> None:
-    content = _content(robot)
+def _csv(robot: Robot, content: dict[str, Any], path: Path) -> str:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json", path)
@@ -504,7 +454,7 @@ def _write_csv(robot: Robot, path: Path) -> None:
     signs = {"sign"} if all(row["sign"] == 1 for row in rows) else set()
     header += sorted({key for row in rows for key in row} - set(header) - signs)
     table = ([*(row.get(key, 0.0 if key in header[:5] else "") for key in header), "modified"] for row in rows)
-    write_text(path, csv_text([*header, "convention"], table))
+    return csv_text([*header, "convention"], table)
 
 
 def _cells(joint: dict[str, Any]) -> dict[str, Any]:

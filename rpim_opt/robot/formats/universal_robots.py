@@ -59,17 +59,8 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
     beta3 take the tilt and every number is near nominal.
 
-    Parameters
-    ----------
-    path
-        The file.
-    nominal
-        The model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key, what was found and what is accepted; for a nominal robot without six revolute joints.
+    ``nominal`` is the model, a ready robot such as ``read_robot(find_robot("ur5e"))``. An error names the file and the
+    key, what was found and what is accepted.
 
     Examples
     --------
@@ -98,21 +89,8 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
     what else it checks (the file has checksums of the joints) is not documented. Keep the original.
 
-    Parameters
-    ----------
-    source
-        The robot's own file.
-    robot
-        The identified robot, in the controller's Base.
-    nominal
-        The model, as for `read_ur_calibration`.
-    target
-        Where to write; may be ``source``.
-
-    Raises
-    ------
-    InputError
-        For alpha1 or a1 that deviate (the base has to hold them), beta6, or axes too nearly parallel.
+    ``robot`` is in the controller's Base; ``source``, its own file, may be the target, too. Refused are alpha1 or a1
+    that deviate (the base has to hold them), beta6, and axes too nearly parallel.
 
     Examples
     --------
@@ -133,11 +111,11 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that holds where axis 1 is", path)
     change = without_beta(robot).mdh - nominal.mdh
-    shifted = {"theta": change[:, 2], "d": change[:, 3], "a": np.append(change[1:, 1], 0.0)}
-    shifted["alpha"] = np.append(change[1:, 0], 0.0)
+    behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
+    new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
     edits = {
         places[name]: ", ".join(repr(float(v)) for v in values)
-        for name, values in shifted.items()
+        for name, values in new.items()
         if not np.array_equal(values, old[name])
     }
     write_bytes(Path(target), spliced(data, edits))
@@ -153,11 +131,10 @@ def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[
     for name, key in DELTAS.items():
         line = rb"^[ \t]*" + key.encode() + rb"[ \t]*=[ \t]*\[([^\]\n]*)\]"
         lists = list(re.finditer(line, section[1], re.MULTILINE))
-        if len(lists) != 1:
-            raise InputError(f"key {key}", f"{len(lists)} lists", "one list of six numbers", path)
-        parts = lists[0][1].split(b",")
+        parts = lists[0][1].split(b",") if len(lists) == 1 else []
         if len(parts) != 6:
-            raise InputError(f"key {key}", f"{len(parts)} numbers", "one list of six numbers", path)
+            found = f"{len(parts)} numbers" if len(lists) == 1 else f"{len(lists)} lists"
+            raise InputError(f"key {key}", found, "one list of six numbers", path)
         values[name] = np.array([_number(part.strip(), f"key {key}", path) for part in parts])
         places[name] = (section.start(1) + lists[0].start(1), section.start(1) + lists[0].end(1))
     return values, places
@@ -176,17 +153,7 @@ def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Describ
     ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
     the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
 
-    Parameters
-    ----------
-    path
-        The file: plain keys, two spaces or more a level, one a line.
-    limits
-        (6, 2) joint limits [rad], which the file does not hold.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the line or key, what was found and what is accepted.
+    The file has plain keys, two spaces or more a level, one a line; joint limits (6, 2) [rad] are not in it.
 
     Examples
     --------
@@ -207,20 +174,8 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
 
     The driver compares the hash with the controller's own calibration; it is that of the robot, not of the numbers.
 
-    Parameters
-    ----------
-    source
-        The original, or ur_description's default_kinematics.yaml of the model. Its `read_ur_kinematics` has to be
-        the robot whose parameters were identified.
-    robot
-        The identified robot.
-    target
-        Where to write; may be ``source``.
-
-    Raises
-    ------
-    InputError
-        As `read_ur_kinematics`, and for another robot or a beta after the last joint.
+    ``source`` is the original, or ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has
+    to be the robot whose parameters were identified. Refused are another robot, and a beta after the last joint.
 
     Examples
     --------
@@ -275,9 +230,8 @@ def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], t
                 raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once", path)
             values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}", path)
             places[joint, key] = (begin + match.start(3), begin + match.end(3))
-    for joint in JOINTS:
-        for key in SIX:
-            if (joint, key) not in values:
-                raise InputError(f"key {joint}.{key}", "nothing", "a number [m or rad]", path)
+    missing = [f"{joint}.{key}" for joint in JOINTS for key in SIX if (joint, key) not in values]
+    if missing:
+        raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]", path)
     origins = [numeric_frame([values[joint, key] for key in SIX]) for joint in JOINTS]
     return Chain.about_z(origins, np.eye(4)), places

@@ -9,9 +9,10 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -82,9 +83,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     urdf = _read(Path(path))
     steps = urdf.path_between(base, tip)
     joints = [step.joint for step in steps if step.joint.kind]
-    chain = _chain(urdf, steps)
-    table, T_base, T_tool, G = describe(chain)
-    masses, centres = _carried_masses(urdf, steps)
+    table, T_base, T_tool, G = describe(_chain(urdf, steps))
     T_top_base = np.linalg.inv(_product([step.constant for step in steps if step.up]))
     robot = Robot(
         name=urdf.name,
@@ -92,9 +91,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
         joint_types=tuple(joint.kind for joint in joints),
         limits=np.array([joint.limits for joint in joints]),
         source=f"{urdf.path.name}, {steps[0].start} to {steps[-1].end}",
-        gravity=Gravity(masses=masses, centres=_on_frames(centres, table, G)).mounted(
-            "floor", (T_top_base @ T_base)[:3, :3]
-        ),
+        gravity=_masses(urdf, steps, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
     )
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
 
@@ -156,15 +153,20 @@ def write_urdf(
     size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
     for between, old, new in zip(_rigid_parts(steps), [*chain.origins, chain.tail], [*origins, tail], strict=True):
-        taker = _taker(between)
-        if taker is not None:  # the other origins stay, this one takes the whole correction
+        if between:  # one origin takes the whole correction: of the joint after, before, or a fixed one
+            taker = 0 if between[0].up and not between[-1].joint.kind else len(between) - 1
             before = _product([step.constant for step in between[:taker]])
             after = _product([step.constant for step in between[taker + 1 :]])
-            T: Array = np.linalg.inv(before) @ new @ np.linalg.inv(after)
             step = between[taker]
+            T = _inverse(before) @ new @ _inverse(after)
             edits |= step.joint.origin_edits(urdf.data, _inverse(T) if step.up else T, size)
         elif np.abs(new - old).max() > 10 * ROUNDING * size:
-            raise _inexpressible(urdf, steps, at_tip=new is tail)
+            at_tip = new is tail
+            step = steps[-1 if at_tip else 0]
+            what = f"a tool or beta{len(table)}" if at_tip else "a base"
+            found = f"{what} that moves link '{step.end if at_tip else step.start}'"
+            accepted = f"a link that a fixed joint holds, as joint '{step.joint.name}' cannot express it"
+            raise InputError("robot", found, f"{accepted}, or no such correction", urdf.path)
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
@@ -210,14 +212,6 @@ def _rigid_parts(steps: Sequence[_Step]) -> list[list[_Step]]:
     return parts
 
 
-def _taker(between: Sequence[_Step]) -> int | None:
-    """Return which origin of a rigid part is corrected: that of the joint after it, before it, or a fixed one."""
-    if not between:
-        return None
-    first_fixed = between[0].up and not between[-1].joint.kind
-    return 0 if first_fixed else len(between) - 1
-
-
 def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:
     """Return the geometry of the joints that move."""
     moving = [step for step in steps if step.joint.kind]
@@ -230,17 +224,6 @@ def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:
     *origins, tail = [_product([step.constant for step in part]) for part in _rigid_parts(steps)]
     axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
     return Chain(np.array(origins), np.array(axes), tail)
-
-
-def _inexpressible(urdf: _Urdf, steps: Sequence[_Step], at_tip: bool) -> InputError:
-    """Return the error for a correction before the first or after the last joint where no fixed joint takes it."""
-    link, what = (steps[0].start, "a base")
-    joint = steps[0].joint
-    if at_tip:
-        link, what = (steps[-1].end, f"a tool or beta{sum(bool(step.joint.kind) for step in steps)}")
-        joint = steps[-1].joint
-    accepted = f"a link that a fixed joint holds, as joint '{joint.name}' cannot express it, or no such correction"
-    return InputError("robot", f"{what} that moves link '{link}'", accepted, urdf.path)
 
 
 # Elements
@@ -389,8 +372,7 @@ class _Urdf:
                 raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
         base = base or self._root()
         tip = tip or self._leaf(base)
-        up = self._to_root(base)
-        down = self._to_root(tip)
+        up, down = self._to_root(base), self._to_root(tip)
         while up and down and up[-1] is down[-1]:
             up.pop()
             down.pop()
@@ -405,6 +387,14 @@ class _Urdf:
             joints.append(self.above[link])
             link = joints[-1].parent
         return joints
+
+    def above_until(self, link: str, known: Collection[str]) -> list[_Joint] | None:
+        """Return the joints from a link up to the first known one; None where no known one is above."""
+        if link in known:
+            return []
+        joints = self._to_root(link)
+        count = next((i for i, joint in enumerate(joints, start=1) if joint.parent in known), None)
+        return None if count is None else joints[:count]
 
     def _root(self) -> str:
         roots = [link for link in self.links if link not in self.above]
@@ -448,7 +438,10 @@ def _read(path: Path) -> _Urdf:
             found = f"two parents, by joints '{above[joint.child].name}' and '{joint.name}'"
             raise InputError(f"link '{joint.child}'", found, "one", path)
         above[joint.child] = joint
-    _require_tree(links, above, path)
+    try:
+        TopologicalSorter({child: {joint.parent} for child, joint in above.items()}).prepare()
+    except CycleError as error:
+        raise InputError(f"link '{error.args[1][0]}'", "a cycle of joints", "a tree", path) from None
     return _Urdf(path, data, root.attributes.get("name") or path.stem, links, above)
 
 
@@ -462,19 +455,6 @@ def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
             raise InputError(f"element <{element.tag}>", found, "every one with a name of its own", path)
         known[name] = element
     return known
-
-
-def _require_tree(links: Mapping[str, _Element], above: Mapping[str, _Joint], path: Path) -> None:
-    grounded: set[str] = set()
-    for link in links:
-        trail: list[str] = []
-        at = link
-        while at in above and at not in grounded:
-            if at in trail:
-                raise InputError(f"link '{at}'", "a cycle of joints", "a tree", path)
-            trail.append(at)
-            at = above[at].parent
-        grounded.update(trail)
 
 
 def _root_element(data: bytes, path: Path) -> _Element:
@@ -509,7 +489,10 @@ def _root_element(data: bytes, path: Path) -> _Element:
 
 
 def _urdf_text(path: Path) -> bytes:
-    """Return the content of a URDF file, or what a xacro file says with its own defaults."""
+    """Return the content of a URDF file, or what a xacro file says with its own defaults.
+
+    Expressions are carried out and other files included: problem folders, which may be somebody else's, name no xacro.
+    """
     content = read_bytes(path)
     if path.suffix.lower() != XACRO:
         return content
@@ -530,67 +513,42 @@ def _urdf_text(path: Path) -> bytes:
 # Masses
 
 
-def _carried_masses(urdf: _Urdf, steps: Sequence[_Step]) -> tuple[tuple[float, ...], tuple[Array, ...]]:
-    """Return the mass [kg] that each moving joint of a chain carries up to the next, and its centre [m]."""
+def _masses(urdf: _Urdf, steps: Sequence[_Step], table: Array, G: Array) -> Gravity:
+    """Return the mass that each moving joint of a chain carries up to the next, and its centre in the table's frames.
+
+    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
+    cannot be read beside the chain is left out, as it is elsewhere. No masses where nothing that moves has one, or the
+    base itself is moved.
+    """
     if any(step.up and step.joint.kind for step in steps):
-        return (), ()
-    frames = _frames(steps)
-    count = max(i for i, _ in frames.values())
-    masses = np.zeros(count)
-    moments = np.zeros((count, 3))
+        return Gravity()
+    frames = {steps[0].start: (0, np.eye(4))}  # which moving joint (from 1; 0: none) carries a link, and where it is
+    for step in steps:
+        i, T = frames[step.start]
+        frames[step.end] = (i + 1, np.eye(4)) if step.joint.kind else (i, T @ step.constant)
+    masses = np.zeros(len(table))
+    moments = np.zeros((len(table), 3))
     for name, body in urdf.links.items():
-        held = _held(urdf, name, frames)
         mass, centre = _inertial(urdf, name, body, name in frames)
-        if held is None or not mass:
+        above = urdf.above_until(name, frames)
+        if not mass or above is None:
             continue
-        i, T = held
+        i, T = frames[above[-1].parent if above else name]
+        try:
+            T = T @ _product([joint.origin for joint in reversed(above)])
+        except InputError:
+            continue
         if i:
             masses[i - 1] += mass
             moments[i - 1] += mass * (T[:3, :3] @ centre + T[:3, 3])
     if not masses.any():
-        return (), ()
-    weighty = np.where(masses > 0, masses, 1.0)
-    return tuple(masses.tolist()), tuple(moments / weighty[:, None])
-
-
-def _on_frames(centres: Sequence[Array], table: Array, G: Array) -> tuple[Vector, ...]:
-    """Return centres in the frames after the table's links, with what ties the file's to them (`chain.describe`)."""
-    if not centres:
-        return ()
-    found = []
-    for centre, row, g in zip(centres, table, G, strict=True):
+        return Gravity()
+    centres: list[Vector] = []
+    for moment, mass, row, g in zip(moments, masses, table, G, strict=True):
         T = numeric_link(beta=-row[4]) @ g
-        x, y, z = (T[:3, :3] @ centre + T[:3, 3]).tolist()
-        found.append((x, y, z))
-    return tuple(found)
-
-
-def _frames(steps: Sequence[_Step]) -> dict[str, tuple[int, Array]]:
-    """Return for the links of a chain which moving joint (from 1; 0: none) carries them, and where they are on it."""
-    frames = {steps[0].start: (0, np.eye(4))}
-    for step in steps:
-        i, T = frames[step.start]
-        if step.joint.kind:
-            frames[step.end] = (i + 1, np.eye(4))
-        else:
-            frames[step.end] = (i, T @ step.constant)
-    return frames
-
-
-def _held(urdf: _Urdf, name: str, frames: dict[str, tuple[int, Array]]) -> tuple[int, Array] | None:
-    """Return by which joint a link of the file is carried, and where it is on it; None for what is above the base."""
-    T = np.eye(4)
-    while name not in frames:
-        joint = urdf.above.get(name)
-        if joint is None:
-            return None
-        try:
-            T = joint.origin @ T
-        except InputError:
-            return None
-        name = joint.parent
-    i, start = frames[name]
-    return i, start @ T
+        x, y, z = (T[:3, :3] @ (moment / (mass or 1.0)) + T[:3, 3]).tolist()
+        centres.append((x, y, z))
+    return Gravity(masses=tuple(masses.tolist()), centres=tuple(centres))
 
 
 def _inertial(urdf: _Urdf, name: str, body: _Element, required: bool) -> tuple[float, Array]:
