@@ -1,11 +1,11 @@
-"""Where a table's header and rows are among the cells of a file, and its numbers without commas, thousands, units."""
+"""Header and rows of a table among the cells of a file, its numbers without decimal commas, thousands and units."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +30,6 @@ SUMMARIES = frozenset({
 })  # fmt: skip
 """What a row begins with that is no measurement."""
 COMMENT = ("//", "#", "%", "!", "*")
-"""What a line begins with that other programs skip."""
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
@@ -41,8 +40,6 @@ VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.
 """What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
-
-
 READING = ("encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "joints")
 """What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
@@ -68,10 +65,9 @@ class TableOptions:
         body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
     prefix
         Of the names of the joints, where columns of several robots are there.
-    key
-        The column by which several files are joined; ``"row"`` for the number of the row.
-    within
-        Tolerance [s] where they are joined by the nearest time.
+    key, within
+        The column by which several files are joined, ``"row"`` for the number of the row; tolerance [s] where they are
+        joined by the nearest time.
     joints
         What the robot's file calls its joints.
 
@@ -79,8 +75,8 @@ class TableOptions:
     --------
     >>> import rpim_opt as ro
     >>> options = ro.data.TableOptions(separator="semicolon", units={"angle": "rad", "length": "m"}, quaternion="xyzw")
-    >>> options.key
-    ''
+    >>> options.texts()
+    {'separator': 'semicolon', 'units': 'rad,m', 'quaternion': 'xyzw'}
     """
 
     sheet: str = ""
@@ -98,12 +94,7 @@ class TableOptions:
 
     @classmethod
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
-        """Return the options that texts state, as a problem file's ``[reading]`` has them.
-
-        >>> from rpim_opt.basics.layout import TableOptions
-        >>> TableOptions.stated({"units": "q=rad,mm", "rotation": "vector"}).units
-        {'q': 'rad', 'length': 'mm'}
-        """
+        """Return the options that texts state, as a problem file's ``[reading]`` has them."""
         for name in texts:
             if name not in READING:
                 raise InputError("key reading", f"'{name}'", choices(name, READING))
@@ -113,7 +104,7 @@ class TableOptions:
         return cls(**{**found, "units": parse_units(texts.get("units", ""))})
 
     def texts(self) -> dict[str, str]:
-        """Return what is stated, as `stated` takes it, but for how several files are joined."""
+        """Return what is stated as texts, but for the sheet and for how several files are joined."""
         said = {name: getattr(self, name) for name in READING}
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
         said |= {"units": ",".join(units), "columns": ",".join(self.columns), "joints": ",".join(self.joints)}
@@ -133,22 +124,24 @@ class Head(NamedTuple):
         return f"{self.group} {self.name}".strip() + unit
 
 
+class Column(NamedTuple):
+    """A column: its name, which no other one has, what stands above it, and its cells."""
+
+    name: str
+    head: Head
+    cells: Sequence[Any]
+
+
 @dataclass(frozen=True)
 class RawTable:
     """A table as its file has it, numbers as Python writes them.
 
-    Parameters
-    ----------
-    columns
-        Cells by what stands above them; a name that is there again has its place behind it, ``X #7``.
-    heads
-        The same taken apart.
-    notes
-        How it was read, and what was left out, a sentence each.
+    ``columns`` are cells by what stands above them (a name that is there again has its place behind it, ``X #7``),
+    ``heads`` the same taken apart; ``notes`` say how it was read, and what was left out, a sentence each.
     """
 
     columns: Columns
-    heads: dict[str, Head] = field(default_factory=dict)
+    heads: Mapping[str, Head] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
@@ -158,13 +151,6 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     A column whose cells list several numbers, ``[1.5, 2, 3]``, becomes a column each; rows that hold one coordinate
     each, ``P1, X, 1.5``, become one.
 
-    Raises
-    ------
-    InputError
-        For a file that cannot be read, and a table without header of which no columns are stated.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> from rpim_opt.basics.layout import read_table
     >>> text = "Cell 7;;;\nJoints;;Position;\nJ1;J2;X;Y\n[deg];[deg];[mm];[mm]\n1,5;2;3;4\n"
@@ -174,28 +160,29 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
     options = options or TableOptions()
+    notes: list[str] = []
     try:
         if columns is None and path.suffix.lower() == ".parquet":
             columns = read_columns(path)
         if columns is not None:
-            raw = RawTable(columns, {name: Head(name) for name in columns})
+            found = [Column(name, Head(name), cells) for name, cells in columns.items()]
         else:
-            raw = _table(read_grid(path, options.sheet, options.encoding, options.separator), options)
-        return _one_row_each(_one_number_each(raw))
+            found, notes = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
+        found = [each for column in found for each in _one_number_each(column)]
+        found, note = _one_row_each(found)
     except InputError as error:
         raise error.within(path) from None
+    by_name = {column.name: column.cells for column in found}
+    return RawTable(by_name, {column.name: column.head for column in found}, (*notes, *note))
 
 
-def missing_rows(columns: Columns, names: Sequence[str]) -> list[int]:
-    """Return the rows (from 0) in which all of some columns have no value."""
-    if not names:  # nor columns, perhaps
-        return []
-    rows = zip(*(columns[name] for name in names), strict=True)
-    return [i for i, row in enumerate(rows) if all(is_missing(str(cell)) for cell in row)]
+def is_missing(cell: str) -> bool:
+    """Return whether a cell says that there is no value."""
+    return MISSING.fullmatch(cell.strip()) is not None
 
 
-def _table(grid: Grid, options: TableOptions) -> RawTable:
-    """Return the table among the rows of a file."""
+def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]]:
+    """Return the table among the rows of a file, and how it was read."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
     if not grid.rows:
@@ -204,26 +191,14 @@ def _table(grid: Grid, options: TableOptions) -> RawTable:
         raise InputError("the table", "a header and no rows", "at least one row of numbers")
     full = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, full, options)
-    summing = [i for i in full if _first(grid.rows[i]).lower().rstrip(":") in SUMMARIES]
-    rows = [grid.rows[i] for i in sorted(set(full) - set(summing))]
-    _require_width(rows, len(heads), options)
-    columns, heads = _columns(rows, heads)
-    columns, mark = _plain(columns, options.decimal)
-    columns, heads = _without_units(columns, heads)
-    notes = [*grid.notes, *_about_header(grid, above, options), *_about_rows(grid, full, above)]
-    notes += [f"line {grid.lines[i]} sums others up: left out '{_first(grid.rows[i])}'." for i in summing]
+    first = {i: next(filter(None, grid.rows[i])) for i in full}
+    summing = [i for i in full if first[i].lower().rstrip(":") in SUMMARIES]
+    columns, mark = _columns([grid.rows[i] for i in full if i not in summing], heads, options)
+    notes = [*grid.notes, *_notes(grid, full, above, options)]
+    notes += [f"line {grid.lines[i]} sums others up: left out '{first[i]}'." for i in summing]
     if mark == ",":
         notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can part thousands'}.")
-    return RawTable(columns, heads, tuple(notes))
-
-
-def _first(row: Sequence[str]) -> str:
-    return next(cell for cell in row if cell)
-
-
-def is_missing(cell: str) -> bool:
-    """Return whether a cell says that there is no value."""
-    return MISSING.fullmatch(cell.strip()) is not None
+    return columns, notes
 
 
 def _count(row: Sequence[str]) -> int:
@@ -232,17 +207,46 @@ def _count(row: Sequence[str]) -> int:
     return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
+def _notes(grid: Grid, full: Sequence[int], above: Sequence[int], options: TableOptions) -> list[str]:
+    """Say where the header is, unless it is the first line alone, and which lines below it are no rows."""
+
+    def lines(rows: Sequence[int]) -> str:
+        return "line " + listed([str(grid.lines[i]) for i in rows])
+
+    notes = []
+    if options.columns:
+        notes.append("names of columns as stated" + (f", instead of {lines(above)}." if above else "."))
+    elif len(above) > 1:
+        notes.append(f"the header has {len(above)} lines, from line {grid.lines[above[0]]}.")
+    if above and above[0]:
+        notes.append(f"{above[0]} lines above the header are left out ('{' '.join(grid.rows[0])[:50]}' ...).")
+    header = [grid.rows[i] for i in above]
+    below = sorted(set(range(full[0], len(grid.rows))) - set(full))
+    again = [i for i in below if grid.rows[i] in header]
+    others = [i for i in below if grid.rows[i] not in header]
+    if again:
+        notes.append(f"the header stands there again in {lines(again)}: left out.")
+    for i in others[:MOST_NAMED]:
+        text = ", ".join(filter(None, grid.rows[i]))
+        notes.append(f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'.")
+    if len(others) > MOST_NAMED:
+        notes.append(f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out.")
+    return notes
+
+
 # --- header --------------------------------------------------------------------------------------------------------
 
 
 def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> list[int]:
     """Return the rows of numbers without those of the header: joints 1 2 3 4 5 6 X Y Z, numbers above more names."""
     while len(full) > 1:
-        pairs = zip(rows[full[0]], rows[full[1]], strict=False)
-        names = rows[full[0] + 1 : full[1]]
-        bare = not rows[full[0]][0] and rows[full[1]][0] != ""  # numbers above, without what rows begin with
-        named = bare and any(not _count(row) for row in names)
-        if not named and sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs) < 2:
+        first, second = rows[full[0]], rows[full[1]]
+        names_between = any(not _count(row) for row in rows[full[0] + 1 : full[1]])
+        above_names = names_between and not first[0] and second[0] != ""
+        above_numbers = sum(
+            cell[:1].isalpha() and is_numeral(below) for cell, below in zip(first, second, strict=False)
+        )
+        if not above_names and above_numbers < 2:
             break
         full = full[1:]
     return full
@@ -258,23 +262,21 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         found = f"no header above '{', '.join(grid.rows[full[0]][:4])}, ...'"
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
-    header = [_uncommented(grid.rows[i], width) for i in above]
-    width = max(map(len, header))
-    lines = [[*row, *[""] * (width - len(row))] for row in header]
-    if grid.blanks and _is_units(header[-1]):  # the label has none, and a blank cell cannot be seen
-        lines[-1] = [*[""] * (width - len(header[-1])), *header[-1]]
+    lines = [_uncommented(grid.rows[i], width) for i in above]
+    width = max(map(len, lines))
     units = [""] * width
     if len(lines) > 1 and _is_units(lines[-1]):
-        units = [cell.strip("[]()") for cell in lines.pop()]
-    names = lines.pop()
+        signs = ["" if cell in ("-", "1") else cell for cell in (each.strip("[]()") for each in lines.pop())]
+        lacking = [""] * (width - len(signs))
+        units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
+    *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
     for i, name in enumerate(names):  # one that is merged downwards stands higher up
-        higher = [line for line in lines if line[i]]
+        higher = [line for line in grouping if line[i]]
         if not name and higher and any(line[i + 1 : i + 2] != [""] for line in higher):
             names[i] = higher[-1][i]
-            for line in lines:
+            for line in grouping:
                 line[i] = ALONE
-    groups = [" ".join(filter(None, parts)) for parts in zip(*map(_unmerged, lines), strict=True)] or [""] * width
-    units = ["" if unit in ("-", "1") else unit for unit in units]
+    groups = [" ".join(filter(None, parts)) for parts in zip(*map(_unmerged, grouping), strict=True)] or [""] * width
     return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
 
 
@@ -324,36 +326,35 @@ def _unmerged(line: Sequence[str]) -> list[str]:
     return cells
 
 
-def _about_header(grid: Grid, above: Sequence[int], options: TableOptions) -> Iterator[str]:
-    """Say where the header is, unless it is the first line alone."""
-    if options.columns:
-        yield "names of columns as stated" + (f", instead of {_lines(grid, above)}." if above else ".")
-    elif len(above) > 1:
-        yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
-    if above and above[0]:
-        yield f"{above[0]} lines above the header are left out ('{' '.join(grid.rows[0])[:50]}' ...)."
-
-
-def _about_rows(grid: Grid, full: Sequence[int], above: Sequence[int]) -> Iterator[str]:
-    """Say which lines below the header are no rows of data: the header once more, and others."""
-    header = [grid.rows[i] for i in above]
-    below = sorted(set(range(full[0], len(grid.rows))) - set(full))
-    again = [i for i in below if grid.rows[i] in header]
-    others = [i for i in below if grid.rows[i] not in header]
-    if again:
-        yield f"the header stands there again in {_lines(grid, again)}: left out."
-    for i in others[:MOST_NAMED]:
-        text = ", ".join(cell for cell in grid.rows[i] if cell)
-        yield f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'."
-    if len(others) > MOST_NAMED:
-        yield f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out."
-
-
-def _lines(grid: Grid, rows: Sequence[int]) -> str:
-    return "line " + listed([str(grid.lines[i]) for i in rows])
-
-
 # --- columns and their numbers -------------------------------------------------------------------------------------
+
+
+def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOptions) -> tuple[list[Column], str]:
+    """Return the columns, those of numbers with decimal points, and the decimal mark that they had."""
+    _require_width(rows, len(heads), options)
+    columns: dict[str, Column] = {}
+    for j, head in enumerate(heads):
+        cells = [row[j] for row in rows]
+        if str(head) == "-" or (not head.name and not any(cells)):
+            continue
+        name = str(head) if head.name else f"column {j + 1}"
+        if name in columns:
+            name = f"{name} #{j + 1}"
+        columns[name] = Column(name, head, cells)
+    numeric = [column.cells for column in columns.values() if _is_numeric(column.cells)]
+    mark = _decimal_mark((cell for cells in numeric for cell in cells), options.decimal)
+    found = []
+    for column in columns.values():
+        unit = ""
+        if _is_numeric(column.cells):
+            column = column._replace(cells=[_as_python(cell, mark) for cell in column.cells])
+        else:
+            unit = _unit_of(column.cells)
+        if unit:
+            bare = [_as_python(cell.removesuffix(unit).strip(), ".") for cell in column.cells]
+            column = column._replace(head=column.head._replace(unit=unit), cells=bare)
+        found.append(column)
+    return found, mark
 
 
 def _require_width(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
@@ -369,31 +370,6 @@ def _require_width(rows: Sequence[list[str]], width: int, options: TableOptions)
         row += [""] * (width - len(row))
 
 
-def _columns(rows: Sequence[Sequence[str]], heads: Sequence[Head]) -> tuple[dict[str, list[str]], dict[str, Head]]:
-    """Return the columns by unique names; those without name and cells are no columns."""
-    columns: dict[str, list[str]] = {}
-    named: dict[str, Head] = {}
-    for j, head in enumerate(heads):
-        cells = [row[j] for row in rows]
-        if str(head) == "-" or (not head.name and not any(cells)):
-            continue
-        key = str(head) if head.name else f"column {j + 1}"
-        if key in columns:
-            key = f"{key} #{j + 1}"
-        columns[key] = cells
-        named[key] = head
-    return columns, named
-
-
-def _plain(columns: dict[str, list[str]], decimal: str) -> tuple[dict[str, list[str]], str]:
-    """Return the columns with decimal points, and the mark that they had."""
-    numeric = {name: cells for name, cells in columns.items() if _is_numeric(cells)}
-    if decimal not in ("", ",", "."):
-        raise InputError("--decimal", f"'{decimal}'", "a comma or a point")
-    mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), decimal)
-    return columns | {name: [_as_python(cell, mark) for cell in cells] for name, cells in numeric.items()}, mark
-
-
 def _is_numeric(cells: Sequence[str]) -> bool:
     numbers = sum(map(is_numeral, cells))
     return numbers > 0 and numbers >= MOSTLY * sum(not is_missing(cell) for cell in cells)
@@ -402,9 +378,11 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     """Return the decimal mark of a table, a comma or a point.
 
-    Where both stand in a number, the last one is the decimal mark. Where commas alone do, one that cannot part
-    thousands decides. A stated mark holds unless a number contradicts it.
+    Where both stand in a number, the last one is it. Where commas alone do, one that cannot part thousands decides. A
+    stated mark holds unless a number contradicts it.
     """
+    if stated not in ("", ",", "."):
+        raise InputError("--decimal", f"'{stated}'", "a comma or a point")
     found: dict[str, str] = {}
     doubtful = ""
     for cell in cells:
@@ -446,23 +424,30 @@ def _as_python(cell: str, mark: str) -> str:
     return cell.replace("," if mark == "." else ".", "").replace(mark, ".")
 
 
-def _one_number_each(raw: RawTable) -> RawTable:
-    """Return a table whose cells that list numbers are columns of one number each."""
-    columns: dict[str, Sequence[Any]] = {}
-    heads: dict[str, Head] = {}
-    for name, cells in raw.columns.items():
-        lists = [list_of_numbers(cell) for cell in cells if isinstance(cell, str) and not is_missing(cell)]
-        counts = set(map(len, lists))
-        if len(counts) != 1 or counts == {0}:
-            columns[name] = cells
-            heads[name] = raw.heads[name]
-            continue
-        stem, unit = split(name)
-        for i, part in enumerate(_parts(stem, counts.pop())):
-            head = Head(part, stem if part in "xyz" else "", unit if part in "xyz" or part[:5] == "joint" else "")
-            heads[str(head)] = head
-            columns[str(head)] = [(list_of_numbers(str(cell)) or [""] * (i + 1))[i] for cell in cells]
-    return replace(raw, columns=columns, heads=heads)
+def _unit_of(cells: Sequence[str]) -> str:
+    """Return the unit that stands behind all numbers; nothing where it is not so."""
+    matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not is_missing(cell)]
+    units = {match[2] if match else "" for match in matches}
+    unit = units.pop() if len(units) == 1 else ""
+    return unit if unit.lower() in UNIT_SIGNS else ""
+
+
+# --- cells that list numbers, rows that hold one coordinate ----------------------------------------------------------
+
+
+def _one_number_each(column: Column) -> list[Column]:
+    """Return the columns of one number each of a column whose cells list numbers; any other as it is."""
+    lists = [list_of_numbers(cell) for cell in column.cells if isinstance(cell, str) and not is_missing(cell)]
+    counts = set(map(len, lists))
+    if len(counts) != 1 or counts == {0}:
+        return [column]
+    stem, unit = split(column.name)
+    found = []
+    for i, part in enumerate(_parts(stem, counts.pop())):
+        head = Head(part, stem if part in "xyz" else "", unit if part in "xyz" or part[:5] == "joint" else "")
+        cells = [(list_of_numbers(str(cell)) or [""] * (i + 1))[i] for cell in column.cells]
+        found.append(Column(str(head), head, cells))
+    return found
 
 
 def _parts(stem: str, count: int) -> Sequence[str]:
@@ -473,72 +458,43 @@ def _parts(stem: str, count: int) -> Sequence[str]:
     if count == 4 and turns:
         return [f"quat_{i}" for i in range(4)]
     if count in (9, 12, 16):
-        return [f"m{i // (4 if count > 9 else 3)}{i % (4 if count > 9 else 3)}" for i in range(count)]
+        width = 4 if count > 9 else 3
+        return [f"m{i // width}{i % width}" for i in range(count)]
     return [f"joint {i}" for i in range(1, count + 1)]
 
 
-def _one_row_each(raw: RawTable) -> RawTable:
-    """Return a table whose rows each had one coordinate of a point, ``P1, X, 1.5``, with a row a point."""
-    axis = next((name for name, cells in raw.columns.items() if {str(c).lower() for c in cells} == set("xyz")), "")
-    if not axis:
-        return raw
-    axes = [str(cell).lower() for cell in raw.columns[axis]]
-    others = {name: cells for name, cells in raw.columns.items() if name != axis}
-    keys = next((cells for cells in others.values() if _one_of_each(cells, axes)), None)
-    if keys is None:
-        raise InputError(
-            "the header", f"a row a coordinate ('{axis}')", "a column that names its point, all three once"
-        )
-    places: dict[str, dict[str, int]] = {}
-    for i, (key, letter) in enumerate(zip(keys, axes, strict=True)):
-        places.setdefault(key, {})[letter] = i
-    first = [min(place.values()) for place in places.values()]
-    same = [
-        name
-        for name, cells in others.items()
-        if all(cells[i] == cells[first[k]] for k, place in enumerate(places.values()) for i in place.values())
-    ]
-    values = [name for name in others if name not in same and _is_numeric(list(map(str, others[name])))]
-    measured = [name for name in values if VALUE.search(name)] or values
+def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
+    """Return the columns of a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point."""
+    axis = next((each for each in columns if {str(cell).lower() for cell in each.cells} == set("xyz")), None)
+    if axis is None:
+        return columns, []
+    letters = [str(cell).lower() for cell in axis.cells]
+    others = [each for each in columns if each is not axis]
+    key = next((each for each in others if _names_points(each.cells, letters)), None)
+    if key is None:
+        accepted = "a column that names its point, all three once"
+        raise InputError("the header", f"a row a coordinate ('{axis.name}')", accepted)
+    points: dict[Any, dict[str, int]] = {}
+    for i, (name, letter) in enumerate(zip(key.cells, letters, strict=True)):
+        points.setdefault(name, {})[letter] = i
+    rows = list(points.values())
+    same = [each for each in others if all(len({each.cells[i] for i in row.values()}) == 1 for row in rows)]
+    names = {each.name for each in same}
+    values = [each for each in others if each.name not in names and _is_numeric(list(map(str, each.cells)))]
+    measured = [each for each in values if VALUE.search(each.name)] or values
     if len(measured) != 1:
-        found = f"a row a coordinate, with values {', '.join(measured) or 'nowhere'}"
+        found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    columns: dict[str, Sequence[Any]] = {name: [others[name][i] for i in first] for name in same}
-    heads = {name: raw.heads[name] for name in same}
+    (value,) = measured
+    whole = [each._replace(cells=[each.cells[min(row.values())] for row in rows]) for each in same]
     for letter in "xyz":
-        head = Head(letter, "", raw.heads[measured[0]].unit or split(measured[0])[1])
-        heads[str(head)] = head
-        columns[str(head)] = [
-            str(others[measured[0]][place[letter]]) if letter in place else "" for place in places.values()
-        ]
-    return replace(
-        raw,
-        columns=columns,
-        heads=heads,
-        notes=(*raw.notes, f"a row a coordinate: column '{measured[0]}' by '{axis}'."),
-    )
+        head = Head(letter, "", value.head.unit or split(value.name)[1])
+        cells = [str(value.cells[row[letter]]) if letter in row else "" for row in rows]
+        whole.append(Column(str(head), head, cells))
+    return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
 
 
-def _one_of_each(keys: Sequence[Any], axes: Sequence[str]) -> bool:
-    """Return whether no key has an axis twice, and all but the last have all three."""
-    pairs = list(zip(map(str, keys), axes, strict=True))
-    return all(map(str.strip, map(str, keys))) and len(set(pairs)) == len(pairs) and len(pairs) > 2 * len(set(keys))
-
-
-def _unit_of(cells: Sequence[str]) -> str:
-    """Return the unit that stands behind all numbers; nothing where it is not so."""
-    matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not is_missing(cell)]
-    units = {match[2] if match else "" for match in matches}
-    unit = units.pop() if len(units) == 1 else ""
-    return unit if unit.lower() in UNIT_SIGNS else ""
-
-
-def _without_units(
-    columns: dict[str, list[str]], heads: dict[str, Head]
-) -> tuple[dict[str, list[str]], dict[str, Head]]:
-    """Return columns whose cells carry a unit as numbers with the unit in the head."""
-    units = {name: _unit_of(cells) for name, cells in columns.items() if not _is_numeric(cells)}
-    units = {name: unit for name, unit in units.items() if unit}
-    bare = {name: [_as_python(cell.removesuffix(unit).strip(), ".") for cell in columns[name]]
-            for name, unit in units.items()}  # fmt: skip
-    return columns | bare, heads | {name: heads[name]._replace(unit=unit) for name, unit in units.items()}
+def _names_points(keys: Sequence[Any], letters: Sequence[str]) -> bool:
+    """Return whether no key has a letter twice, and all but the last have all three."""
+    pairs = set(zip(map(str, keys), letters, strict=True))
+    return all(map(str.strip, map(str, keys))) and len(pairs) == len(letters) > 2 * len(set(keys))

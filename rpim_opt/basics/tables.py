@@ -1,9 +1,8 @@
 """Cells of tables: text, Excel and Parquet files and data frames, as rows or as named columns.
 
-What the cells mean is decided in `data.tables`. Small files can say more than memory holds, so that sizes are bounded
-before and while they are read. Measured against: python-calamine reads a workbook 5 times as fast as openpyxl, and ends
-the process where a file of 5 kB has a cell in its last row (it allocates the whole sheet); charset-normalizer reads
-``J1 [°]`` in Windows-1252 as Chinese in UTF-16.
+Small files can unpack to more than memory holds, so that sizes are bounded before and while they are read.
+python-calamine ends the process where a workbook of 5 kB has a cell in its last row; charset-normalizer reads
+``J1 [°]`` in Windows-1252 as Chinese.
 """
 
 from __future__ import annotations
@@ -15,11 +14,10 @@ import io
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
@@ -31,29 +29,24 @@ from rpim_opt.basics.units import numeral
 WIDEST = 1000
 """Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
 MOST_CELLS = 2**27
-"""Cells that a Parquet file may have: ten million rows of a dozen columns."""
 MOST_TEXT = 2**27
-"""Bytes of texts that a Parquet file may have, which a dictionary of one value repeats in every row."""
+"""Cells, and bytes of texts, of a Parquet file: a dictionary of one value repeats it in every row."""
 LARGEST_WORKBOOK = 2**27
 """Bytes that a workbook may unpack to: some three hundred thousand rows."""
 EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
-SAMPLE = 200
-"""Lines from which the separator is found."""
-LONGEST = 2**16
-"""Characters of these lines; a line of a hundred thousand cells is not looked at whole."""
+SAMPLE_LINES = 200
+SAMPLE_CHARACTERS = 2**16
+"""Of the lines from which the separator is found."""
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 THOUSANDS = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))")
 """Signs between thousands that are no decimal marks."""
-OPEN = re.compile(r"[\[({][\s\d.+\-\[({]")
-"""How a cell of several numbers begins."""
-ONE_READ = 2**20
+LIST_OPENS = re.compile(r"[\[({][\s\d.+\-\[({]")
 ZEROS = bytes(8)
 """No text has so many zeros in a row, in whatever encoding."""
-BRACKETS = frozenset("[({")
 ROW_OF_NUMBERS = 1 / 3
 """Part of a row's cells that are numbers, from which on it tells what separates them."""
 BLANKS_CLEARLY = 1.5
@@ -68,12 +61,8 @@ Columns = Mapping[str, Sequence[Any]]
 """Column name to its cells: text from a text or Excel file, whatever the table holds elsewhere."""
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The rows of a file: texts of those that are not blank, their line in the file (from 1), how it was read.
-
-    ``blanks`` tells that blanks separate the cells, so that no cell can be empty.
-    """
+class Grid(NamedTuple):
+    """The rows of a file that are not blank, their lines (from 1), how it was read, and whether blanks part cells."""
 
     rows: list[list[str]]
     lines: list[int]
@@ -81,24 +70,11 @@ class Grid:
     blanks: bool = False
 
 
-# --- what has the shape that problem folders have ------------------------------------------------------------------
+# --- tables of problem folders: a header, then rows ----------------------------------------------------------------
 
 
 def read_columns(source: Any) -> Columns:
-    """Return the columns of a table whose first row is its header.
-
-    Parameters
-    ----------
-    source
-        A path (``.csv`` in UTF-8 with commas, ``.parquet``, ``.xlsx``), a pandas, polars or similar data frame, or a
-        mapping from column names to cells.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, it cannot be read as what its name says, or the table has no rows, a column
-        twice, or rows of different lengths.
-    """
+    """Return the columns of a file (.csv in UTF-8 with commas, .parquet, .xlsx), a data frame or a mapping."""
     columns = _file(Path(source)) if isinstance(source, str | Path) else _frame(source)
     if not columns:
         raise InputError("the table", "an empty table", "at least one row")
@@ -108,7 +84,7 @@ def read_columns(source: Any) -> Columns:
 
 
 def _file(path: Path) -> Columns:
-    readers = {".csv": _csv, ".parquet": read_parquet, ".xlsx": lambda file: _rectangle(_excel(file).rows)}
+    readers = {".csv": _csv, ".parquet": _parquet, ".xlsx": lambda file: _rectangle(_excel(file, "").rows)}
     kind = path.suffix.lower()
     if kind not in readers:
         raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(readers), path)
@@ -117,7 +93,6 @@ def _file(path: Path) -> Columns:
 
 
 def _frame(source: Any) -> Columns:
-    """Return the columns of a data frame or a mapping."""
     names = list(getattr(source, "column_names", getattr(source, "columns", source)))
     for name in names:
         if not isinstance(name, str):
@@ -129,14 +104,12 @@ def _frame(source: Any) -> Columns:
 def _csv(path: Path) -> Columns:
     text = read_text(path, LARGEST_DATA).lstrip("\ufeff")  # files put together have more than one mark
     rows, _ = _split(text, ",")
-    rows = [[_without_apostrophe(cell) for cell in row] for row in rows]
     if rows and len(rows[0]) == 1 and any(mark in rows[0][0] for mark in ";\t"):
         raise InputError("the header", "one column with semicolons or tabs", "columns separated by commas")
-    return _rectangle(rows)
+    return _rectangle([[_without_apostrophe(cell) for cell in row] for row in rows])
 
 
 def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
-    """Return the columns of rows of text; the first row is the header."""
     if not rows:
         raise InputError("the table", "an empty file", "a header and at least one row")
     header, *body = rows
@@ -149,7 +122,6 @@ def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
 
 
 def _require_names(header: Sequence[str]) -> None:
-    """Refuse a header that is too wide, or has a column without a name or twice."""
     accepted = "every column once, with its name"
     if len(header) > WIDEST:
         raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
@@ -160,8 +132,7 @@ def _require_names(header: Sequence[str]) -> None:
             raise InputError("the header", f"column '{name[:40]}' twice", accepted)
 
 
-def read_parquet(path: Path) -> Columns:
-    """Return the columns of a Parquet file."""
+def _parquet(path: Path) -> Columns:
     parquet = _library("pyarrow.parquet", "Parquet files")
     try:
         with parquet.ParquetFile(path) as file:
@@ -186,7 +157,7 @@ def read_parquet(path: Path) -> Columns:
 
 
 def _repeated(column: Any) -> int:
-    """Return how many bytes the texts of a column have where each stands in every row that has it."""
+    """Return the bytes of a column's texts where each stands in every row that has it."""
     compute = import_module("pyarrow.compute")
     if str(getattr(column.type, "value_type", "")) not in ("string", "large_string", "binary"):
         return 0
@@ -195,11 +166,8 @@ def _repeated(column: Any) -> int:
 
 
 def _parquet_cells(column: Any) -> Sequence[Any]:
-    """Return a column of numbers without gaps as an array, any other as a list."""
     if str(column.type).startswith("dictionary"):
-        known = [chunk.dictionary.to_pylist() for chunk in column.chunks]
-        indices = [chunk.indices.to_pylist() for chunk in column.chunks]
-        return [None if i is None else known[k][i] for k, chunk in enumerate(indices) for i in chunk]
+        return column.cast(column.type.value_type).to_pylist()
     numeric = str(column.type).startswith(("float", "double", "int", "uint"))
     return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
 
@@ -208,28 +176,10 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 
 
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
-    r"""Return the rows of a text or Excel file.
+    r"""Return the rows of a text or Excel file; the arguments are those of `TableOptions`.
 
-    A byte order mark tells the encoding, else zeros in every other byte (UTF-16), else whether the bytes are UTF-8,
-    which other encodings practically never are; else it is Windows-1252, which has Latin-1's letters. The separator is
-    the one that parts most numbers from each other in the first lines.
+    The separator is the one that parts most numbers from each other in the first lines.
 
-    Parameters
-    ----------
-    path
-        The file; its ending decides how it is read.
-    sheet
-        An Excel sheet's name, or its number from 1; by default the first one that has cells.
-    encoding, separator
-        Of a text file, where stated: ``"cp1252"``; a name of `SEPARATORS`, or the sign itself.
-
-    Raises
-    ------
-    InputError
-        For a file that cannot be read, a sheet that is not there, an unknown separator, a quote that does not end.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> from rpim_opt.basics.tables import read_grid
     >>> _ = Path("points.txt").write_text("// Point X Y Z\nP1 1.5 2.5 3.5\nP2 4 5 6\n")
@@ -245,34 +195,6 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     if path.suffix.lower() not in TEXTS:
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {', '.join(known)}")
-    return _text(path, encoding, separator)
-
-
-def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the text of a file, whatever ends its lines, and a sentence on its encoding unless that is UTF-8.
-
-    Raises
-    ------
-    InputError
-        For another encoding than the stated one, and a file with zeros, which may be no longer than its hole.
-    """
-    with path.open("rb") as stream:  # before it is in memory
-        while block := stream.read(ONE_READ):
-            if ZEROS in block:
-                raise InputError("the text", "bytes that are zero", "a text file, not a binary one")
-    data = read_bytes(path, LARGEST_DATA)
-    name, why = (encoding, "as stated") if encoding else _encoding(data)
-    try:
-        text = data.decode(name)
-    except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
-        raise InputError("the text", str(error), "an encoding that fits: --encoding utf-8, cp1252, utf-16") from None
-    if "\x00" in text:
-        raise InputError("the text", "bytes that are zero", "a text file, not a binary one")
-    text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
-    return text, () if name == "utf-8" else (f"read as {name}: {why}.",)
-
-
-def _text(path: Path, encoding: str, separator: str) -> Grid:
     whole, said = decoded(path, encoding)
     text = THOUSANDS.sub("", whole)
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
@@ -285,8 +207,27 @@ def _text(path: Path, encoding: str, separator: str) -> Grid:
     return Grid(*_split(text, mark), tuple(notes), mark == " ")
 
 
+def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
+    """Return the text of a file with line feeds, and a sentence on its encoding unless that is UTF-8."""
+    binary = InputError("the text", "bytes that are zero", "a text file, not a binary one")
+    with path.open("rb") as stream:  # before it is in memory: a file may be one long hole
+        while block := stream.read(2**20):
+            if ZEROS in block:
+                raise binary
+    data = read_bytes(path, LARGEST_DATA)
+    name, why = (encoding, "as stated") if encoding else _encoding(data)
+    try:
+        text = data.decode(name)
+    except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
+        raise InputError("the text", str(error), "an encoding that fits: --encoding utf-8, cp1252, utf-16") from None
+    if "\x00" in text:
+        raise binary
+    text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
+    return text, () if name == "utf-8" else (f"read as {name}: {why}.",)
+
+
 def _encoding(data: bytes) -> tuple[str, str]:
-    """Return the encoding of a file, and why it is that one."""
+    """Return the encoding of a file, and why: what is no UTF-8 is practically never taken for it by chance."""
     for mark, name in BYTE_ORDER_MARKS:
         if data.startswith(mark):
             return name, "byte order mark"
@@ -313,8 +254,8 @@ def is_numeral(cell: str) -> bool:
 
 def _separator(text: str) -> str:
     """Return the separator that parts most numbers in rows of numbers; a comma where none does."""
-    lines = (line for line in io.StringIO(text[: SAMPLE * LONGEST]) if line.strip())
-    sample = "".join(islice(lines, SAMPLE))[:LONGEST]
+    lines = (line for line in io.StringIO(text[: SAMPLE_LINES * SAMPLE_CHARACTERS]) if line.strip())
+    sample = "".join(islice(lines, SAMPLE_LINES))[:SAMPLE_CHARACTERS]
     rows = {mark: _split(sample, mark, strict=False)[0] for mark in SEPARATORS.values()}
     parted = {mark: sum(map(_parted, split)) for mark, split in rows.items()}
     blanks = parted.pop(" ")
@@ -339,7 +280,7 @@ def list_of_numbers(cell: str) -> list[str]:
     >>> list_of_numbers("[1.5, 2, -3e-2]"), list_of_numbers("((1 2) (3 4))"), list_of_numbers("1.5")
     (['1.5', '2', '-3e-2'], ['1', '2', '3', '4'], [])
     """
-    if not OPEN.match(cell) or cell[-1] not in "])}":
+    if not LIST_OPENS.match(cell) or cell[-1] not in "])}":
         return []
     parts = re.split(r"[\s\[\](){};]+" if ";" in cell else r"[\s\[\](){},]+", cell)  # else commas are decimal marks
     numbers = [part for part in parts if part]
@@ -351,28 +292,30 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
     kept: list[list[str]] = []
     lines: list[int] = []
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, strict=strict, skipinitialspace=True)
-    spaced = enumerate(map(_words, text.split("\n")), start=1)
-    numbered = spaced if mark == " " else ((reader.line_num, row) for row in reader)
+    numbered: Iterable[tuple[int, list[str]]] = ((reader.line_num, row) for row in reader)
+    if mark == " ":
+        numbered = enumerate(map(_words, text.split("\n")), start=1)
     brackets = any(sign in text for sign in "[({")
     try:
         for number, cells in numbered:
             row = [cell.strip() for cell in cells]
+            if not any(row):
+                continue
             if brackets:
-                row = _closed(row, mark)
-            if strict and len(row) > WIDEST and any(row):
+                row = _with_lists(row, mark)
+            if strict and len(row) > WIDEST:
                 raise InputError("the table", f"a row of {len(row)} cells", f"at most {WIDEST} columns")
-            if any(row):
-                kept.append(row)
-                lines.append(number)
+            kept.append(row)
+            lines.append(number)
     except csv.Error as error:
         if strict:
             raise InputError(f"line {reader.line_num}", str(error), "short cells whose quotes end") from None
     return kept, lines
 
 
-def _closed(row: list[str], mark: str) -> list[str]:
+def _with_lists(row: list[str], mark: str) -> list[str]:
     """Return a row in which numbers between brackets are one cell, whatever stands between them."""
-    if not any(cell[:1] in BRACKETS and OPEN.match(cell) for cell in row):
+    if not any(map(LIST_OPENS.match, row)):
         return row
     whole: list[str] = []
     depth = 0
@@ -381,7 +324,7 @@ def _closed(row: list[str], mark: str) -> list[str]:
             whole[-1] += mark + cell
         else:
             whole.append(cell)
-        if depth > 0 or OPEN.match(cell):
+        if depth > 0 or LIST_OPENS.match(cell):
             depth += sum(map(cell.count, "[({")) - sum(map(cell.count, "])}"))
     return whole if depth == 0 else row
 
@@ -395,7 +338,7 @@ def _words(line: str) -> list[str]:
     return wide if len(wide) > 2 else words
 
 
-def _excel(path: Path, sheet: str = "") -> Grid:
+def _excel(path: Path, sheet: str) -> Grid:
     """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has cells."""
     openpyxl = _library("openpyxl", "Excel files")
     rows: list[tuple[int, list[str]]] = []
@@ -423,11 +366,11 @@ def _excel(path: Path, sheet: str = "") -> Grid:
 
 
 def _sheet(names: Sequence[str], stated: str) -> str:
-    if stated in names:
-        return stated
-    if stated.isdigit() and 0 < int(stated) <= len(names):
+    if stated not in names and stated.isdigit() and 0 < int(stated) <= len(names):
         return names[int(stated) - 1]
-    raise InputError("--sheet", f"'{stated}'", choices(stated, names))
+    if stated not in names:
+        raise InputError("--sheet", f"'{stated}'", choices(stated, names))
+    return stated
 
 
 def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
@@ -446,7 +389,6 @@ def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
 
 
 def _library(name: str, what: str) -> Any:
-    """Return a package that only some tables need, or say how to get it."""
     try:
         return import_module(name)
     except ImportError:
@@ -460,7 +402,7 @@ def _first_line(error: Exception) -> str:
 # --- cells ---------------------------------------------------------------------------------------------------------
 
 
-def numbers(cells: Sequence[Any], labels: Sequence[str], column: str) -> np.ndarray:
+def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np.ndarray:
     """Return cells as finite numbers (N,), or name the row whose cell is none."""
     try:
         values = np.asarray(cells)
@@ -468,7 +410,7 @@ def numbers(cells: Sequence[Any], labels: Sequence[str], column: str) -> np.ndar
             return values.astype(float)
     except (TypeError, ValueError):
         pass
-    return np.array([_number(cell, row, column) for cell, row in zip(cells, labels, strict=True)])
+    return np.array([_number(cell, labels[i] if labels else str(i + 1), column) for i, cell in enumerate(cells)])
 
 
 def _number(cell: Any, row: str, column: str) -> float:
@@ -492,10 +434,7 @@ def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:
 
 
 def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Return a table as CSV text, one line a row.
-
-    A text that a spreadsheet would compute, ``=1+1``, gets an apostrophe before it, which `read_columns` takes away.
-    """
+    """Return a table as CSV; a text that a spreadsheet would compute gets an apostrophe, which reading takes away."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_with_apostrophe(name) for name in header)
@@ -514,19 +453,11 @@ def _with_apostrophe(cell: Any) -> Any:
 
 
 def _without_apostrophe(cell: str) -> str:
-    if cell.startswith("'") and FORMULA.match(cell):
-        return cell[1:].strip()
-    return cell
+    return cell[1:].strip() if cell.startswith("'") and FORMULA.match(cell) else cell
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:
-    """Return rows as a data frame of pandas, or of polars where that is missing.
-
-    Raises
-    ------
-    InputError
-        Where neither is installed.
-    """
+    """Return rows as a data frame of pandas, or of polars where that is missing."""
     with contextlib.suppress(ImportError):
         return import_module("pandas").DataFrame(list(rows))
     with contextlib.suppress(ImportError):

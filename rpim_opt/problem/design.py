@@ -110,12 +110,11 @@ def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator 
 def read_candidates(source: Any, robot: Robot) -> Array:
     """Return the joint values (M, dof) of a table with columns ``q1_deg``, ...; other columns are left alone."""
     columns, q = read_columns(source), []
-    rows = [str(i + 1) for i in range(len(next(iter(columns.values()))))]
     for i, dimension in enumerate(robot.joint_dimensions, start=1):
         name = next((n for n in with_unit(f"q{i}", dimension) if n in columns), None)
         if name is None:
             raise InputError("the header", f"no column for 'q{i}'", " or ".join(with_unit(f"q{i}", dimension)), source)
-        q.append(UNITS[name.split("_")[1]].si * numbers(columns[name], rows, name))
+        q.append(UNITS[name.split("_")[1]].si * numbers(columns[name], name))
     return np.column_stack(q)
 
 

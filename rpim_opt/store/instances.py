@@ -28,8 +28,7 @@ from rpim_opt.data.measurements.camera import Board, on_board
 from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record, Requirement
-from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.robodk import robodk_columns
+from rpim_opt.data.tables.reading import read_data, robodk_columns
 from rpim_opt.problem.identified import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters

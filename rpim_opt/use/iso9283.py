@@ -301,8 +301,7 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
         missing = [stem for stem in stems if stem not in of]
         if missing:
             raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
-        rows = [str(i + 1) for i in range(len(columns[pose]))]
-        return np.column_stack([si * numbers(columns[name], rows, name) for name, si in (of[stem] for stem in stems)])
+        return np.column_stack([si * numbers(columns[name], name) for name, si in (of[stem] for stem in stems)])
 
     return iso9283(
         texts(columns[pose], pose),

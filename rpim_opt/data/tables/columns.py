@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -30,25 +29,14 @@ def text_columns(kind: Measurement) -> list[str]:
 def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
     """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    torques = {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
-    sides = {f"approach{i}": "" for i in range(1, robot.dof + 1)}
-    plain = {**further_columns(robot, kind), **joints, **kind.columns, **torques, **sides, "payload": "mass"}
+    joints |= {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
+    joints |= {f"approach{i}": "" for i in range(1, robot.dof + 1)}
+    plain = {**further_columns(robot, kind), **joints, **kind.columns, "payload": "mass"}
     for form, _ in kind.forms:
         plain |= form
     if kind.points == 2:
-        plain |= {f"to_{stem}": dimension for stem, dimension in {**joints, **torques, **sides}.items()}
+        plain |= {f"to_{stem}": dimension for stem, dimension in joints.items()}
     known = {stem: [dimension] for stem, dimension in plain.items()}
-    return known | _spread_columns(kind)
-
-
-def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
-    """Return the columns that terms and measurement see, name to dimension: temperature, and a user's own."""
-    return {"temperature": "temperature", **robot.model.columns, **kind.extra}
-
-
-def _spread_columns(kind: Measurement) -> dict[str, list[str]]:
-    """Return the columns in which a row states its own uncertainty."""
-    known: dict[str, list[str]] = {}
     for spread in SPREADS:
         known[spread] = sorted(set(kind.components.values()))
         known |= {f"{spread}_{name}": [dimension] for name, dimension in kind.components.items()}
@@ -57,6 +45,11 @@ def _spread_columns(kind: Measurement) -> dict[str, list[str]]:
         for b, of_b in components[i:]:
             known[f"cov_{a}_{b}"] = [f"{of_a}2" if of_a == of_b else f"{of_a} {of_b}"]
     return known
+
+
+def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
+    """Return the columns that terms and measurement see, name to dimension: temperature, and a user's own."""
+    return {"temperature": "temperature", **robot.model.columns, **kind.extra}
 
 
 def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str]) -> Numbers:
@@ -76,66 +69,42 @@ def quantities_of(
     """Return all columns but those of names in SI; refuse those that are not known, stem to its dimensions."""
     columns: Numbers = {}
     for name in table:
-        if name not in names:
-            _add(columns, name, table[name], known, names, label)
+        if name in names:
+            continue
+        stem, unit = split_unit(name)
+        dimension = unit.dimension if unit else ""
+        si = unit.si if unit else 1.0
+        if stem not in known:
+            others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
+            accepted = [each for key, dimensions in others.items() for each in spelled(key, dimensions, 1)]
+            raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
+        if dimension not in known[stem]:
+            accepted = ", ".join(spelled(stem, known[stem]))
+            raise InputError("the header", f"column '{name}' without a unit that fits", accepted)
+        if (stem, dimension) in columns:
+            raise InputError("the header", f"column '{stem}' in two units", "one of them")
+        values = si * numbers(table[name], name, label) + (unit.zero if unit else 0.0)
+        fits = np.abs(values) <= LARGEST
+        accepted = f"a size of at most {LARGEST / si:g}"
+        if stem.startswith(SPREADS) and fits.all():
+            fits = values >= SMALLEST
+            accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
+        if not fits.all():
+            i = int(np.argmin(fits))
+            raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", accepted)
+        columns[stem, dimension] = values
+        if len(known[stem]) == 1:
+            columns[stem, ""] = values
     return columns
-
-
-def _add(
-    columns: Numbers,
-    name: str,
-    cells: Sequence[Any],
-    known: Mapping[str, Sequence[str]],
-    names: Sequence[str],
-    label: Sequence[str],
-) -> None:
-    """Add a column of numbers in SI."""
-    stem, unit = split_unit(name)
-    dimension = unit.dimension if unit else ""
-    si = unit.si if unit else 1.0
-    zero = unit.zero if unit else 0.0
-    _require_known(name, stem, dimension, known, names)
-    if (stem, dimension) in columns:
-        raise InputError("the header", f"column '{stem}' in two units", "one of them")
-    values = si * numbers(cells, label, name) + zero
-    _require_rows(np.abs(values) <= LARGEST, values / si, name, label, f"a size of at most {LARGEST / si:g}")
-    if stem.startswith(SPREADS):
-        accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
-        _require_rows(values >= SMALLEST, values / si, name, label, accepted)
-    columns[stem, dimension] = values
-    if len(known[stem]) == 1:
-        columns[stem, ""] = values
-
-
-def _require_known(
-    name: str, stem: str, dimension: str, known: Mapping[str, Sequence[str]], names: Sequence[str]
-) -> None:
-    if stem not in known:
-        others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
-        accepted = [each for key, dimensions in others.items() for each in spelled(key, dimensions, 1)]
-        raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
-    if dimension not in known[stem]:
-        raise InputError(
-            "the header", f"column '{name}' without a unit that fits", ", ".join(spelled(stem, known[stem]))
-        )
-
-
-def _require_rows(fits: np.ndarray, values: Array, name: str, label: Sequence[str], accepted: str) -> None:
-    """Refuse the first row whose value does not fit."""
-    if not fits.all():
-        i = int(np.argmin(fits))
-        raise InputError(f"row {label[i]}, column {name}", f"{values[i]:g}", accepted)
 
 
 def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
     """Return the stems that must be there: joints, measured values, and whole groups of what is there in part."""
-    joints = [f"q{i}" for i in range(1, robot.dof + 1)]
-    torques = [f"tau{i}" for i in range(1, robot.dof + 1)]
+    joints, *others = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
     required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
-    sides = [f"approach{i}" for i in range(1, robot.dof + 1)]
-    groups = [torques, sides]
+    groups = list(others)
     if kind.points == 2:
-        groups += [[f"to_{stem}" for stem in group] for group in (joints, torques, sides)]
+        groups += [[f"to_{stem}" for stem in group] for group in (joints, *others)]
     for group in groups:
         if any((stem, "") in columns for stem in group):
             required += group
@@ -153,9 +122,8 @@ def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callabl
 
 def labels(table: Columns, N: int) -> tuple[str, ...]:
     """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
-    if "label" not in table:
-        label = _numbers(N)
-    else:
+    label = _numbers(N)
+    if "label" in table:
         label = texts(table["label"], "label")
         require_unique(label, "label")
     for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane", "session"):
@@ -167,8 +135,7 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
 
 @lru_cache(maxsize=8)
 def _numbers(N: int) -> tuple[str, ...]:
-    """Return the labels of rows that have none; tables in parts are as long as each other, and read again and again."""
-    return tuple(map(str, range(1, N + 1)))
+    return tuple(map(str, range(1, N + 1)))  # tables in parts are as long as each other, and read again and again
 
 
 def require_unique(names: Sequence[str], column: str) -> None:

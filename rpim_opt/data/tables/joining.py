@@ -1,4 +1,4 @@
-"""Several raw tables become one: below each other where each is whole, else joined by a key or the nearest time."""
+"""Several raw tables as one: below each other where each is whole, else joined by a key or the nearest time."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -35,14 +36,6 @@ class Whole(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Keys(NamedTuple):
-    """What a key is called, and the keys of the rows with joints and of those with measured values."""
-
-    how: str
-    joints: list[str]
-    values: list[str]
-
-
 class Pairs(NamedTuple):
     """Rows of one table with rows of another one, and by how much their times differ [s]."""
 
@@ -54,27 +47,10 @@ class Pairs(NamedTuple):
 def together(
     tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
 ) -> Whole:
-    """Return several tables as one.
+    """Return several tables as one; ``key`` and ``within`` are those of `TableOptions`.
 
     Tables that have joint and measured values each are stacked. Where some have the one and some the other, rows of
-    equal keys, or of the nearest times, are one row.
-
-    Parameters
-    ----------
-    tables
-        What was understood of every file.
-    robot, kind
-        Decide which columns are joint and which are measured values.
-    key
-        The column of the key, as the files or we call it; ``"row"`` for the number of the row. By default the label,
-        else the only name that both have.
-    within
-        Tolerance [s]: rows are joined by the nearest time, in columns called time or by the key, of clocks that agree.
-
-    Raises
-    ------
-    InputError
-        For columns that one table lacks, keys that are there twice, and tables without a common key.
+    equal keys (the label by default, else the only name that both have), or of the nearest times, are one row.
     """
     stems = row_stems(robot, kind)
     moving = [table for table in tables if table.stems & stems["joint"]]
@@ -85,9 +61,7 @@ def together(
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
         found = f"{lost or 'some tables'} with only part of joint and measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
-    if within is not None:
-        return _by_time(moving, seen, key, within)
-    return _by_key(moving, seen, key)
+    return _by_key(moving, seen, key) if within is None else _by_time(moving, seen, key, within)
 
 
 # --- below each other ----------------------------------------------------------------------------------------------
@@ -117,7 +91,6 @@ def _count(columns: Columns) -> int:
 
 
 def _labels(columns: Columns) -> list[str]:
-    """Return the labels of a table's rows; their numbers where it has none."""
     return [str(label) for label in columns.get("label", range(1, _count(columns) + 1))]
 
 
@@ -128,22 +101,20 @@ def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
     if lacking:
         found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
         raise InputError("the header", found, "the same columns in all files, or one file of joints and one of values")
-    return {name: _in_unit(table.columns[own[stem]], own[stem], name) for stem, name in wanted.items()}
-
-
-def _in_unit(cells: Sequence[Any], name: str, wanted: str) -> Sequence[Any]:
-    """Return a column's cells in the unit of another name."""
-    old = split_unit(name)[1]
-    new = split_unit(wanted)[1]
-    if old is None or new is None or old.si == new.si:
-        return cells
-    return [repr(float(cell) * old.si / new.si) for cell in cells]
+    columns: dict[str, Sequence[Any]] = {}
+    for stem, name in wanted.items():
+        cells = table.columns[own[stem]]
+        old, new = split_unit(own[stem])[1], split_unit(name)[1]
+        if old is not None and new is not None and old.si != new.si:
+            cells = [repr(float(cell) * old.si / new.si) for cell in cells]
+        columns[name] = cells
+    return columns
 
 
 def _beside(joints: Columns, left: Sequence[int], values: Columns, right: Sequence[int], names: list[str]) -> Columns:
-    """Return rows of joints beside rows of measured values, whose columns go before, and their names.
+    """Return rows of joints beside rows of measured values, whose columns go before.
 
-    These are labels where each is another, otherwise configurations.
+    Their names are labels where each is another, otherwise configurations.
     """
     own = {name: cells for name, cells in joints.items() if name not in values}
     whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
@@ -161,56 +132,54 @@ def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
     """Return rows of joints with the measured values of the same key."""
     joints = _stacked(moving)
     values = _stacked(seen)
-    keys = _keys(moving, seen, joints.columns, values.columns, key)
+    how, left, right = _keys(moving, seen, joints.columns, values.columns, key)
     place: dict[str, int] = {}
-    for i, name in enumerate(keys.joints):
+    for i, name in enumerate(left):
         if place.setdefault(name, i) != i:
-            raise InputError(f"the key {keys.how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
-    rows = [i for i, name in enumerate(keys.values) if name in place]
+            raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
+    rows = [i for i, name in enumerate(right) if name in place]
     if not rows:
         found = f"none that {moving[0].file} and {seen[0].file} share"
         accepted = "--key with a column that both have, --key row, or --time-tolerance for the nearest time"
-        raise InputError(f"the key {keys.how}", found, accepted)
-    names = [keys.values[i] for i in rows]
+        raise InputError(f"the key {how}", found, accepted)
+    names = [right[i] for i in rows]
     whole = _beside(joints.columns, [place[name] for name in names], values.columns, rows, names)
     notes = [*joints.notes, *values.notes]
-    notes.append(
-        f"joined by {keys.how}: {len(rows)} rows of {len(keys.joints)} with joints and {len(keys.values)} measured."
-    )
-    known = set(keys.values)
-    lonely = [name for name in keys.joints if name not in known] + [name for name in keys.values if name not in place]
+    notes.append(f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured.")
+    known = set(right)
+    lonely = [name for name in left if name not in known] + [name for name in right if name not in place]
     if lonely:
         notes.append(f"without a partner, left out: {listed(lonely)}.")
     return Whole(whole, tuple(notes))
 
 
-def _keys(moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str) -> Keys:
-    """Return what the key is, and those of both tables."""
+def _keys(
+    moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
+) -> tuple[str, list[str], list[str]]:
+    """Return what the key is, and those of the rows with joints and of the measured ones."""
+    counts = _count(joints), _count(values)
     if key == "row":
-        if _count(joints) != _count(values):
-            found = f"{_count(joints)} rows of joints and {_count(values)} measured"
+        if counts[0] != counts[1]:
+            found = f"{counts[0]} rows of joints and {counts[1]} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
-        numbers = [str(i) for i in range(1, _count(joints) + 1)]
-        return Keys("the number of the row", numbers, numbers)
+        numbers = [str(i) for i in range(1, counts[0] + 1)]
+        return "the number of the row", numbers, numbers
     if "label" in joints and key in ("", "label"):
         labels = _normal(joints["label"])
         for column in ("label", "configuration"):
             others = _normal(values.get(column, ()))
             if set(labels) & set(others):
-                return Keys("label", labels, others)
+                return "label", labels, others
     left, right = _raw(moving), _raw(seen)
     common = [name for name in left if name in right]
     name = key.lower()
     if not key and len(common) == 1:
         name = common[0]
     if name not in common:
-        files = f"{moving[0].file} and {seen[0].file}"
-        found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {files}"
-        accepted = (
-            "a column that both have, --key row for rows in the same order, or --time-tolerance for the nearest time"
-        )
-        raise InputError("--key", found, accepted)
-    return Keys(f"column '{name}'", _normal(left[name]), _normal(right[name]))
+        found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
+        accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
+        raise InputError("--key", found, f"{accepted} for the nearest time")
+    return f"column '{name}'", _normal(left[name]), _normal(right[name])
 
 
 def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:
@@ -230,11 +199,7 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 
 
 def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str, within: float) -> Whole:
-    """Return rows of joints beside the measured values of the nearest time.
-
-    Every row of the shorter table looks for its partner in the longer one, where a row is the partner of the nearest
-    alone (of readings of one time, of all).
-    """
+    """Return rows of joints beside the measured values of the nearest time."""
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     joints = _stacked(moving)
@@ -263,6 +228,8 @@ def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str,
 def partners(left: Array, right: Array, within: float) -> Pairs:
     """Return which times (N,) and (M,) [s] belong together: each of the fewer with the nearest of the others.
 
+    Of several whose nearest is the same one, the nearest alone is its partner (of equal times, all).
+
     >>> import numpy as np
     >>> from rpim_opt.data.tables.joining import partners
     >>> pairs = partners(np.arange(0.0, 1.0, 0.01), np.array([0.104, 0.501, 7.0]), within=0.005)
@@ -273,13 +240,7 @@ def partners(left: Array, right: Array, within: float) -> Pairs:
         turned = partners(right, left, within)
         order = np.argsort(turned.right, kind="stable")
         return Pairs(turned.right[order], turned.left[order], -turned.apart[order])
-    order = np.argsort(left, kind="stable")
-    ordered = left[order]
-    after = np.clip(np.searchsorted(ordered, right), 1, max(len(left) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(left) - 1)
-    nearer = np.where(np.abs(ordered[after] - right) < np.abs(ordered[before] - right), after, before)
-    partner = order[nearer]
+    _, partner = scipy.spatial.KDTree(left[:, None]).query(right[:, None])
     apart = right - left[partner]
     least = np.full(len(left), np.inf)
     np.minimum.at(least, partner, np.abs(apart))
@@ -295,11 +256,9 @@ def _times(tables: Sequence[Understood], key: str) -> Array:
         if key and key.lower() != "time":
             name = next((column for column in table.raw if column.lower() == key.lower()), None)
         if name is None:
-            what = f"no column '{key}'" if key else "no column of times"
-            columns = ", ".join(table.raw)
-            raise InputError(
-                f"--time-tolerance, {table.file}", f"{what} among {columns}", "one called time, or --key with it"
-            )
+            lacks = f"no column '{key}'" if key else "no column of times"
+            where = f"--time-tolerance, {table.file}"
+            raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
         found.append(seconds(name, table.raw[name]))
     return np.concatenate(found)
 
@@ -320,13 +279,6 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     Numbers without a unit are seconds, or, where that would be after the year 5000, what since 1970 is in our time.
     Dates without a zone are UTC.
 
-    Raises
-    ------
-    InputError
-        For a cell that is neither.
-
-    Examples
-    --------
     >>> from rpim_opt.data.tables.joining import seconds
     >>> seconds("time_ms", ["0", "250"]).tolist(), seconds("date", ["1970-01-01T00:01", "1970-01-02"]).tolist()
     ([0.0, 0.25], [60.0, 86400.0])

@@ -1,16 +1,8 @@
 """Names of columns that programs and people use: what each can only mean, and why.
 
-Headers as they are exported, each read as it stands:
-
-- SpatialAnalyzer: ``Point Name, X [mm], Y [mm], Z [mm], U(95) X [mm], U(95) Y [mm], U(95) Z [mm]``; its ASCII files
-  begin with comments ``//`` and part ``Collection Group Target X Y Z`` by spaces or commas.
-- Leica: ``Point ID;X [mm];Y [mm];Z [mm];Std X [mm];Std Y [mm];Std Z [mm]``.
-- RoboDK: ``J1, ..., J6, X, Y, Z``; the file of calibration measurements is read with ``layout = "robodk"`` instead.
-- ROS, ``rostopic echo -p``: ``%time, field.header.seq, field.name0, ..., field.position0, ...``;
-  ``field.pose.position.x, ..., field.pose.orientation.w``; a bag by path, ``/joint_states/elbow_joint/position``.
-- Universal Robots, RTDE: ``timestamp, actual_q_0, ..., actual_q_5, target_q_0, ...``.
-- KUKA: ``A1 [deg], ..., A6 [deg]`` and ``X, Y, Z, A, B, C``; FANUC: ``J1, ...`` and ``X, Y, Z, W, P, R``.
-- ABB: ``rax_1, ..., rax_6`` and ``x, y, z, q1, q2, q3, q4``.
+SpatialAnalyzer ``Point Name, X [mm], U(95) X [mm]``; Leica ``Point ID;Std X [mm]``; ROS ``field.name0, field.position0,
+field.pose.orientation.w, /joint_states/elbow_joint/position``; Universal Robots' RTDE ``actual_q_0, target_q_0``; KUKA
+``A1, X, Y, Z, A, B, C``; FANUC ``J1, X, Y, Z, W, P, R``; ABB ``rax_1, x, y, z, q1, q2, q3, q4``; RoboDK ``J1, X``.
 """
 
 from __future__ import annotations
@@ -28,6 +20,10 @@ class Reading(NamedTuple):
     unit: str = ""
     why: str = ""
     kind: str = ""
+
+
+Readings = dict[str, Reading]
+"""What every column holds, by its name."""
 
 
 class Name(NamedTuple):
@@ -113,7 +109,7 @@ def dialect(name: str) -> Dialect | None:
 
 
 def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
-    """Return what a name means, with why; without where it is not known.
+    """Return what a name means, with why; without a reason where it is not known.
 
     >>> from rpim_opt.data.tables.names import recognize
     >>> [recognize(name).stem for name in ("Measured X", "Joint 3", "quat_w", "Std y", "shoulder_pan_joint")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -11,7 +10,7 @@ import scipy
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, numbers
-from rpim_opt.data.tables.names import Reading
+from rpim_opt.data.tables.names import Readings
 
 ORDERS = ("wxyz", "xyzw")
 QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
@@ -25,21 +24,31 @@ ROUNDED = 1e-6
 Place = tuple[int, int]
 
 
-def numbered(read: dict[str, Reading], table: Columns, dof: int, order: str) -> dict[str, Reading]:
-    """Return readings in which the columns of quaternions (in that order) and matrices have their names."""
+def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
+    """Give the columns of quaternions (in that order) and matrices their names."""
     if order not in ORDERS:
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
     for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
-        why = f"component {i} of a quaternion, order {order}"
-        read = {**read, name: read[name]._replace(stem=f"q{letter}", why=why)}
+        read[name] = read[name]._replace(stem=f"q{letter}", why=f"component {i} of a quaternion, order {order}")
     stems = {found.stem for found in read.values()}
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
-        first = {name: each for name, each in read.items() if re.fullmatch(r"q_?0", name.strip().lower())}
-        read = {**read, **{name: each._replace(stem="qw", why="beside qx, qy, qz") for name, each in first.items()}}
-    return {**read, **_matrix(read, table)}
+        first = [name for name in read if re.fullmatch(r"q_?0", name.strip().lower())]
+        read.update({name: read[name]._replace(stem="qw", why="beside qx, qy, qz") for name in first})
+    places = _places(read)
+    why = "a matrix, row by row"
+    if len(places) == 16:
+        why = "a matrix, row by row: its last row is 0 0 0 1"
+        if _is_transposed(places, table):
+            places = {name: (j, i) for name, (i, j) in places.items()}
+            why = "a matrix, column by column: its last column is 0 0 0 1"
+    for name, (row, column) in places.items():
+        stem = "the last row of a matrix"
+        if row < 3:
+            stem = "xyz"[row] if column == 3 else f"r{row + 1}{column + 1}"
+        read[name] = read[name]._replace(stem=stem, why=why)
 
 
-def quaternion_columns(read: dict[str, Reading], dof: int) -> list[str]:
+def quaternion_columns(read: Readings, dof: int) -> list[str]:
     """Return the four columns of a quaternion whose components are numbered, in order; none where there is none.
 
     ``q0 ... q3`` are one where other columns are the joints.
@@ -58,25 +67,7 @@ def quaternion_columns(read: dict[str, Reading], dof: int) -> list[str]:
     return []
 
 
-def _matrix(read: dict[str, Reading], table: Columns) -> dict[str, Reading]:
-    """Return the readings of a matrix: rotation, position, and its last row, which is checked."""
-    places = _places(read)
-    why = "a matrix, row by row"
-    if len(places) == 16:
-        why = "a matrix, row by row: its last row is 0 0 0 1"
-        if _is_transposed(places, table):
-            places = {name: (j, i) for name, (i, j) in places.items()}
-            why = "a matrix, column by column: its last column is 0 0 0 1"
-    entries = {}
-    for name, (row, column) in places.items():
-        stem = "the last row of a matrix"
-        if row < 3:
-            stem = "xyz"[row] if column == 3 else f"r{row + 1}{column + 1}"
-        entries[name] = read[name]._replace(stem=stem, why=why)
-    return entries
-
-
-def _places(read: dict[str, Reading]) -> dict[str, Place]:
+def _places(read: Readings) -> dict[str, Place]:
     """Return the columns of a matrix with their row and column from 0; nothing where there is none."""
     pairs: dict[str, Place] = {}
     single: dict[str, int] = {}
@@ -99,21 +90,14 @@ def _places(read: dict[str, Reading]) -> dict[str, Place]:
 
 
 def _is_transposed(places: dict[str, Place], table: Columns) -> bool:
-    by_place = {place: name for name, place in places.items()}
-
-    def is_last(last: Sequence[Place]) -> bool:
-        cells = [_numbers(table, by_place[place]) for place in last]
-        return bool(np.abs(np.stack(cells, axis=1) - [0, 0, 0, 1]).max() < ROUNDED)
-
-    if is_last([(3, j) for j in range(4)]):
+    matrices = np.empty((len(next(iter(table.values()))), 4, 4))
+    for name, (i, j) in places.items():
+        matrices[:, i, j] = numbers(table[name], name)
+    if np.abs(matrices[:, 3] - [0, 0, 0, 1]).max() < ROUNDED:
         return False
-    if is_last([(i, 3) for i in range(4)]):
+    if np.abs(matrices[:, :, 3] - [0, 0, 0, 1]).max() < ROUNDED:
         return True
     raise InputError("the matrices", "neither a last row nor a last column 0 0 0 1", "4 x 4 transforms")
-
-
-def _numbers(table: Columns, name: str) -> np.ndarray:
-    return numbers(table[name], [str(i) for i in range(1, len(table[name]) + 1)], name)
 
 
 def require_rotation(stated: str) -> None:
@@ -124,10 +108,10 @@ def require_rotation(stated: str) -> None:
 
 
 def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:
-    """Return ``qw, qx, qy, qz`` of columns rx, ry, rz (N, 3) [rad], which are a rotation vector or three turns.
+    """Return ``qw, qx, qy, qz`` of columns rx, ry, rz (N, 3) [rad], none for rows that are not finite.
 
     Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
-    first, second and third turn. Rows that are not finite have no quaternion.
+    first, second and third turn.
     """
     kept = np.isfinite(angles).all(axis=1)
     rotations = scipy.spatial.transform.Rotation

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError
-from rpim_opt.basics.tables import Columns, read_columns, texts
+from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
+from rpim_opt.basics.units import joint_columns
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
@@ -78,8 +81,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     kind = next((variant for column, variant in kind.variants.items() if column in table), kind)
     label = labels(table, N)
     columns = numeric(table, robot, kind, label)
-    y = _measured(columns, kind, label, N)
+    stems, convert = values_form(columns, kind)
+    try:
+        y = kind.prepare(convert(_beside_each_other(columns, stems, N)))
+    except RowError as error:
+        raise error.named(f"row {label[error.row]}") from None
     q = _of_joints("q", columns, robot, kind, N)
+    payload = columns.get(("payload", ""))
+    if payload is not None and not (payload >= 0).all():
+        row = int(np.argmin(payload))
+        raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
     whole = Block(
         kind,
         q=q,
@@ -87,15 +98,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         covariance=covariances(columns, declared, kind, y, label),
         row=np.arange(N),
         torque=_of_joints("tau", columns, robot, kind, N) if ("tau1", "") in columns else None,
-        payload=_payload(columns, label),
+        payload=payload,
         approach=_approach(columns, robot, kind, label),
         columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
         point=_named_points(table, kind, N),
         session=named_sessions(texts(table.get("session", ()), "session"), N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
-    _require_two_points(whole, markers, label)
-    configuration: Any = partial(_by_joints, whole.q)  # a third of the time of reading, and not all ask
+    if kind.points == 2:
+        _require_two_points(q, markers, label)
+    configuration: Any = partial(_by_joints, q)  # a third of the time of reading, and not all ask
     if "configuration" in table:
         configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
@@ -114,18 +126,15 @@ def _named_points(table: Columns, kind: Measurement, N: int) -> np.ndarray | Non
     return np.array(_names(table, columns, N), dtype=object)[:, None] if columns else None
 
 
-def _several(columns: Numbers, stems: Sequence[str], N: int) -> Array:
-    """Return columns side by side, (N, len(stems))."""
-    if not stems:
-        return np.empty((N, 0))
-    return np.column_stack([columns[stem, ""] for stem in stems])
+def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:
+    return np.column_stack([columns[stem, ""] for stem in stems]) if stems else np.empty((N, 0))
 
 
 def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
     """Return joint values, torques or directions (N, p, dof); a second point without its own has the first's."""
     own = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
     points = [own, [f"to_{name}" for name in own] if (f"to_{stem}1", "") in columns else own][: kind.points]
-    values = [_several(columns, names, N) for names in points]
+    values = [_beside_each_other(columns, names, N) for names in points]
     return values[0][:, None] if len(values) == 1 else np.stack(values, axis=1)  # of one point without a copy
 
 
@@ -140,37 +149,16 @@ def _approach(columns: Numbers, robot: Robot, kind: Measurement, label: Sequence
     return approach
 
 
-def _payload(columns: Numbers, label: Sequence[str]) -> Array | None:
-    """Return the mass at the flange (N,) [kg]."""
-    payload = columns.get(("payload", ""))
-    if payload is not None and not (payload >= 0).all():
-        row = int(np.argmin(payload))
-        raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
-    return payload
-
-
-def _measured(columns: Numbers, kind: Measurement, label: Sequence[str], N: int) -> Array:
-    stems, convert = values_form(columns, kind)
-    try:
-        return kind.prepare(convert(_several(columns, stems, N)))
-    except RowError as error:
-        raise error.named(f"row {label[error.row]}") from None
-
-
 def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
     """Return the texts of the first of the columns that is there, or N empty ones."""
-    for column in columns:
-        if column in table:
-            return texts(table[column], column)
-    return ("",) * N
+    column = next((each for each in columns if each in table), None)
+    return texts(table[column], column) if column else ("",) * N
 
 
-def _require_two_points(whole: Block, markers: Sequence[Sequence[str]], label: Sequence[str]) -> None:
+def _require_two_points(q: Array, markers: Sequence[Sequence[str]], label: Sequence[str]) -> None:
     """Refuse a distance from a point to itself."""
-    if whole.measurement.points != 2:
-        return
     for i, name in enumerate(label):
-        if markers[0][i] == markers[1][i] and np.array_equal(whole.q[i, 0], whole.q[i, 1]):
+        if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
             found = "twice the same reflector in the same configuration"
             raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
 
@@ -194,3 +182,32 @@ def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[st
         index = np.array(rows)
         blocks.append(replace(whole.take(index, index), markers=tuple(names), fixture=place))
     return tuple(blocks)
+
+
+# --- RoboDK ----------------------------------------------------------------------------------------------------------
+
+
+def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, list[float]]) -> Columns:
+    """Return the columns of the file that RoboDK exports after calibration measurements: their order counts.
+
+    They are the joints [deg or mm], the measured point x, y, z [mm], and the reflector in the flange frame x, y, z [mm]
+    (RoboDK's macro library reads it so). ``joints`` are "angle" or "length" each; ``tools`` are the reflectors that are
+    known, marker to x, y, z [mm], to which new ones are added as A, B, ...
+    """
+    try:
+        table = list(read_columns(Path(path)).values())
+        names = [*joint_columns(joints), "x_mm", "y_mm", "z_mm"]
+        if len(table) < len(names) + 3:
+            accepted = f"{len(joints)} joints, 3 measured and 3 of the tool"
+            raise InputError("the header", f"{len(table)} columns", accepted)
+        places = np.column_stack([numbers(table[i], f"{i + 1}") for i in range(len(names), len(names) + 3)])
+    except InputError as error:
+        raise error.within(path) from None
+    markers = []
+    for place in places:
+        name = next((name for name, known in tools.items() if np.allclose(known, place, atol=1e-6)), None)
+        if name is None:
+            name = next(new for new in chain(ascii_uppercase, (f"M{i}" for i in count(1))) if new not in tools)
+            tools[name] = place.tolist()
+        markers.append(name)
+    return {**dict(zip(names, table, strict=False)), "marker": markers}

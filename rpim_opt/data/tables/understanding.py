@@ -1,9 +1,9 @@
-"""What a raw table says: every column with its meaning, its unit, and why; the table with our names."""
+"""Meaning and unit of every column of a raw table, with the reason; the table under our names."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,26 +11,36 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.layout import Head, RawTable, TableOptions, is_missing, missing_rows
+from rpim_opt.basics.layout import Head, RawTable, TableOptions, is_missing
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.formats.registry import read_raw
-from rpim_opt.data.tables.names import MOTOMAN, TURNS, UR_JOINTS, Reading, dialect, endings, recognize, ur_joint
+from rpim_opt.data.tables.names import (
+    MOTOMAN,
+    TURNS,
+    UR_JOINTS,
+    Reading,
+    Readings,
+    dialect,
+    endings,
+    recognize,
+    ur_joint,
+)
 from rpim_opt.data.tables.orientations import numbered, quaternion_columns, quaternions, require_rotation
 from rpim_opt.robot.mdh import Robot
 
 TURNED = ("rx", "ry", "rz")
 """Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
-Readings = dict[str, Reading]
-"""What every column holds, by its name."""
-NAMES = {"label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
-         "session": "session of the measurements", "to_marker": "reflector of the second point",
-         "point": "point that was touched or seen", "rx": "measured roll (extrinsic xyz)",
-         "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)"}  # fmt: skip
+MEANINGS = {
+    "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
+    "session": "session of the measurements", "to_marker": "reflector of the second point",
+    "point": "point that was touched or seen", "rx": "measured roll (extrinsic xyz)",
+    "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)",
+}  # fmt: skip
 NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
             r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
 SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
@@ -50,21 +60,8 @@ class Meant(NamedTuple):
 class Understood:
     """A raw table with our names.
 
-    Parameters
-    ----------
-    file
-        Its name.
-    columns
-        Cells by our names.
-    raw
-        The columns as the file has them, of the same rows.
-    meant
-        What every column means.
-    notes
-        How the file was read and what was left out, a sentence each.
-    doubt
-        The option that tells how orientations are to be read where only a check against the robot does:
-        ``quaternion`` or ``rotation``.
+    ``columns`` are cells by our names, ``raw`` those that the file has, of the same rows. ``doubt`` is the option that
+    says how orientations are to be read where only a check against the robot shows it: ``quaternion``, ``rotation``.
     """
 
     file: str
@@ -93,33 +90,12 @@ def understand(
     joints: Sequence[str] = (),
     targets: bool = False,
 ) -> Understood:
-    r"""Return what a raw table says of a robot and a kind of measurement, under the names that `read_data` takes.
+    r"""Return what a raw table says of a robot and a measurement type, under the names that `read_data` takes.
 
-    Names that it takes already stay. Others are recognized where they can mean one thing only: ``joint_1``,
-    ``J1 [deg]``, names of joints in a URDF, joints counted from 0, ``robot1_joint_1``, ``measured_x (mm)``,
-    ``quat_w``, ``roll`` and what `names` lists. What is recognized in no way is left out, and so are rows without any
-    measured value, or without any joint value; cells change where their unit is none of ours.
+    Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
+    recognized is left out, and so are rows without any measured or any joint value. ``joints`` are the names that the
+    robot's file has. Of ``targets`` what was commanded counts, and rows may lack either values.
 
-    Parameters
-    ----------
-    source
-        A file of any format, or what it holds.
-    robot, kind
-        Decide which columns there may be.
-    options
-        What the user states.
-    joints
-        What the robot's file calls its joints.
-    targets
-        Whether rows are where the robot is to go: what was commanded counts then, and rows may lack either values.
-
-    Raises
-    ------
-    InputError
-        For a table that cannot be read, columns without a unit that no one gave, names that may mean two things.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import numpy as np
     >>> from rpim_opt.data.measurements.position import position
@@ -133,91 +109,38 @@ def understand(
     (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
     """
     options = options or TableOptions()
-    file = source.name if isinstance(source, Path) else ""
-    raw = read_raw(source, options) if isinstance(source, Path) else source
+    path = source if isinstance(source, Path) else None
+    raw = source if isinstance(source, RawTable) else read_raw(source, options)
     require_rotation(options.rotation)
     known = number_columns(robot, kind)
     try:
         read, why, rotation = _readings(raw, robot, kind, options, joints, targets)
-        columns, meant = _ours(raw.columns, read, why, kind, known, options.units)
-        if "rx" in known:
+        columns, meant = _under_our_names(raw.columns, read, why, kind, known, options.units)
+        if "rx" in known and (options.rotation or rotation) not in ("", "extrinsic xyz"):
             columns, meant = _as_quaternions(columns, meant, options.rotation or rotation)
+        kept, notes = range(len(next(iter(columns.values()), ()))), []
+        if not targets:
+            kept, notes = _rows_with_values(columns, robot, kind)
+            columns, more = _labelled({name: [cells[i] for i in kept] for name, cells in columns.items()})
+            notes += more
     except InputError as error:
-        raise error.within(source if isinstance(source, Path) else None) from None
-    kept = list(range(len(next(iter(columns.values()), ()))))
-    notes: list[str] = []
-    if not targets:
-        columns, kept, notes = _with_values(columns, robot, kind)
-        columns, more = _labelled(columns)
-        notes += more
+        raise error.within(path) from None
     return Understood(
-        file,
+        path.name if path else "",
         columns,
         {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
-        meant,
+        tuple(meant),
         (*raw.notes, *notes),
         _doubt(read, options, rotation, robot.dof),
     )
 
 
 def _doubt(read: Readings, options: TableOptions, rotation: str, dof: int) -> str:
-    """Return which option only a check against the robot can spare: of components that are numbered, of rx, ry, rz."""
     if not options.quaternion and quaternion_columns(read, dof):
         return "quaternion"
     turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
     named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
     return "rotation" if len(turns) == 3 and not named and not (options.rotation or rotation) else ""
-
-
-def _ours(
-    table: Columns,
-    read: Readings,
-    left_why: Mapping[str, str],
-    kind: Measurement,
-    known: Mapping[str, Sequence[str]],
-    units: Mapping[str, str],
-) -> tuple[dict[str, Sequence[Any]], tuple[Meant, ...]]:
-    """Return the columns that are ours, by our names and in our units, and what every column means."""
-    plain = text_columns(kind)
-    ours = {
-        name: each for name, each in read.items() if name not in left_why and (each.stem in known or each.stem in plain)
-    }
-    in_unit = _with_units(ours, known, units)
-    columns: dict[str, Sequence[Any]] = {}
-    meant = []
-    for name in table:
-        if name not in ours:
-            reason = left_why.get(name) or read[name].why or "no column of these measurements"
-            meant.append(Meant(name, "left out", "", "", reason))
-            continue
-        new, size, why = in_unit[name]
-        columns[new] = table[name] if size == 1 else _times(table[name], size, name)
-        stem, unit = split_unit(new)
-        reason = f"{ours[name].why}; unit {why}" if why else ours[name].why
-        shown = new.removeprefix(f"{stem}_") if unit else ""
-        meant.append(Meant(name, kind.words.columns.get(stem) or meaning(stem), new, shown, reason))
-    return columns, tuple(meant)
-
-
-def meaning(stem: str) -> str:
-    """Return what a column of ours is, in words.
-
-    >>> from rpim_opt.data.tables.understanding import meaning
-    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
-    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
-    """
-    if stem in NAMES:
-        return NAMES[stem]
-    if stem.startswith("to_"):
-        return f"second point: {meaning(stem.removeprefix('to_'))}"
-    for prefix, word in SPREAD.items():
-        if stem.startswith(prefix):
-            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
-    for pattern, words in NUMBERED.items():
-        match = re.fullmatch(pattern, stem)
-        if match:
-            return words.format(*match.groups())
-    return f"measured {stem}"
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------
@@ -230,12 +153,12 @@ def _readings(
     table, dof = raw.columns, robot.dof
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
-    read, rotation = _of_letters(read, dof)
-    read = numbered(read, table, dof, options.quaternion or "wxyz")
-    read = _from_one(_by_name(read, table, joints, dof), dof)
-    wanted = [{f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}]
-    for stems in wanted:
-        read = _without_prefix(read, stems, joints, options.prefix)
+    rotation = _of_letters(read, dof)
+    numbered(read, table, dof, options.quaternion or "wxyz")
+    _by_joint_names(read, table, joints, dof)
+    read.update(_from_one(read, dof))
+    for stems in ({f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}):
+        read.update(_without_prefix(read, stems, joints, options.prefix))
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "a row each, with a column marker")
@@ -245,13 +168,10 @@ def _readings(
                 "--rotation 'intrinsic xyz'; or --measurement position"
             )
             raise InputError("the header", f"column '{name}', of angles or of a rotation vector", accepted)
-        if (
-            each.stem == "temperature"
-            and not each.unit
-            and not {"temperature"} & {*options.units, *robot.model.columns}
-        ):
+        wanted = {*options.units, *robot.model.columns}
+        if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature whose unit is not there")
-    return (*_one_of_each(read, targets), rotation)
+    return read, _left_out(read, targets), rotation
 
 
 def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
@@ -279,39 +199,36 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
     return found._replace(unit=unit)
 
 
-def _of_letters(read: Readings, dof: int) -> tuple[Readings, str]:
-    """Return readings in which letters are angles or joints where all of them are there, and the rotation they tell."""
+def _of_letters(read: Readings, dof: int) -> str:
+    """Take letters for joints or angles where all of them are there, and return the rotation that they tell."""
     stems = {found.stem for found in read.values()}
     if dof == len(MOTOMAN) and stems >= set(MOTOMAN):
         joints = {letter: f"q{i}" for i, letter in enumerate(MOTOMAN, start=1)}
-        why = "Yaskawa: S, L, U, R, B, T"
-        yaskawa = {name: each for name, each in read.items() if each.stem in joints}
-        read = read | {name: each._replace(stem=joints[each.stem], why=why) for name, each in yaskawa.items()}
+        _rename(read, joints, "Yaskawa: S, L, U, R, B, T")
     for letters, meant, why, rotation in TURNS:
         if {"x", "y", "z", *letters} <= stems:
-            new = dict(zip(letters, meant, strict=True))
-            turned = {
-                name: each._replace(stem=new[each.stem], why=why) for name, each in read.items() if each.stem in new
-            }
-            return {**read, **turned}, rotation
-    return read, ""
+            _rename(read, dict(zip(letters, meant, strict=True)), why)
+            return rotation
+    return ""
 
 
-def _by_name(read: Readings, table: Columns, joints: Sequence[str], dof: int) -> Readings:
-    """Return readings with ROS' joints in the robot's order, where columns name0, ... name them."""
+def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
+    read.update({name: each._replace(stem=new[each.stem], why=why) for name, each in read.items() if each.stem in new})
+
+
+def _by_joint_names(read: Readings, table: Columns, joints: Sequence[str], dof: int) -> None:
+    """Give ROS' joints the robot's order, where columns name0, ... name them."""
     matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
     named = {int(match[1]): name for name, match in matches.items() if match}
     if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:
-        return read
+        return
     places = {f"q{i}": _joint_named(table[column], column, joints, dof) for i, column in named.items()}
-    ordered = dict(read)
-    for name, found in read.items():
+    for name, found in list(read.items()):
         number = places.get(found.stem)
         if number:
-            ordered[name] = found._replace(stem=f"q{number}", why="the joint that its column of names names")
+            read[name] = found._replace(stem=f"q{number}", why="the joint that its column of names names")
         elif number == 0:
-            ordered[name] = found._replace(stem=f"another {found.stem}")
-    return ordered
+            read[name] = found._replace(stem=f"another {found.stem}")
 
 
 def _joint_named(cells: Sequence[Any], column: str, joints: Sequence[str], dof: int) -> int:
@@ -325,58 +242,53 @@ def _joint_named(cells: Sequence[Any], column: str, joints: Sequence[str], dof: 
     number = ur_joint(name)
     if number and dof == len(UR_JOINTS):
         return number
-    raise InputError(
-        "the header", f"joint '{name}' in column '{column}'", "a robot from a URDF, which names its joints"
-    )
+    accepted = "a robot from a URDF, which names its joints"
+    raise InputError("the header", f"joint '{name}' in column '{column}'", accepted)
 
 
 def _from_one(read: Readings, dof: int) -> Readings:
-    """Return readings with the joints counted from 1, where they are counted from 0."""
+    """Return the joints counted from 1, where they are counted from 0."""
     if all(found.stem != "q0" for found in read.values()):
-        return read
+        return {}
     count = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
-    shifted = {name: found._replace(stem=count[found.stem], why=f"{found.why}, counted from 0")
-               for name, found in read.items() if found.stem in count}  # fmt: skip
-    return {**read, **shifted}
+    return {
+        name: found._replace(stem=count[found.stem], why=f"{found.why}, counted from 0")
+        for name, found in read.items()
+        if found.stem in count
+    }
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
-    """Return readings in which names with a prefix are what they are without it, where no others are any of these."""
+    """Return what names mean without a prefix that all of the wanted ones have, where none of these is there."""
     if wanted & {each.stem for each in read.values()}:
-        return read
+        return {}
     found: dict[str, Readings] = {}
     for name, each in read.items():
-        stem = split(name)[0]
-        for prefix, rest in endings(stem):
+        for prefix, rest in endings(split(name)[0]):
             known = recognize(rest, joints)
             if known.why and known.kind != "derived" and not each.why:
-                why = f"{known.why}, of {prefix.strip(' ._/:-')}"
-                found.setdefault(prefix, {})[name] = known._replace(
-                    unit=each.unit, why=why, kind=known.kind or each.kind
-                )
+                bare = prefix.strip(" ._/:-")
+                new = Reading(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
+                found.setdefault(bare, {})[name] = new
     whole = {}
     for prefix, each in found.items():
-        shifted = _from_one(each, len(wanted))
-        if wanted <= {known.stem for known in shifted.values()}:
-            whole[prefix] = shifted
-    if stated:
-        whole = {prefix: each for prefix, each in whole.items() if prefix.strip(" ._/:-") == stated.strip(" ._/:-")}
+        counted = each | _from_one(each, len(wanted))
+        if wanted <= {known.stem for known in counted.values()} and stated.strip(" ._/:-") in ("", prefix):
+            whole[prefix] = counted
     if len(whole) > 1:
-        accepted = "--prefix with the one that was measured"
-        raise InputError("the header", f"columns of {', '.join(each.strip(' ._/:-') for each in whole)}", accepted)
-    return {**read, **next(iter(whole.values()), {})}
+        raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
+    return next(iter(whole.values()), {})
 
 
-def _one_of_each(read: Readings, targets: bool) -> tuple[Readings, dict[str, str]]:
-    """Return readings, and why some are left out: what was computed, and what was wanted where it was measured.
+def _left_out(read: Readings, targets: bool) -> dict[str, str]:
+    """Return why columns are left out: what was computed, and what was wanted where it was measured.
 
     Of targets, what was measured is left out where it was wanted, too.
     """
     why: dict[str, str] = {}
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
-    found = dict(read)
-    for name, each in read.items():
+    for name, each in list(read.items()):
         if each.kind == "derived":
             why[name] = "computed from others"
         elif targets:
@@ -385,47 +297,80 @@ def _one_of_each(read: Readings, targets: bool) -> tuple[Readings, dict[str, str
         elif each.kind != "wanted" or (each.stem == "label" and "label" not in measured):
             continue
         elif each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
-            found[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
+            read[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
         else:
             why[name] = "what was wanted is no measurement"
-    return found, why
+    return why
 
 
-# --- units ---------------------------------------------------------------------------------------------------------
+# --- our names and units -------------------------------------------------------------------------------------------
 
 
-def _with_units(
-    read: Readings, known: Mapping[str, Sequence[str]], units: Mapping[str, str]
-) -> dict[str, tuple[str, float, str]]:
-    """Return the columns' names with their units, the factor on their cells, and why; refuse what cannot be."""
-    named: dict[str, tuple[str, float, str]] = {}
-    first: dict[str, str] = {}
+def _under_our_names(
+    table: Columns,
+    read: Readings,
+    left_why: Mapping[str, str],
+    kind: Measurement,
+    known: Mapping[str, Sequence[str]],
+    units: Mapping[str, str],
+) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
+    """Return the columns that are ours, by our names and in our units, and what every column means."""
+    columns: dict[str, Sequence[Any]] = {}
+    meant: list[Meant] = []
     unitless: dict[str, list[str]] = {}
-    for name, found in read.items():
+    for name, cells in table.items():
+        found = read[name]
+        if name in left_why or (found.stem not in known and found.stem not in text_columns(kind)):
+            reason = left_why.get(name) or found.why or "no column of these measurements"
+            meant.append(Meant(name, "left out", "", "", reason))
+            continue
         dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
         unit, why = _unit(name, found, dimensions, units)
         if unit and dimension_of(unit) not in dimensions:
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
             raise InputError("the header", f"column '{name}' ({meaning(found.stem)}) in {unit}", accepted)
-        size = 1.0
         if unit in FOREIGN:
-            size = FOREIGN[unit].size
-            why += f"; {unit} is {size:g} {FOREIGN[unit].unit}"
-            unit = FOREIGN[unit].unit
+            of = FOREIGN[unit]
+            cells = ["" if np.isnan(value) else repr(float(of.size * value)) for value in _values(cells, name)]
+            why += f"; {unit} is {of.size:g} {of.unit}"
+            unit = of.unit
         if not unit and dimensions:
             unitless.setdefault(dimensions[0], []).append(name)
         new = f"{found.stem}_{unit}" if unit else found.stem
-        named[name] = new, size, why
-        other = first.setdefault(new, name)
-        if other != name:
+        if new in columns:
+            other = next(each.column for each in meant if each.name == new)
             raise InputError("the header", f"columns '{other}' and '{name}' for {new}", "one of them")
+        columns[new] = cells
+        said = kind.words.columns.get(found.stem) or meaning(found.stem)
+        meant.append(Meant(name, said, new, unit, f"{found.why}; unit {why}" if why else found.why))
     if unitless:
         examples = {"angle": "deg", "length": "mm", "torque": "Nm", "mass": "kg"}
         missing = ",".join(examples.get(dimension, dimension) for dimension in unitless)
         lacking = ", ".join(name for names in unitless.values() for name in names)
         accepted = f"--units with theirs, such as {missing}, or names that carry one, such as q1_deg and x_mm"
         raise InputError("the header", f"columns without a unit ({lacking})", accepted)
-    return named
+    return columns, meant
+
+
+def meaning(stem: str) -> str:
+    """Return what a column of ours is, in words.
+
+    >>> from rpim_opt.data.tables.understanding import meaning
+    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
+    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
+    """
+    if stem in MEANINGS:
+        return MEANINGS[stem]
+    if stem.startswith("to_"):
+        return f"second point: {meaning(stem.removeprefix('to_'))}"
+    for prefix, word in SPREAD.items():
+        if stem.startswith(prefix):
+            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
+    for pattern, words in NUMBERED.items():
+        match = re.fullmatch(pattern, stem)
+        if match:
+            return words.format(*match.groups())
+    return f"measured {stem}"
 
 
 def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[str, str]) -> tuple[str, str]:
@@ -448,35 +393,26 @@ def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[s
     return "", ""
 
 
-def _times(cells: Sequence[Any], size: float, name: str) -> list[str]:
-    """Return numbers in another unit; cells without one stay."""
-    rows = range(1, len(cells) + 1)
-    return ["" if is_missing(str(cell)) else repr(float(size * numbers([cell], [str(i)], name)[0]))
-            for i, cell in zip(rows, cells, strict=True)]  # fmt: skip
+def _values(cells: Sequence[Any], name: str) -> np.ndarray:
+    """Return the numbers (N,) of cells, NaN where there is none."""
+    missing = [is_missing(str(cell)) for cell in cells]
+    found = numbers([0.0 if lacks else cell for cell, lacks in zip(cells, missing, strict=True)], name)
+    return np.where(missing, np.nan, found)
 
 
 def _as_quaternions(
-    columns: dict[str, Sequence[Any]], meant: tuple[Meant, ...], rotation: str
-) -> tuple[dict[str, Sequence[Any]], tuple[Meant, ...]]:
+    columns: dict[str, Sequence[Any]], meant: Sequence[Meant], rotation: str
+) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
     """Return columns whose rotation vector, or turns other than roll, pitch, yaw, are a quaternion."""
-    if rotation in ("", "extrinsic xyz"):
-        return columns, meant
     names = {split_unit(name)[0]: name for name in columns}
     if any(turn not in names for turn in TURNED):
         raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
-    angles = []
-    for turn in TURNED:
-        unit = split_unit(names[turn])[1] or UNITS["rad"]
-        cells = ["nan" if is_missing(str(cell)) else cell for cell in columns[names[turn]]]
-        filled = [0.0 if cell == "nan" else cell for cell in cells]
-        values = unit.si * numbers(filled, [str(i) for i in range(1, len(cells) + 1)], names[turn])
-        angles.append(np.where([cell == "nan" for cell in cells], np.nan, values))
-    others = {name: cells for name, cells in columns.items() if split_unit(name)[0] not in TURNED}
+    turned = [names[turn] for turn in TURNED]
+    angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns[name], name) for name in turned]
+    others = {name: cells for name, cells in columns.items() if name not in turned}
     said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
     new = "qw, qx, qy, qz"
-    changed = tuple(
-        each._replace(meaning=said, name=new, unit="") if split_unit(each.name)[0] in TURNED else each for each in meant
-    )
+    changed = [each._replace(meaning=said, name=new, unit="") if each.name in turned else each for each in meant]
     return {**others, **quaternions(np.column_stack(angles), rotation)}, changed
 
 
@@ -485,28 +421,29 @@ def _as_quaternions(
 
 def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
     """Return the names of measured and of joint values without units: a row needs both."""
-    forms: Iterable[str] = [stem for form, _ in kind.forms for stem in form]
+    forms = {stem for form, _ in kind.forms for stem in form}
     return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
-def _with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Columns, list[int], list[str]]:
-    """Return the columns without rows that have no values, the rows that are left, and what was left out."""
-    out: set[int] = set()
-    notes = []
+def _rows_with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Sequence[int], list[str]]:
+    """Return the rows that have measured and joint values, and which were left out."""
     count = len(next(iter(columns.values()), ()))
     labels = columns.get("label", range(1, count + 1))
+    out: set[int] = set()
+    notes = []
     for what, stems in row_stems(robot, kind).items():
-        rows = missing_rows(columns, [name for name in columns if split_unit(name)[0] in stems])
+        own = [cells for name, cells in columns.items() if split_unit(name)[0] in stems]
+        rows = [i for i in range(count) if own and all(is_missing(str(cells[i])) for cells in own)]
         if rows:
             notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
         out |= set(rows)
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
-    return {name: [cells[i] for i in kept] for name, cells in columns.items()}, kept, notes
+    return kept, notes
 
 
-def _labelled(columns: Columns) -> tuple[Columns, list[str]]:
+def _labelled(columns: dict[str, Sequence[Any]]) -> tuple[dict[str, Sequence[Any]], list[str]]:
     """Return the columns with unique labels, of point and reflector where a point is there with several."""
     labels = [str(cell).strip() for cell in columns.get("label", ())]
     if _unique(labels):

@@ -12,12 +12,14 @@ from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
 def read(text: str) -> Rows:
     """Return the rows; names of objects within objects are joined by points, ``measured.x_mm``."""
-    if text.lstrip().startswith("["):
-        found = parse_json(text)
-    else:
-        lines = [line for line in text.splitlines() if line.strip()]
-        whole = len(lines) > 1 and lines[0].rstrip().endswith("}")
-        found = [_parsed(line, i) for i, line in enumerate(lines, start=1)] if whole else parse_json(text)
+    lines = [line for line in text.splitlines() if line.strip()]
+    try:
+        if not text.lstrip().startswith("[") and len(lines) > 1 and lines[0].rstrip().endswith("}"):
+            found = [parse_json(line) for line in lines]
+        else:
+            found = parse_json(text)
+    except ValueError as error:
+        raise InputError("the JSON text", str(error), "a whole JSON file, or an object a line") from None
     if isinstance(found, dict) and all(isinstance(cells, list) for cells in found.values()):
         if len(set(map(len, found.values()))) != 1:
             raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
@@ -27,13 +29,6 @@ def read(text: str) -> Rows:
     if not all(isinstance(row, dict) for row in found):
         raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
     return [dict(_flat("", row)) for row in found]
-
-
-def _parsed(line: str, number: int) -> Any:
-    try:
-        return parse_json(line)
-    except InputError as error:
-        raise InputError(f"line {number}", error.found, error.accepted) from None
 
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:

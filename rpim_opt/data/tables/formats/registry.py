@@ -45,13 +45,6 @@ def formats() -> list[TableFormat]:
 def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     """Return the table of a file of any format.
 
-    Raises
-    ------
-    InputError
-        For a file that cannot be read, and a table without header of which no columns are stated.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> from rpim_opt.data.tables.formats.registry import read_raw
     >>> _ = Path("points.jsonl").write_text('{"id": "P1", "xyz": [1.5, 2, 3]}')
@@ -59,25 +52,26 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     ['id', 'xyz x', 'xyz y', 'xyz z']
     """
     ending = path.suffix.lower()
-    fitting = [each for each in formats() if ending in each.endings]
-    if not fitting:
-        known = {*TEXTS, *EXCEL, ".parquet"}
-        if ending not in known:
-            accepted = ", ".join(sorted(known.union(*(each.endings for each in formats()))))
-            raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
-        return read_table(path, options)
-    try:
-        require_file(path, LARGEST_DATA)
-        text, _ = decoded(path, options.encoding if options else "")
-        found = next((each for each in fitting if each.shown_by(text)), None)
-        if found is None and ending in TEXTS:
-            return read_table(path, options)
-        rows = found.read(text) if found else []
-        if found is None or not rows:
+    every = formats()
+    fitting = [each for each in every if ending in each.endings]
+    plain = {*TEXTS, *EXCEL, ".parquet"}
+    if not fitting and ending not in plain:
+        accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
+        raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
+    found = None
+    if fitting:
+        try:
+            require_file(path, LARGEST_DATA)
+            text, _ = decoded(path, options.encoding if options else "")
+            found = next((each for each in fitting if each.shown_by(text)), None)
+            rows = found.read(text) if found else ()
+        except InputError as error:
+            raise error.within(path) from None
+        if not rows and (found or ending not in TEXTS):
             names = " or ".join(each.name for each in fitting)
-            raise InputError("the file", "neither targets nor rows", f"{names} with some")
-    except InputError as error:
-        raise error.within(path) from None
+            raise InputError("the file", "neither targets nor rows", f"{names} with some", path)
+    if found is None:
+        return read_table(path, options)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
     raw = read_table(path, options, columns)
