@@ -59,6 +59,7 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
     found = None
+    rows: Rows = ()
     if fitting:
         try:
             require_file(path, LARGEST_DATA)
