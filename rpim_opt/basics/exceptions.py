@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, TypeVar
 Named = TypeVar("Named")
 LONGEST = 1000
 """Characters of a part of a sentence."""
+LONGEST_COMPARED = 200
+"""Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 
 
 class RpimError(Exception):
@@ -51,9 +53,7 @@ class InputError(RpimError):
         self.where = _one_line(where)
         self.found = _one_line(found)
         self.accepted = _one_line(accepted)
-        place = self.where
-        if file:
-            place = f"{_one_line(str(file))}, {self.where}"
+        place = f"{_one_line(str(file))}, {self.where}" if file else self.where
         super().__init__(f"{place}: found {self.found}, accepted: {self.accepted}.")
 
     def within(self, file: object) -> InputError:
@@ -64,28 +64,14 @@ class InputError(RpimError):
 def _one_line(text: str) -> str:
     """Return a part of a sentence: what files say may have lines, and be of any length."""
     line = " ".join(text.splitlines())
-    if len(line) <= LONGEST:
-        return line
-    return f"{line[:LONGEST]}..."
+    return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
 
 
 class RowError(InputError):
-    """A row of a table is wrong, and the table's reader knows what the row is called.
+    """A row of a table (from 0) is wrong, and the table's reader knows what the row is called.
 
-    Parameters
-    ----------
-    row
-        Its number, from 0.
-    found, accepted
-        As `InputError` has them.
-
-    Examples
-    --------
     >>> from rpim_opt.basics.exceptions import RowError
-    >>> error = RowError(3, "a quaternion of norm 2", "norm 1")
-    >>> print(error)
-    row 4: found a quaternion of norm 2, accepted: norm 1.
-    >>> print(error.named("row P4"))
+    >>> print(RowError(3, "a quaternion of norm 2", "norm 1").named("row P4"))
     row P4: found a quaternion of norm 2, accepted: norm 1.
     """
 
@@ -99,11 +85,11 @@ class RowError(InputError):
 
 
 class Conflict(NamedTuple):
-    """What contradicts what: by how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
+    """By how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
 
     Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
-    names of demands that cannot hold together, of which any one less would do; ``stated`` says by how much [SI]
-    statements in words would have to give way.
+    those that cannot hold together, of which any one less would do; ``stated`` says by how much [SI] statements in
+    words would have to give way.
     """
 
     parameters: dict[str, float]
@@ -111,16 +97,33 @@ class Conflict(NamedTuple):
     constraints: tuple[str, ...] = ()
     stated: Mapping[str, float] = MappingProxyType({})
 
+    def __str__(self) -> str:
+        """Return it as a sentence, empty where nothing is known."""
+        parts = []
+        if self.constraints:
+            parts.append(f"these cannot hold together: {', '.join(self.constraints)}")
+        bounds = _by(self.parameters)
+        rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in self.configurations.items())
+        if bounds and rows:
+            parts.append(f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}")
+        elif bounds or rows:
+            parts.append(f"loosening {bounds or rows} would do")
+        if self.stated:
+            parts.append(f"loosening {_by(self.stated)} would do")
+        return "; ".join(parts)
+
+
+def _by(bounds: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
+
 
 class NoSolutionFound(RpimError):
     """A convex program was not solved; its parameters, kept as attributes, are the evidence.
 
     Parameters
     ----------
-    formulation
-        Its name.
-    weight
-        At which it was to be solved.
+    formulation, weight
+        Its name, and the weight at which it was to be solved.
     status
         How the solver ended, ``"infeasible"`` for instance.
     conflict
@@ -149,9 +152,9 @@ class NoSolutionFound(RpimError):
         self.status = status
         self.conflict = conflict
         self.advice = advice
-        text = f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; "
+        why = (str(conflict) if conflict else "") or advice or "change the weight, or give it constraints"
         super().__init__(
-            text + (_contradiction(conflict) or advice or "change the weight, or give it constraints") + "."
+            f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; {why}."
         )
 
     def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
@@ -165,47 +168,17 @@ class NoSolutionFound(RpimError):
         """
         if not self.conflict:
             return self
-        rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
 
-        def rename(demand: str) -> str:
-            what, _, rest = demand.partition(" ")
-            number, _, tail = rest.partition(" ")
+        def rename(constraint: str) -> str:
+            what, number, *rest = constraint.split(" ", 2)
             if what == "configuration" and number.isdigit():
-                return f"configuration {names.get(int(number), number)} {tail}"
-            return demand
+                return " ".join([what, str(names.get(int(number), number)), *rest])
+            return constraint
 
-        named = self.conflict._replace(configurations=rows, constraints=tuple(map(rename, self.conflict.constraints)))
+        rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
+        renamed = tuple(rename(each) if " " in each else each for each in self.conflict.constraints)
+        named = self.conflict._replace(configurations=rows, constraints=renamed)
         return NoSolutionFound(self.formulation, self.weight, self.status, named, self.advice)
-
-
-def _contradiction(conflict: Conflict | None) -> str:
-    if conflict is None:
-        return ""
-    parts = []
-    if conflict.constraints:
-        parts.append(f"these cannot hold together: {', '.join(conflict.constraints)}")
-    if conflict.parameters or conflict.configurations:
-        parts.append(_loosening(conflict))
-    if conflict.stated:
-        parts.append(f"loosening {_by(conflict.stated)} would do")
-    return "; ".join(parts)
-
-
-def _loosening(conflict: Conflict) -> str:
-    """Say which bounds of parameters, or of configurations, would have to give way."""
-    bounds = _by(conflict.parameters)
-    rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in conflict.configurations.items())
-    if bounds and rows:
-        return f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}"
-    return f"loosening {bounds or rows} would do"
-
-
-def _by(bounds: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
-
-
-LONGEST_COMPARED = 200
-"""Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 
 
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:
@@ -215,8 +188,8 @@ def choices(found: str, known: Iterable[str], many: int = 24) -> str:
     close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
     shown = names
     if len(names) > many:
-        shown = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
-        shown = [name for name in names if name in shown]
+        near = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
+        shown = [name for name in names if name in near]
     listed = ", ".join(shown) if names else "nothing"
     more = f" and {len(names) - len(shown)} others" if len(shown) < len(names) else ""
     return f"{listed}{more} (did you mean {' or '.join(close)}?)" if close else listed + more

@@ -12,6 +12,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from glob import escape
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -39,40 +40,21 @@ ENDING = ".part"
 
 
 def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
-    """Refuse what is no ordinary file of at most ``largest`` bytes; a pipe or device would be read for ever.
-
-    Raises
-    ------
-    InputError
-        Saying what is there instead, or what the folder holds with one of the ``endings``.
-    """
+    """Refuse what is no ordinary file of at most ``largest`` bytes; a pipe or device would be read for ever."""
     try:
         found = path.stat()
     except FileNotFoundError:
-        accepted = "a file there"
-        near = _near(path, endings)
-        if near:
-            accepted = choices(path.name, near)
-        raise InputError("the file", "nothing", accepted, path) from None
+        near: list[str] = []
+        with suppress(OSError):
+            near = sorted(p.name for p in path.parent.iterdir() if p.suffix in endings)
+        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         raise InputError("the file", str(error), "a readable file", path) from None
     if not stat.S_ISREG(found.st_mode):
-        raise InputError("the file", _kind(found.st_mode), "an ordinary file", path)
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
+        raise InputError("the file", kind, "an ordinary file", path)
     if found.st_size > largest:
         raise InputError("the file", f"{found.st_size} bytes", f"a file of at most {largest} bytes", path)
-
-
-def _near(path: Path, endings: Sequence[str]) -> list[str]:
-    try:
-        return sorted(p.name for p in path.parent.iterdir() if p.suffix in endings)
-    except OSError:
-        return []
-
-
-def _kind(mode: int) -> str:
-    if stat.S_ISDIR(mode):
-        return "a folder"
-    return "a pipe, a socket or a device"
 
 
 def read_bytes(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> bytes:
@@ -101,15 +83,8 @@ def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
     """Return the path of a file that a folder names, which must lie in that folder.
 
     A folder may come from somebody else: what it names elsewhere is neither read nor written, be it by an absolute
-    path, by ``..`` or by a link.
+    path, by ``..`` or by a link. Errors have ``where`` and ``file`` as the place of the name.
 
-    Raises
-    ------
-    InputError
-        With ``where`` and ``file`` as the place of the name.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
     >>> from rpim_opt.basics.files import inside
@@ -136,13 +111,7 @@ def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return a TOML file's content.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is no TOML (with line and column).
-    """
+    """Return a TOML file's content; errors say line and column."""
     text = read_text(path, endings=[".toml"])
     if _DEEP.search(text):
         raise InputError("the TOML text", "a key of more than a hundred parts", "keys that a person would write", path)
@@ -153,13 +122,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Return a JSON file's content.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is no JSON (with line and column).
-    """
+    """Return a JSON file's content; errors say line and column."""
     text = read_text(path, LARGEST_DATA, [".json"])
     try:
         return parse_json(text)
@@ -168,13 +131,10 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return what JSON says, texts that can be written again.
+    """Return what JSON says.
 
-    Raises
-    ------
-    ValueError
-        For what is no JSON, is nested too deeply, states a key twice, or has half a surrogate pair, which no file of
-        UTF-8 can hold.
+    A ValueError is what is no JSON, is nested too deeply, states a key twice, or has half a surrogate pair, which no
+    file of UTF-8 can hold.
     """
     try:
         content = json.loads(text, object_pairs_hook=_unique)
@@ -186,7 +146,6 @@ def parse_json(text: str) -> Any:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object's keys and values; of a key that stands there twice, nobody knows which value is meant."""
     found = dict(pairs)
     if len(found) < len(pairs):
         ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
@@ -213,40 +172,40 @@ def refused(path: object) -> Iterator[None]:
 
 def write_text(path: Path, text: str) -> None:
     """Write text so that ``path`` holds either the whole new text or what it held before."""
-    write_bytes(path, text.encode("utf-8"))
+    write_files({path: text.encode("utf-8")})
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes so that ``path`` holds either all of them or what it held before, also after a power failure.
-
-    A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A
-    device or pipe gets the bytes as they are.
-    """
+    """Write bytes so that ``path`` holds either all of them or what it held before."""
     write_files({path: data})
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write several files as `write_bytes` does: all of them, or none.
+    """Write several files: all of them, or none, also after a power failure.
 
-    None is touched before the bytes of all are on the disk; when one cannot be put in its place those before it, and
-    folders that were made for them, are taken back.
+    A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A device
+    or pipe gets the bytes as they are. Nothing is put in its place before the bytes of all are on the disk; when one
+    cannot be, those before it, and folders that were made, are taken back.
     """
     streams = {path: data for path, data in contents.items() if _is_stream(path)}
     with undoing() as folders, ExitStack() as stack, undoing() as renames:
         made: dict[Path, Path] = {}
-        for path, data in contents.items():
+        for path in contents:
             if path in streams:
                 continue
             place = Path(os.path.realpath(path))
             if place.is_dir():
                 raise IsADirectoryError(21, "a folder is there", str(place))
             make_folder(place.parent, folders)
-            folder = stack.enter_context(scratch_folder(place))
-            made[place] = folder / "file"
-            _write_through(made[place], data, place)
+            made[place] = stack.enter_context(scratch_folder(place)) / "file"
+            with made[place].open("xb") as stream:
+                _keep_mode(stream.fileno(), place)
+                stream.write(contents[path])
+                stream.flush()
+                os.fsync(stream.fileno())
         for place, file in made.items():
             if len(contents) > 1:
-                _keep_old(place, file, renames)
+                _keep_old(place, file.with_name("old"), renames)
             file.replace(place)
         for path, data in streams.items():
             path.write_bytes(data)
@@ -264,12 +223,11 @@ def undoing() -> Iterator[ExitStack]:
 
 def make_folder(folder: Path, steps: ExitStack) -> None:
     """Make a folder and those above it; the steps take them back while nothing is in them."""
-    if folder.is_dir():
-        return
-    make_folder(folder.parent, steps)
-    with suppress(FileExistsError):  # somebody else just made it
-        folder.mkdir()
-        steps.callback(_remove_empty, folder)
+    for each in reversed([folder, *folder.parents]):
+        if not each.is_dir():
+            with suppress(FileExistsError):  # somebody else just made it
+                each.mkdir()
+                steps.callback(_remove_empty, each)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -277,27 +235,17 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _keep_old(place: Path, file: Path, steps: ExitStack) -> None:
+def _keep_old(place: Path, old: Path, steps: ExitStack) -> None:
     """Keep what is at a place beside the file that replaces it, for the case that a later one cannot be replaced."""
-    old = file.with_name("old")
     try:
-        os.link(place, old)
-    except FileNotFoundError:
-        steps.callback(_take_away, place, file)
-        return
-    except OSError:  # a file system without links
         shutil.copy2(place, old)
-    steps.callback(old.replace, place)
-
-
-def _take_away(place: Path, file: Path) -> None:
-    """Remove a file that was put where none was."""
-    if not file.exists():
-        place.unlink(missing_ok=True)
+        steps.callback(old.replace, place)
+    except FileNotFoundError:
+        steps.callback(place.unlink, missing_ok=True)
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether something is there that cannot be replaced: a pipe, a device."""
+    """Return whether something is there that cannot be replaced: a pipe, a device."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -305,16 +253,8 @@ def _is_stream(path: Path) -> bool:
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
-def _write_through(file: Path, data: bytes, place: Path) -> None:
-    """Write a new file and wait until it is on the disk; mode and owner are those of the file at ``place``."""
-    with file.open("xb") as stream:
-        _keep_mode(stream.fileno(), place)
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
 def _keep_mode(handle: int, place: Path) -> None:
+    """Give a new file the mode and the owner of the one at a place."""
     try:
         known = place.stat()
     except OSError:
@@ -343,47 +283,31 @@ def scratch_folder(place: Path) -> Iterator[Path]:
 
     A kill leaves it, and the next one for the same place removes it: a lock tells which ones somebody still uses.
     """
-    for left in place.parent.glob(f".{_literal(place.name)}.*{ENDING}"):
-        _remove_left(left)
+    for left in place.parent.glob(f".{escape(place.name)}.*{ENDING}"):
+        with ExitStack() as stack:
+            if _lock(left, stack, wait=False):
+                shutil.rmtree(left, ignore_errors=True)
     with ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
-        while not _lock(folder, stack):  # somebody took it for one that was left
+        stack.callback(lambda: shutil.rmtree(folder, ignore_errors=True))
+        _lock(folder, stack, wait=True)
+        while not folder.exists():  # somebody took it for one that was left
             folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            _lock(folder, stack, wait=True)
         yield folder
 
 
-def _literal(name: str) -> str:
-    """Return a name as a pattern that it alone meets."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
-
-
-def _lock(folder: Path, stack: ExitStack, unlockable: bool = True) -> bool:
-    """Lock a folder until the stack ends; return whether it is there and nobody else has it.
-
-    ``unlockable`` is the answer where locks are not to be had.
-    """
+def _lock(folder: Path, stack: ExitStack, wait: bool) -> bool:
+    """Lock a folder until the stack ends; return whether that succeeded, which not all systems know."""
     if fcntl is None:
-        return unlockable
+        return False
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
+        stack.callback(os.close, handle)
+        fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         return False
-    stack.callback(os.close, handle)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return unlockable
-    return folder.exists() and folder.stat().st_ino == os.fstat(handle).st_ino
-
-
-def _remove_left(folder: Path) -> None:
-    """Remove a folder that a killed process left."""
-    with ExitStack() as stack:
-        if _lock(folder, stack, unlockable=False):
-            shutil.rmtree(folder, ignore_errors=True)
+    return True
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -399,9 +323,6 @@ def json_text(content: Any) -> str:
 
 
 def _json(content: Any) -> str:
-    """Return JSON; a row of numbers stands on one line.
-
-    A text cannot be taken for such a row, since JSON escapes its line breaks.
-    """
+    """Return JSON with a row of numbers on one line; no text can be taken for one, since JSON escapes line breaks."""
     text = json.dumps(content, indent=2, allow_nan=False)
     return re.sub(r"\[\n([^][{}\"]*)\n *]", lambda row: f"[{' '.join(row[1].split())}]", text) + "\n"

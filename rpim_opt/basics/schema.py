@@ -15,6 +15,7 @@ Angle = Annotated[float, "angle"]
 Mass = Annotated[float, "mass"]
 Name = Annotated[str, Field(max_length=200)]
 """A name or a pattern of names: long ones would take for ever to be matched."""
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class Misfit(ValueError):
@@ -39,49 +40,35 @@ class Table(BaseModel):
     @cache
     def _dimensions(cls) -> dict[str, tuple[str, ...]]:
         known = {unit.dimension for unit in UNITS.values()}
-        return {
-            name: tuple(m for m in field.metadata if m in known)
-            for name, field in cls.model_fields.items()
-            if any(m in known for m in field.metadata)
-        }
+        found = {name: tuple(m for m in field.metadata if m in known) for name, field in cls.model_fields.items()}
+        return {name: dimensions for name, dimensions in found.items() if dimensions}
 
     @model_validator(mode="before")
     @classmethod
     def _to_si(cls, table: Any) -> Any:
+        """Return a table with its quantities [SI]; a stem may stand there once, whatever its unit."""
         if not isinstance(table, dict):
             return table
         dimensions = cls._dimensions()
         plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
         others = {key: value for key, value in table.items() if key not in plain}
-        si = _quantities(others, dimensions, plain)
-        kept = {key: value for key, value in table.items() if key not in others}
-        return kept | si
-
-
-def _quantities(table: dict[str, Any], dimensions: dict[str, tuple[str, ...]], plain: list[str]) -> dict[str, Any]:
-    """Return the quantities of a table [SI]; a stem may stand there once, whatever its unit."""
-    try:
-        values = quantities(table, dimensions, convert=_scaled, also=plain)
-    except InputError as error:
-        key = ""
-        if error.where.startswith("key "):
-            key = error.where.removeprefix("key ")
-        raise Misfit(key, error.found, error.accepted) from None
-    si: dict[str, Any] = {}
-    for (stem, _), value in values.items():
-        if stem in si:
-            raise Misfit(stem, "the same quantity twice", "one of them")
-        si[stem] = value
-    return si
+        try:
+            values = quantities(others, dimensions, convert=_scaled, also=plain)
+        except InputError as error:
+            key = error.where.removeprefix("key ") if error.where.startswith("key ") else ""
+            raise Misfit(key, error.found, error.accepted) from None
+        found = {key: value for key, value in table.items() if key not in others}
+        for (stem, _), value in values.items():
+            if stem in found:
+                raise Misfit(stem, "the same quantity twice", "one of them")
+            found[stem] = value
+        return found
 
 
 def _scaled(value: Any, where: str, si: float) -> Any:
     if isinstance(value, list):
         return [_scaled(v, where, si) for v in value]
     return number(value, where) * si
-
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
@@ -91,7 +78,12 @@ def validate(model: type[Model], content: dict[str, Any], file: object) -> Model
     except ValidationError as error:
         first = error.errors()[0]
         misfit = (first.get("ctx") or {}).get("error")
-        where = _where(first["loc"])
+        where = ""
+        for part in first["loc"]:  # joint 3.a, as a person counts
+            if isinstance(part, int):
+                where += f" {part + 1}"
+            elif not part.startswith("list["):  # which of several types, and no key
+                where += f".{part}" if where else part
         if isinstance(misfit, Misfit):
             where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
             raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
@@ -99,13 +91,3 @@ def validate(model: type[Model], content: dict[str, Any], file: object) -> Model
             raise InputError(f"key {where}", "nothing", "this key is required", file) from None
         wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
         raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
-
-
-def _where(loc: tuple[int | str, ...]) -> str:
-    """Format pydantic's location the way a person counts: ``joint 3.a``."""
-    text = ""
-    for part in loc:
-        if isinstance(part, str) and part.startswith("list["):  # which of several types, and no key
-            continue
-        text += f" {part + 1}" if isinstance(part, int) else f".{part}" if text else part
-    return text

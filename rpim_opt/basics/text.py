@@ -12,6 +12,13 @@ from io import StringIO
 from typing import Any
 from unicodedata import category
 
+BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
+"""Style of a table in a notebook: a long one scrolls."""
+MOST = 60
+"""Rows of a table in a notebook."""
+LONGEST = 60
+"""Characters of a title in one line."""
+
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a plain-text table; the first column is aligned left, the others right."""
@@ -34,13 +41,10 @@ def visible(text: str) -> str:
 
     Titles, sources, labels and file names may come from somebody else, and a terminal obeys what they say.
     """
-    return "".join(map(_visible, text))
-
-
-def _visible(character: str) -> str:
-    if character.isprintable() or character == "\n" or category(character) == "Zs":
-        return character
-    return character.encode("unicode_escape").decode("ascii")
+    return "".join(
+        c if c.isprintable() or c == "\n" or category(c) == "Zs" else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )
 
 
 def listed(items: Sequence[str], most: int = 8, between: str = ", ") -> str:
@@ -53,10 +57,6 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table; the first column is aligned left, the others right."""
     lines = [header, [":--", *["--:"] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
-"""Style of a table in a notebook: a long one scrolls."""
 
 
 def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str] = (), title: str = "") -> str:
@@ -80,51 +80,40 @@ def three_digits(value: float) -> str:
     ('0.537', '-44.3', '853,000')
     """
     rounded = float(f"{value:.3g}")
-    if abs(rounded) < 1000:
-        return f"{rounded:g}"
-    return f"{rounded:,.0f}"
+    return f"{rounded:g}" if abs(rounded) < 1000 else f"{rounded:,.0f}"
 
 
 def joined(parts: Sequence[str]) -> str:
-    """Return parts as an English list: ``a, b and c``.
-
-    >>> from rpim_opt.basics.text import joined
-    >>> joined(["gravity"]), joined(["a", "b", "c"])
-    ('gravity', 'a, b and c')
-    """
+    """Return parts as an English list: ``a, b and c``."""
     *before, last = parts
-    if not before:
-        return last
-    return f"{', '.join(before)} and {last}"
+    return f"{', '.join(before)} and {last}" if before else last
 
 
 def percent(share: float) -> str:
-    """Return a share as a text.
-
-    >>> from rpim_opt.basics.text import percent
-    >>> percent(0.95), percent(0.999)
-    ('95 %', '99.9 %')
-    """
+    """Return a share as a text: ``95 %``, ``99.9 %``."""
     return f"{100 * share:.4g} %"
+
+
+def counted(count: int, word: str) -> str:
+    """Return a number with a word: ``1 row``, ``3 rows``."""
+    return f"1 {word}" if count == 1 else f"{count} {word}s"
+
+
+def shortened(text: str) -> str:
+    """Return the beginning of a title."""
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+
+
+def version_of(package: str) -> str:
+    """Return the version of an installed package; this one need not be installed, a checkout will do."""
+    return str(sys.modules["rpim_opt"].__version__) if package == "rpim-opt" else metadata.version(package)
 
 
 # Objects
 
 
-MOST = 60
-"""Rows of a table in a notebook."""
-YES_OR_NO = {True: "yes", False: "no"}
-LONGEST = 60
-"""Characters of a title in one line."""
-
-
 class Brief:
-    """What says what it is in one short line; `_short` is that line without the class's name.
-
-    >>> import rpim_opt as ro
-    >>> ro.load("position").problem.robot
-    <Robot 'ABB IRB 120-3/0.58', 6 joints>
-    """
+    """What says what it is in one short line; `_short` is that line without the class's name."""
 
     def _short(self) -> str:
         raise NotImplementedError
@@ -151,13 +140,6 @@ class Tabled(Brief):
     def to_frame(self) -> Any:
         """Return its table as a data frame (pandas, or polars where that is missing).
 
-        Raises
-        ------
-        InputError
-            Where neither is installed.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> frame = ro.load("position").problem.parameters.to_frame()
         >>> list(frame.columns)
@@ -187,26 +169,12 @@ def _cell(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):
-        return YES_OR_NO[value]
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list | tuple):
         return ", ".join(map(_cell, value))
     return str(value)
-
-
-def counted(count: int, word: str) -> str:
-    """Return a number with a word: ``1 row``, ``3 rows``."""
-    if count == 1:
-        return f"1 {word}"
-    return f"{count} {word}s"
-
-
-def shortened(text: str) -> str:
-    """Return the beginning of a title."""
-    if len(text) <= LONGEST:
-        return text
-    return text[: LONGEST - 3] + "..."
 
 
 # Progress
@@ -220,12 +188,8 @@ Progress = Callable[[int, int], None]
 def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress]:
     """Give what receives how many of how many are done.
 
-    Parameters
-    ----------
-    name
-        What stands before the bar.
-    wanted
-        Whether there is a bar on stderr, if that is a terminal or a notebook with widgets; or a function of one's own.
+    That is a bar on stderr, where it is wanted and that is a terminal or a notebook with widgets; or a function of
+    one's own.
     """
     if callable(wanted):
         yield wanted
@@ -245,10 +209,3 @@ def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress
     with progress.Progress(*columns, console=console, transient=True, disable=not visible) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, every: bar.update(task, completed=done, total=every)
-
-
-def version_of(package: str) -> str:
-    """Return the version of an installed package; this one need not be installed, a checkout will do."""
-    if package == "rpim-opt":
-        return str(sys.modules["rpim_opt"].__version__)
-    return metadata.version(package)

@@ -17,6 +17,8 @@ from threadpoolctl import ThreadpoolController
 Function = TypeVar("Function", bound=Callable[..., Any])
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
+PHASES = ("evaluation", "reduction", "canonicalization", "solve", "selection")
+_running: ContextVar[Clock | None] = ContextVar("clock", default=None)
 _worker = threading.local()
 
 
@@ -31,7 +33,7 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     """Return the answers to items, in their order; as many are worked on at once as there are cores.
 
     What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
-    thread of its own it works one by one.
+    thread of its own it works one by one. A second in each of several threads counts as one second of its phase.
 
     >>> from rpim_opt.basics.threads import on_all_cores
     >>> on_all_cores(lambda k: k**2, range(4))
@@ -41,13 +43,24 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     workers = min(cores(), len(waiting))
     if workers < 2 or getattr(_worker, "busy", False):
         return [function(item) for item in waiting]
-    with beside(workers) as counted, ThreadPoolExecutor(workers, initializer=_begin) as pool:
-        return list(pool.map(counted(function), waiting))
+    clocks: list[Clock] = []
 
+    def work(item: Item) -> Answer:
+        with clock() as own:
+            clocks.append(own)
+            return function(item)
 
-def _begin() -> None:
-    """Mark a thread as one of those that work at once: it starts no others."""
-    _worker.busy = True
+    def begin() -> None:
+        _worker.busy = True
+
+    with ThreadPoolExecutor(workers, initializer=begin) as pool:
+        answers = list(pool.map(work, waiting))
+    running = _running.get()
+    if running is not None and not running.stack:  # else all of it is a part of the phase that runs
+        for own in clocks:
+            for name, seconds in own.seconds.items():
+                running.seconds[name] += seconds / workers
+    return answers
 
 
 _lock = threading.Lock()
@@ -88,36 +101,24 @@ def one_blas_thread(function: Function) -> Function:
     return limited  # type: ignore[return-value]
 
 
-# Phases
-
-
-PHASES = ("evaluation", "reduction", "canonicalization", "solve", "selection")
-_running: ContextVar[Clock | None] = ContextVar("clock", default=None)
-
-
 class Clock:
     """Seconds by phase; a phase inside another one counts for itself alone."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
         self.started = self._since = time.perf_counter()
-        self._stack: list[str] = []
+        self.stack: list[str] = []
 
     def switch(self, phase: str | None) -> None:
         """Begin a phase, or end the one that runs."""
         now = time.perf_counter()
-        if self._stack:
-            self.seconds[self._stack[-1]] += now - self._since
+        if self.stack:
+            self.seconds[self.stack[-1]] += now - self._since
         self._since = now
         if phase is None:
-            self._stack.pop()
+            self.stack.pop()
         else:
-            self._stack.append(phase)
-
-    @property
-    def busy(self) -> bool:
-        """Whether a phase runs."""
-        return bool(self._stack)
+            self.stack.append(phase)
 
     def rows(self) -> list[tuple[str, float]]:
         """Return the seconds of every phase, and what is left of the time since the clock was made."""
@@ -137,47 +138,14 @@ def clock() -> Iterator[Clock]:
 
 
 @contextmanager
-def beside(workers: int) -> Iterator[Callable[[Callable[..., Any]], Callable[..., Any]]]:
-    """Count the phases of threads that work at once: ``with beside(2) as counted: threads.map(counted(work), ...)``.
-
-    A second in each of several threads is one second; what runs inside a phase of the caller's counts for that phase.
-    """
-    running = _running.get()
-    clocks: list[Clock] = []
-
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        if running is None:
-            return function
-        inside = running.busy
-
-        def timed(*arguments: Any) -> Any:
-            with clock() as own:
-                if not inside:
-                    clocks.append(own)
-                return function(*arguments)
-
-        return timed
-
-    yield counted
-    if running is not None:
-        for own in clocks:
-            for name, seconds in own.seconds.items():
-                running.seconds[name] += seconds / workers
-
-
-class phase:  # noqa: N801 - used like a function
+def phase(name: str) -> Iterator[None]:
     """Count what runs inside as a phase, if a clock runs: ``with phase("solve"): ...``."""
-
-    __slots__ = ("_clock", "_name")
-
-    def __init__(self, name: str):
-        self._name = name
-        self._clock = _running.get()
-
-    def __enter__(self) -> None:
-        if self._clock is not None:
-            self._clock.switch(self._name)
-
-    def __exit__(self, *_: object) -> None:
-        if self._clock is not None:
-            self._clock.switch(None)
+    running = _running.get()
+    if running is None:
+        yield
+        return
+    running.switch(name)
+    try:
+        yield
+    finally:
+        running.switch(None)

@@ -80,8 +80,9 @@ DISPLAY = {
 }
 """The unit in which a dimension is shown and written."""
 
-
 _LONGEST_UNIT = max(map(len, UNITS))
+LONGEST = 200
+"""Characters of a pattern or a name: longer ones, which nobody writes, would take for ever to be matched."""
 
 
 @cache
@@ -92,10 +93,8 @@ def accepted_units(dimension: str) -> tuple[str, ...]:
 
 def display(dimension: str) -> tuple[str, float]:
     """Return the unit for showing a dimension and its size in SI; no unit for the dimension ``""``."""
-    if not dimension:
-        return "", 1.0
-    name = DISPLAY[dimension]
-    return name, UNITS[name].si
+    name = DISPLAY[dimension] if dimension else ""
+    return name, UNITS[name].si if name else 1.0
 
 
 def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
@@ -113,12 +112,8 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None where there is none.
 
     >>> from rpim_opt.basics.units import split_unit
-    >>> split_unit("q1_deg")[0]
-    'q1'
-    >>> split_unit("base_rx_mrad")[1].dimension
-    'angle'
-    >>> split_unit("label")
-    ('label', None)
+    >>> split_unit("base_rx_mrad")[0], split_unit("label")
+    ('base_rx', ('label', None))
     """
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
@@ -166,15 +161,6 @@ def numeral(text: str) -> float:
     return value if math.isfinite(value) and text.isascii() and "_" not in text else math.nan
 
 
-def require_size(value: Any, where: str, unit: Unit) -> None:
-    """Refuse a value [SI], or one in a list, that no robot and no instrument has: its digits would be lost."""
-    if isinstance(value, list):
-        for each in value:
-            require_size(each, where, unit)
-    elif not abs(value) <= LARGEST:
-        raise InputError(where, f"{value / unit.si:g}", f"a size of at most {LARGEST / unit.si:g}")
-
-
 def quantities(
     table: Mapping[str, Any],
     dimensions: Mapping[str, tuple[str, ...]],
@@ -182,36 +168,17 @@ def quantities(
     convert: Callable[[Any, str, float], Any] = lambda value, key, si: number(value, key) * si,
     also: Iterable[str] = (),
 ) -> dict[tuple[str, str], Any]:
-    """Read a table of quantities whose keys carry units.
+    """Return the values [SI] of a table of quantities, ``{"x_mm": 1.0, "rx_deg": 90}``, by (stem, dimension).
 
-    Parameters
-    ----------
-    table
-        For instance ``{"x_mm": 1.0, "rx_deg": 90}``.
-    dimensions
-        The accepted stems with their dimensions, ``{"x": ("length",), "rx": ("angle",)}``.
-    where
-        What to call the table in an error.
-    convert
-        From a value, its key and the unit's size to SI; a finite number by default.
-    also
-        Keys to list as accepted beside these.
-
-    Returns
-    -------
-    SI values by (stem, dimension).
-
-    Raises
-    ------
-    InputError
-        For an unknown key, a missing or wrong unit, a value that is no finite number or beyond all sizes.
+    ``dimensions`` are those that stems may have, ``{"x": ("length",), "rx": ("angle",)}``; ``where`` is what errors
+    call the table; ``convert`` gets a value, its key and the unit's size; ``also`` are further keys to list.
     """
-    result = {}
+    result: dict[tuple[str, str], Any] = {}
     for key, value in table.items():
         place = f"{where}, key {key}" if where else f"key {key}"
         stem, unit = split_unit(key)
         if stem not in dimensions:
-            names = _accepted(dimensions)
+            names = [name for each, of in dimensions.items() for name in spelled(each, of, 3)]
             raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
         unit = unit or Unit("", 1.0)
         if unit.dimension not in dimensions[stem]:
@@ -219,16 +186,17 @@ def quantities(
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")
         result[stem, unit.dimension] = convert(value, place, unit.si)
-        require_size(result[stem, unit.dimension], place, unit)
+        _require_size(result[stem, unit.dimension], place, unit)
     return result
 
 
-def _accepted(dimensions: Mapping[str, tuple[str, ...]]) -> list[str]:
-    return [name for stem, of in dimensions.items() for name in spelled(stem, of, 3)]
-
-
-LONGEST = 200
-"""Characters of a pattern: longer ones, which nobody writes, would take for ever to be matched."""
+def _require_size(value: Any, where: str, unit: Unit) -> None:
+    """Refuse a value [SI], or one in a list, that no robot and no instrument has: its digits would be lost."""
+    if isinstance(value, list):
+        for each in value:
+            _require_size(each, where, unit)
+    elif not abs(value) <= LARGEST:
+        raise InputError(where, f"{value / unit.si:g}", f"a size of at most {LARGEST / unit.si:g}")
 
 
 def fits(name: str, pattern: str) -> bool:
@@ -250,7 +218,6 @@ SPELLED = {
     "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm",
     "°c": "degC", "celsius": "degC", "kelvin": "K", "gradi": "deg", "degrés": "deg", "度": "deg", "毫米": "mm",
 }  # fmt: skip
-"""Units as they are spelled in headers; their own names besides."""
 UNIT_SIGNS = frozenset({
     *UNITS, "°", "grad", "degree", "degrees", "radian", "radians", "inch", "in", "cm", "gon", "µm", "μm", "nm", "n.m",
     "n·m", "-", "s", "1",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -109,24 +109,6 @@ class Block(Brief):
         )
 
 
-class _Numbered:
-    """A field of numbers, or of a function that finds them, which is called when somebody first asks."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, data: Dataset | None, owner: type) -> np.ndarray:
-        if data is None:
-            raise AttributeError(self._name)  # the field has no default
-        value: Any = vars(data)[self._name]
-        if callable(value):
-            value = vars(data)[self._name] = value()
-        return value
-
-    def __set__(self, data: Dataset, value: np.ndarray | Callable[[], np.ndarray]) -> None:
-        vars(data)[self._name] = value
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Dataset(Tabled):
     """Rows of measurements, of one kind or several.
@@ -138,8 +120,7 @@ class Dataset(Tabled):
     label
         N row labels, unique.
     configuration
-        (N,) number of the configuration a row belongs to: rows of one configuration stay together
-        in cross-validation. Or a function that returns them, called once when somebody asks.
+        (N,) number of the configuration a row belongs to: rows of one configuration stay together in cross-validation.
 
     Examples
     --------
@@ -153,7 +134,7 @@ class Dataset(Tabled):
 
     blocks: tuple[Block, ...]
     label: tuple[str, ...]
-    configuration: _Numbered = _Numbered()
+    configuration: np.ndarray
 
     def _short(self) -> str:
         kinds = ", ".join(dict.fromkeys(block.measurement.name for block in self.blocks))
@@ -161,7 +142,6 @@ class Dataset(Tabled):
         return f"{counted(len(self), 'row')} of {kinds} in {configurations}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return label, configuration, kind of measurement, reflectors, and what was measured."""
         rows: list[dict[str, Any]] = [{} for _ in self.label]
         for block in self.blocks:
             units = {column: display(dimension) for column, dimension in block.measurement.columns.items()}
@@ -205,12 +185,7 @@ class Dataset(Tabled):
 
     @property
     def temperatures(self) -> Array:
-        """The temperatures (N',) [K] of the rows that state one.
-
-        >>> import rpim_opt as ro
-        >>> ro.load("position").problem.data.temperatures.shape
-        (0,)
-        """
+        """The temperatures (N',) [K] of the rows that state one."""
         stated = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
         return np.concatenate([np.zeros(0), *stated])
 
@@ -245,20 +220,8 @@ class Dataset(Tabled):
 
     @classmethod
     def of_robots(cls, parts: Mapping[str, Dataset]) -> Dataset:
-        """Return the measurements of several robots as one, as a problem of `together` takes them.
+        """Return the measurements of several robots, by their names, as one, as a problem of `together` takes them.
 
-        Parameters
-        ----------
-        parts
-            The datasets by the robots' names, one or several of them.
-
-        Raises
-        ------
-        InputError
-            For data of several robots among them.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> data = ro.load("paper_arm").problem.data
         >>> both = ro.Dataset.of_robots({"left": data, "right": data})

@@ -122,13 +122,7 @@ class HeldOut:
     coverage: float | None = None
 
     def sentence(self, rows: int) -> str:
-        """Say what validated, and what the parameters come from: so many rows.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
-        >>> print(result.record.held_out.sentence(80).partition(":")[0])
-        Validated on 40 rows that were kept apart
-        """
+        """Say what validated, and what the parameters come from: so many rows."""
         missed = f"{1e3 * np.nanmean(self.error):.4f} mm"
         return (
             f"Validated on {len(self.label)} rows that were kept apart: parameters from the {self.used} others missed "

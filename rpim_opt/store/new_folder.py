@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.units import UNITS, parse_units
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
-from rpim_opt.data.measurements.measurement import Measurement, Words, of_fixture
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.identified import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
@@ -80,28 +80,16 @@ def new_problem(
     ----------
     folder
         A new one.
-    robot
-        The name of a ready robot, or a file ``.urdf``, ``.xacro``, ``.toml``, ``.json`` or ``.csv``.
-    data
-        Measurements, in one or several text, Excel or Parquet files of whatever columns `understand_tables` recognises.
-    measurement
-        What was measured; by default poses where the table has orientations, else positions.
+    robot, data, measurement, options, urdf_base, urdf_tip, dh
+        As for `understand_tables`.
     units
-        Units of columns whose name carries none, ``"deg,mm"``.
-    options
-        What else is stated of the tables, and their units.
+        Units of columns whose name carries none, ``"deg,mm"``, where no options state them.
     validation
         A table of measurements for validation.
-    hold_out
+    hold_out, seed
         Instead of that, which part of the configurations to hold out, drawn at random.
-    seed
-        Of the draw.
-    urdf_base, urdf_tip
-        Links between which a URDF's robot is.
     target
         What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
-    dh
-        The convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it.
     understood
         Called with what was understood of the tables, before anything is computed.
 
@@ -130,42 +118,65 @@ def new_problem(
     if understood is not None:
         understood(found)
     board = stated_target(target)
-    _require_target(found, board)
     kind, how = _kind(arm, found, board, measurement)
-    reader = _Reader(arm, kind, board)
-    rows = reader.rows(found.file, found.columns)
+    noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
+    notes = list(found.sentences)
+    try:
+        rows = read_data(board.under(found.columns), arm.robot, noise, kind)
+    except InputError as error:
+        raise error.within(found.file) from None
     columns = found.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
+    tables = {IDENTIFICATION: columns}
+    said = f'# validation = "{VALIDATION}"   # a table that no choice may see; none was given'
     if validation is not None:
-        parts = reader.beside(found, columns, rows, validation)
+        other = understand_of(arm, [validation], kind.name, found.options)
+        try:
+            read_data(board.under(other.columns), arm.robot, noise, kind)
+        except InputError as error:
+            raise error.within(validation) from None
+        tables[VALIDATION] = other.columns
+        notes += other.sentences
+        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; no choice sees it'
     elif hold_out is not None:
-        parts = _held_out(columns, rows, hold_out, seed)
-    else:
-        said = f'# validation = "{VALIDATION}"   # a table that no choice may see; none was given'
-        parts = _Parts({IDENTIFICATION: columns}, rows, said)
-    tables = parts.tables
+        held = _held_out(rows, hold_out, seed)
+        tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}
+        rows = rows.take(np.flatnonzero(~held))
+        said = f'validation = "{VALIDATION}"\n# configurations drawn with seed {seed}; no choice sees them'
     if board.table:
-        tables = {**tables, TARGET: board.table}
-    said = {
+        tables[TARGET] = board.table
+    context = {
         "target": board.stated,
         "robot": toml(source.stated),
         "drawing": source.origin,
         "columns": how,
         "data": Path(found.file).name,
-        "count": str(len(parts.rows)),
-        "validation": parts.said,
+        "count": len(rows),
+        "validation": said,
+        "reading": [(name, toml(text)) for name, text in replace(found.options, joints=arm.names).texts().items()],
     }
     try:
-        text, guessed = _problem_text(
-            arm, kind, parts.rows, reader.noise, said, replace(found.options, joints=arm.names).texts()
-        )
+        text, guessed = _problem_text(arm, kind, rows, noise, context)
     except InputError as error:
         raise error.within(found.file) from None
     _write(folder, text, tables, source, arm)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    notes = (*found.sentences, *parts.notes, f"Measurement {kind.name}: {how}.", *guessed)
-    return Started(folder, counts, notes, replace(found, kind=kind))
+    notes += [f"Measurement {kind.name}: {how}.", guessed]
+    return Started(folder, counts, tuple(notes), replace(found, kind=kind))
+
+
+def _held_out(rows: Dataset, share: float, seed: int) -> np.ndarray:
+    """Return which rows (N,) belong to a share of the configurations, at least one, which is held out."""
+    known = len(np.unique(rows.configuration))
+    if not 0 < share < 1 or known < 2:
+        raise InputError("--hold-out", f"{share:g} of {known} configurations", "a part between 0 and 1 of two or more")
+    drawn = rows.configurations(min(max(round(share * known), 1), known - 1), seed)
+    return np.isin(rows.configuration, drawn.configuration)
+
+
+def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
+    return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
 
 
 def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: RobotSource, arm: Described) -> None:
@@ -181,60 +192,6 @@ def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Robot
         elif source.stated == "robot.toml":
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)
-
-
-# --- rows that identify, and rows for validation -----------------------------------------------------------------
-
-
-class _Parts(NamedTuple):
-    """Tables by file, the rows that identify, what the problem file says of validation, and notes."""
-
-    tables: Mapping[str, Columns]
-    rows: Dataset
-    said: str
-    notes: tuple[str, ...] = ()
-
-
-class _Reader(NamedTuple):
-    """How tables are read."""
-
-    arm: Described
-    kind: Measurement
-    target: StatedTarget
-
-    @property
-    def noise(self) -> dict[str, float]:
-        """Noise by key, where the data state none."""
-        return {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in self.kind.noise.items()}
-
-    def rows(self, file: str | Path, columns: Columns) -> Dataset:
-        """Return the rows of a table; errors name its file."""
-        try:
-            return read_data(self.target.under(columns), self.arm.robot, self.noise, self.kind)
-        except InputError as error:
-            raise error.within(file) from None
-
-    def beside(self, found: Understanding, columns: Columns, rows: Dataset, validation: str | Path) -> _Parts:
-        """Return all rows, and those of a table of its own for validation."""
-        other = understand_of(self.arm, [validation], self.kind.name, found.options)
-        self.rows(validation, other.columns)
-        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; no choice sees it'
-        return _Parts({IDENTIFICATION: columns, VALIDATION: other.columns}, rows, said, other.sentences)
-
-
-def _held_out(columns: Columns, rows: Dataset, share: float, seed: int) -> _Parts:
-    """Return the rows without a share of the configurations, at least one, which is held out."""
-    known = len(np.unique(rows.configuration))
-    if not 0 < share < 1 or known < 2:
-        raise InputError("--hold-out", f"{share:g} of {known} configurations", "a part between 0 and 1 of two or more")
-    drawn = rows.configurations(min(max(round(share * known), 1), known - 1), seed)
-    held = np.isin(rows.configuration, drawn.configuration)
-
-    def take(chosen: np.ndarray) -> Columns:
-        return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
-
-    said = f'validation = "{VALIDATION}"\n# configurations drawn with seed {seed}; no choice sees them'
-    return _Parts({IDENTIFICATION: take(~held), VALIDATION: take(held)}, rows.take(np.flatnonzero(~held)), said)
 
 
 # --- what was measured, and the board that a camera sees ---------------------------------------------------------
@@ -256,8 +213,6 @@ class StatedTarget:
 def stated_target(text: str) -> StatedTarget:
     """Return the board that ``--target`` states: a table, or columns, rows and spacing of a grid; empty for nothing.
 
-    Examples
-    --------
     >>> from rpim_opt.store.new_folder import stated_target
     >>> stated_target("7x5,30mm").stated
     'target = { columns = 7, rows = 5, spacing_mm = 30 }'
@@ -278,22 +233,17 @@ def stated_target(text: str) -> StatedTarget:
     return StatedTarget(board, f'target = "{TARGET}"', table)
 
 
-def _require_target(found: Understanding, target: StatedTarget) -> None:
-    """Refuse pixels without a board, and a board without pixels."""
-    if target.board and not found.kind.by_camera:
-        accepted = f"none: measurement {found.kind.name} sees no points of one"
-        raise InputError("--target", "a board", accepted, found.file)
-    stated = any(name.startswith("target_x") for name in found.columns)
-    if found.kind.by_camera and not target.board and not stated:
-        accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
-        raise InputError("the target", "nothing", accepted, found.file)
-
-
 def _kind(
     arm: Described, found: Understanding, target: StatedTarget, measurement: str | None
 ) -> tuple[Measurement, str]:
-    """Return the kind of measurement, and how it is known."""
+    """Return the measurement type and how it is known; refuse pixels without a board, and a board without pixels."""
     kind = found.kind
+    if target.board and not kind.by_camera:
+        raise InputError("--target", "a board", f"none: measurement {kind.name} sees no points of one", found.file)
+    stated = any(name.startswith("target_x") for name in found.columns)
+    if kind.by_camera and not target.board and not stated:
+        accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
+        raise InputError("the target", "nothing", accepted, found.file)
     if measurement is not None:
         return kind, "as you said"
     if kind.by_camera:
@@ -306,13 +256,7 @@ def _kind(
 
 
 def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
-    """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found.
-
-    Raises
-    ------
-    InputError
-        Where neither fits clearly better.
-    """
+    """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found."""
     misfit = {name: _misfit(arm, columns, kind) for name, kind in CAMERAS.items()}
     best, other = sorted(misfit, key=lambda name: misfit[name])
     said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
@@ -338,28 +282,23 @@ def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:
 
 
 def _problem_text(
-    arm: Described,
-    kind: Measurement,
-    rows: Dataset,
-    noise: Mapping[str, float],
-    said: Mapping[str, str],
-    reading: Mapping[str, str],
-) -> tuple[str, list[str]]:
-    """Return the text of ``problem.toml``, and what was guessed in sentences."""
+    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], context: Mapping[str, Any]
+) -> tuple[str, str]:
+    """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment
 
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
-    words = kind.words
-    base, how = _base(arm, rows, tools, words)
+    base, how = _base(arm, rows, tools, kind)
     parameters = starting_parameters(arm.robot, rows, base, tools)
+    names = list(identifiable("auto", arm.robot, parameters, rows))
     touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        **said,
+        **context,
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
-        identify=toml(_patterns(list(identifiable("auto", arm.robot, parameters, rows)), arm.robot.dof)),
+        identify=toml(_patterns(names, arm.robot.dof)),
         noise=list(noise.items()),
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),
@@ -372,10 +311,9 @@ def _problem_text(
         sessions=rows.sessions,
         temperatures=len(rows.temperatures),
         label=_key(rows.label[0]),
-        reading=[(name, toml(text)) for name, text in reading.items()],
-        words=words,
+        words=kind.words,
     )
-    return text, [how]
+    return text, how
 
 
 def _cameras(rows: Dataset) -> list[tuple[str, str]]:
@@ -388,7 +326,7 @@ def _cameras(rows: Dataset) -> list[tuple[str, str]]:
     return cameras
 
 
-def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], words: Words) -> tuple[Array | None, str]:
+def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
@@ -398,23 +336,11 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], words: Word
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
-    how = f"Guessed: the data put the base at {placed(found)}, {words.frame} ({verdict})."
-    return None, how
+    return None, f"Guessed: the data put the base at {placed(found)}, {kind.words.frame} ({verdict})."
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:
-    """Return names with those of all joints, or of a whole frame, as patterns."""
-    left = list(names)
-    patterns = []
-    for pattern, members in _groups(names, dof).items():
-        if set(members) <= set(left):
-            left = [name for name in left if name not in members]
-            patterns.append(pattern)
-    return [*patterns, *left]
-
-
-def _groups(names: Sequence[str], dof: int) -> dict[str, list[str]]:
-    """Return what patterns stand for: one column of all joints, a whole frame, a frame's place."""
+    """Return names with those of one column of all joints, of a whole frame, of a frame's place as patterns."""
     groups: dict[str, list[str]] = {}
     if dof < 10:  # a question mark stands for one digit
         groups = {f"{column}?": [f"{column}{i}" for i in range(1, dof + 1)] for column in MDH}
@@ -422,7 +348,13 @@ def _groups(names: Sequence[str], dof: int) -> dict[str, list[str]]:
         groups[f"{prefix}*"] = [prefix + c for c in FRAME]
         groups[f"{prefix}[xyz]"] = [prefix + c for c in FRAME[:3]]
     groups["camera_*"] = [f"camera_{name}" for name in INTRINSICS]
-    return groups
+    left = list(names)
+    patterns = []
+    for pattern, members in groups.items():
+        if set(members) <= set(left):
+            left = [name for name in left if name not in members]
+            patterns.append(pattern)
+    return [*patterns, *left]
 
 
 def _frame(place: Array) -> str:

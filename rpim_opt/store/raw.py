@@ -29,14 +29,13 @@ from rpim_opt.robot.library import find_source, read_arm
 CLEARLY = 3.0
 """The right reading of orientations leaves so many times less than another one."""
 USUAL = "extrinsic xyz"
-GUESSED = (pose, position)
-"""What columns are taken for, the first that they have all values of."""
 READINGS = {
     "quaternion": ORDERS,
     "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
                  "intrinsic zxy"),
 }  # fmt: skip
 """What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
+Files = Sequence[tuple[Path, RawTable]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +52,8 @@ class Understanding:
         What was understood of every file.
     notes
         How the tables were put together and what was checked, a sentence each.
-    options
-        What was stated of them.
-    file
-        The file, or the first of them.
+    options, file
+        What was stated of them; the file, or the first of them.
 
     Examples
     --------
@@ -79,61 +76,45 @@ class Understanding:
     options: TableOptions
     file: str
 
+    @property
+    def count(self) -> int:
+        """The number of rows."""
+        return len(next(iter(self.columns.values())))
+
     def __str__(self) -> str:
         """Return what every column means as a table, and the sentences."""
         parts = []
         for each in self.tables:
-            rows = [[m.column, m.meaning, m.name, m.unit, m.why] for m in each.meant]
-            text = _table(["column", "meaning", "name here", "unit", "why"], rows)
-            if len(self.tables) > 1:
-                text = f"{each.file}\n{text}"
-            parts.append("\n".join([text, *(f"{each.file}: {note}" for note in each.notes)]))
-        count = len(next(iter(self.columns.values())))
-        what = f"measurement {self.kind.name}"
-        if self.kind.by_camera:  # on the flange or beside the robot: only what they fit tells
-            what = "pixels of a camera"
-        return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{count} rows, {what}."])
+            rows = [["column", "meaning", "name here", "unit", "why"]]
+            rows += [[m.column, m.meaning, m.name, m.unit, m.why] for m in each.meant]
+            width = [max(map(len, column)) for column in zip(*rows, strict=True)]
+            rows.insert(1, ["-" * w for w in width])
+            lines = ["   ".join(cell.ljust(w) for cell, w in zip(row, width, strict=True)).rstrip() for row in rows]
+            title = [each.file] if len(self.tables) > 1 else []
+            parts.append("\n".join([*title, *lines, *(f"{each.file}: {note}" for note in each.notes)]))
+        # on the flange or beside the robot: only what they fit tells
+        what = "pixels of a camera" if self.kind.by_camera else f"measurement {self.kind.name}"
+        return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{self.count} rows, {what}."])
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The same in sentences, without what stands as it was.
-
-        >>> import rpim_opt as ro
-        >>> arm = ro.store.find_problem("paper_arm")
-        >>> ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"]).sentences
-        ()
-        """
+        """The same in sentences, without what stands as it was."""
         said = []
         for each in self.tables:
             said += [f"{each.file}: {note}" for note in each.notes]
             renamed = [f"{m.column} is {m.name}" for m in each.meant if m.name and m.name != m.column]
-            out = [m.column for m in each.meant if m.meaning == "left out"]
             if renamed:
                 said.append(f"{each.file}: {', '.join(renamed)}.")
-            if out:
-                said.append(f"{each.file}: left out {', '.join(out)}.")
+            if each.left_out:
+                said.append(f"{each.file}: left out {', '.join(each.left_out)}.")
         return (*said, *self.notes)
 
     def content(self) -> dict[str, Any]:
-        """Return the same as a document.
-
-        >>> import rpim_opt as ro
-        >>> arm = ro.store.find_problem("paper_arm")
-        >>> found = ro.store.understand_tables(str(arm / "robot.toml"), [arm / "identification.csv"])
-        >>> found.content()["columns"][1]["meaning"], found.content()["rows"]
-        ('joint 1', 9)
-        """
+        """Return the same as a document."""
         said = [f"{each.file}: {note}" for each in self.tables for note in each.notes]
-        count = len(next(iter(self.columns.values())))
         columns = [{"file": each.file, **meant._asdict()} for each in self.tables for meant in each.meant]
-        return {"columns": columns, "measurement": self.kind.name, "rows": count, "notes": [*said, *self.notes]}
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of text, all columns aligned left."""
-    width = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    lines = [header, ["-" * w for w in width], *rows]
-    return "\n".join("   ".join(cell.ljust(w) for cell, w in zip(line, width, strict=True)).rstrip() for line in lines)
+        notes = [*said, *self.notes]
+        return {"columns": columns, "measurement": self.kind.name, "rows": self.count, "notes": notes}
 
 
 def understand_tables(
@@ -183,8 +164,7 @@ def understand_tables(
     >>> found.notes
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
-    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip, dh)
-    return understand_of(arm, data, measurement, options)
+    return understand_of(read_arm(find_source(robot).file, urdf_base, urdf_tip, dh), data, measurement, options)
 
 
 def understand_of(
@@ -192,73 +172,67 @@ def understand_of(
 ) -> Understanding:
     """Return what raw tables of an arm say, as `understand_tables` does."""
     options = options or TableOptions()
-    paths = [Path(each) for each in data]
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
-    files = [read_raw(path, options) for path in paths]
+    files = [(Path(each), read_raw(Path(each), options)) for each in data]
     if known is None:
-        columns = [table.columns for table in files]
+        columns = [raw.columns for _, raw in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-    for kind in [known] if known else GUESSED:
-        tables = [_understood(path, file, arm, kind, options) for path, file in zip(paths, files, strict=True)]
-        if known or _has_values(tables, kind):
-            found = _whole(paths, arm, kind, options, tables)
+    for kind in [known] if known else (pose, position):  # the first that they have all values of
+        tables = _tables(files, arm, kind, options)
+        stems = set().union(*(each.stems for each in tables))
+        if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
+            found = _whole(files, arm, kind, options, tables)
             doubt = next((each.doubt for each in tables if each.doubt), "")
             return _checked(found, files, arm, doubt) if doubt and kind.turning else found
-    names = ", ".join(name for table in files for name in table.columns)
+    names = ", ".join(name for _, raw in files for name in raw.columns)
     accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
-    raise InputError("the header", f"no positions among {names}", accepted, paths[0])
+    raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
 
 
-def _understood(path: Path, file: RawTable, arm: Described, kind: Measurement, options: TableOptions) -> Understood:
-    try:
-        return replace(understand(file, arm.robot, kind, options, arm.names), file=path.name)
-    except InputError as error:
-        raise error.within(path) from None
-
-
-def _has_values(tables: Sequence[Understood], kind: Measurement) -> bool:
-    """Return whether tables state the values of a type in one of its forms."""
-    stems = {stem for each in tables for stem in each.stems}
-    return any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms)))
+def _tables(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> list[Understood]:
+    tables = []
+    for path, raw in files:
+        try:
+            tables.append(replace(understand(raw, arm.robot, kind, options, arm.names), file=path.name))
+        except InputError as error:
+            raise error.within(path) from None
+    return tables
 
 
 def _whole(
-    paths: Sequence[Path], arm: Described, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
+    files: Files, arm: Described, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
 ) -> Understanding:
     try:
         whole = together(tables, arm.robot, kind, options.key, options.within)
     except InputError as error:
-        raise error.within(paths[0] if len(paths) == 1 else None) from None
-    return Understanding(kind, whole.columns, tuple(tables), whole.notes, options, str(paths[0]))
+        raise error.within(files[0][0] if len(files) == 1 else None) from None
+    return Understanding(kind, whole.columns, tuple(tables), whole.notes, options, str(files[0][0]))
 
 
-def _checked(first: Understanding, files: Sequence[RawTable], arm: Described, doubt: str) -> Understanding:
+def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:
     """Return poses read as they fit the nominal robot, and say both figures: the order of a quaternion is found.
 
     Turns that fit clearly better in another convention than roll, pitch, yaw are asked for.
     """
-    paths = [Path(first.file).with_name(each.file) for each in first.tables]
     found: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
     for reading in READINGS[doubt]:
         options = replace(first.options, **{doubt: reading})
-        tables = [_understood(path, file, arm, first.kind, options) for path, file in zip(paths, files, strict=True)]
-        found[reading] = replace(_whole(paths, arm, first.kind, options, tables), file=first.file)
+        found[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
         data = read_data(found[reading].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, first.kind)
         misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
     best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
-    clear = misfit[second] > CLEARLY * misfit[best]
     figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))
     if doubt == "rotation":
         if misfit[USUAL] <= CLEARLY * misfit[best]:
             return first
-        accepted = f"--rotation '{best}' if that is what they are, or '{USUAL}'"
-        found_ = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
-        raise InputError("rx, ry, rz", found_, accepted, first.file)
-    if not clear:
+        missed = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
         raise InputError(
-            "the order of the quaternion", f"no clear one ({figures})", "--quaternion wxyz or xyzw", first.file
+            "rx, ry, rz", missed, f"--rotation '{best}' if that is what they are, or '{USUAL}'", first.file
         )
+    if misfit[second] <= CLEARLY * misfit[best]:
+        where = "the order of the quaternion"
+        raise InputError(where, f"no clear one ({figures})", "--quaternion wxyz or xyzw", first.file)
     note = (
         f"the quaternion's order is {best}: on the nominal robot it leaves {misfit[best]:.2f} deg, "
         f"{second} {misfit[second]:.1f} deg."

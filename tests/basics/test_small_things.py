@@ -8,7 +8,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
-from rpim_opt.basics.minimization import least
 from rpim_opt.basics.text import LONGEST, as_html, shortened
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
@@ -40,20 +39,6 @@ def test_a_file_that_states_no_size_is_read_no_further_than_it_may_be() -> None:
     with pytest.raises(ro.InputError, match="more than 10 bytes"):
         read_bytes(endless, 10)
     assert read_bytes(endless)
-
-
-def test_a_minimum_that_is_never_near_enough_ends() -> None:
-    """Of a function without any shape, at an accuracy that numbers do not have."""
-    asked: list[float] = []
-
-    def flat(x: float) -> float:
-        asked.append(x)
-        return 1.0
-
-    x, value = least(flat, 1.0, 2.0, 0.0)
-    assert 1.0 <= x <= 2.0
-    assert value == 1.0
-    assert len(asked) < 200
 
 
 @pytest.mark.parametrize(

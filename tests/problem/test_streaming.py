@@ -15,7 +15,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.data.tables import reading
 from rpim_opt.problem import parts as streaming
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions, reduced
@@ -106,23 +105,6 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     assert 0.9 < again.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
     assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
-
-
-def test_configurations_are_numbered_when_somebody_asks(whole: CalibrationProblem, monkeypatch) -> None:
-    block, asked, numbered = whole.data.blocks[0], [], reading._by_joints
-    columns = {f"q{i + 1}_rad": block.q[:, 0, i] for i in range(6)}
-    columns |= {f"{axis}_m": block.y[:, i] for i, axis in enumerate("xyz")}
-    monkeypatch.setattr(reading, "_by_joints", lambda q: asked.append(1) or numbered(q))
-    read = partial(ro.read_data, columns, whole.robot, {"position_mm": 0.05})
-    data = read()
-    PartitionedProblem(whole.robot, whole.parameters, whole.data, [lambda: data]).linearize(np.zeros(33))
-    assert not asked
-    other = replace(read(), label=data.label)
-    assert np.array_equal(data.configuration, np.unique(data.q[:, 0], return_inverse=True)[1])
-    assert np.array_equal(data.configuration, other.configuration)
-    assert len(asked) == 2  # once each
-    monkeypatch.undo()
-    assert np.array_equal(pickle.loads(pickle.dumps(read())).configuration, data.configuration)
 
 
 TWICE = ro.Formulation("twice", loss=lambda r: 2 * cp.sum_squares(r), penalty=ro.tikhonov.penalty)

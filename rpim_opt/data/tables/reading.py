@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from string import ascii_uppercase
@@ -107,9 +106,10 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     if kind.points == 2:
         _require_two_points(q, markers, label)
-    configuration: Any = partial(_by_joints, q)  # a third of the time of reading, and not all ask
     if "configuration" in table:
         configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    else:
+        configuration = _by_joints(q)
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
     if {"marker", "to_marker", "fixture"} & set(table):
         blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
