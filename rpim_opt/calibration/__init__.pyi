@@ -7,8 +7,8 @@ from .expected import Improvement as Improvement
 from .expected import improvement as improvement
 from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
-from .leaving_out import Influence as Influence
-from .leaving_out import influence as influence
+from .leverage import Influence as Influence
+from .leverage import influence as influence
 from .loop import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration

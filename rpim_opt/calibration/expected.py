@@ -1,4 +1,4 @@
-"""Whether a calibration makes a robot's positions better, decided from what identified it alone."""
+"""Improvement: whether a calibration makes a robot's positions better, from its identification data alone."""
 
 from __future__ import annotations
 
@@ -9,38 +9,29 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.covariance import coverage_factor
-from rpim_opt.calibration.leaving_out import influence
-from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.leverage import influence
+from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.identified import Machine, require_robot
 from rpim_opt.problem.workspace import moved, predicted, within_ranges
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameter_names import of_joint, own_name
 
 WORTH = 0.9
-"""A calibration whose predicted error is above this part of the drawing's is worth nothing."""
+"""A calibration whose predicted error is above this share of the nominal robot's improves nothing."""
 CONFIDENCE = 0.95
 """Of the intervals."""
 
 
 @dataclass(frozen=True)
 class Improvement:
-    """Position errors of the flange [m] that are expected over the joint ranges, base and tool placed as fits best.
+    """Position errors of the flange [m] that are expected over the joint ranges, base and tool fitted.
 
     Parameters
     ----------
-    before
-        RMS with the drawing's parameters.
-    after
-        RMS with the identified ones.
+    before, after
+        RMS with the nominal parameters, and with the identified ones.
     within
-        What 95 % of the errors along any axis do not exceed at the place where least is known.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> found = ro.calibration.Improvement(before=1e-3, after=1e-4, within=3e-4)
-    >>> found.improves, ro.calibration.Improvement(before=1e-4, after=1e-4, within=3e-4).improves
-    (True, False)
+        What 95 % of the errors along any axis do not exceed where least is known.
     """
 
     before: float
@@ -49,21 +40,21 @@ class Improvement:
 
     @property
     def improves(self) -> bool:
-        """Whether identified parameters are expected to be clearly better than the drawing's."""
+        """Whether identified parameters are expected to be clearly better than the nominal ones."""
         return self.after < WORTH * self.before
 
 
-def improvement(result: Calibration) -> Improvement | None:
-    """Return the expected position errors of the flange, as drawn and as identified; None where nothing tells them.
+def improvement(result: Outcome) -> Improvement | None:
+    """Return the expected position errors of the flange, nominal and identified; None where nothing tells them.
 
-    With the deviations x, D their slopes of W positions over the joint ranges less what placing base and tool anew
+    With the deviations x, D their slopes of W positions over the joint ranges less what fitting base and tool anew
     takes back, N the covariance of x by noise and B the mean square of what the penalty holds back::
 
         after^2  = tr(D (N + B) D') / W
         before^2 = (|D x|^2 - tr(D N D') + tr(D B D')) / W
 
     N is that of leaving out every configuration in turn (the jackknife) where that is more than the noise says: then
-    the rows of a configuration err together, by the robot or by how it was seen, and more of them do not help.
+    the rows of a configuration err together, by the robot or by the camera, and more of them do not help.
 
     Parameters
     ----------
@@ -77,30 +68,34 @@ def improvement(result: Calibration) -> Improvement | None:
     >>> found.improves, found.before > 10 * found.after
     (True, True)
     """
+    if not result.linear_penalty:
+        return None
     try:
         D, directions = _slopes(result)
-        noise, prior = _moving_apart(result)
+        noise, prior = result.spread.noise, result.spread.prior
+        change = influence(result).change
     except InputError:
         return None
+    if np.isfinite(change).all():
+        scale = result.problem.parameters.free.scale
+        jackknife = change.T @ change * (len(change) - 1) / len(change)
+        if np.trace(jackknife / np.outer(scale, scale)) > np.trace(noise / np.outer(scale, scale)):
+            noise = jackknife
     count = len(directions)
-    shown = _trace(D, noise)
-    kept = _trace(D, prior)
-    before = float(np.sum((D @ result.x) ** 2)) - shown + kept
+    by_noise = float(np.sum((D @ noise) * D))
+    by_prior = float(np.sum((D @ prior) * D))
+    before = float(np.sum((D @ result.x) ** 2)) - by_noise + by_prior
     each = np.einsum("nij,jk,nik->ni", directions, noise + prior, directions)
     factor = coverage_factor(result.freedom, CONFIDENCE)
     return Improvement(
         before=float(np.sqrt(max(before, 0.0) / count)),
-        after=float(np.sqrt((shown + kept) / count)),
+        after=float(np.sqrt((by_noise + by_prior) / count)),
         within=float(factor * np.sqrt(each.max())),
     )
 
 
-def _trace(D: Array, C: Array) -> float:
-    return float(np.sum((D @ C) * D))
-
-
-def _slopes(result: Calibration) -> tuple[Array, Array]:
-    """Return the slopes of flange positions without what placing takes back, (3 W, n) and (W, 3, n)."""
+def _slopes(result: Outcome) -> tuple[Array, Array]:
+    """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n)."""
     machine, columns = _at_flange(result)
     q = within_ranges(machine)
     p = predicted(machine, q).position
@@ -114,13 +109,13 @@ def _slopes(result: Calibration) -> tuple[Array, Array]:
     nominal = dict(zip(machine.parameters.names, machine.parameters.nominal, strict=True))
     base = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
     along = base[:3, :3] @ forward_kinematics(require_robot(machine), q)[:, :3, :3]
-    placing = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
-    U = np.linalg.qr(placing)[0]
+    fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
+    U = np.linalg.qr(fitting)[0]
     D = D - U @ (U.T @ D)
     return D, D.reshape(J.shape)
 
 
-def _at_flange(result: Calibration) -> tuple[Machine, np.ndarray]:
+def _at_flange(result: Outcome) -> tuple[Machine, np.ndarray]:
     """Return the machine with its reflectors at the flange, where it was linearized, and which columns of x it has.
 
     Several problems of `together` are one machine where they share all that is identified of the joints.
@@ -140,22 +135,3 @@ def _at_flange(result: Calibration) -> tuple[Machine, np.ndarray]:
     at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
     data = problem.alone(robot).data
     return Machine(problem.arms[robot], replace(of_robot, nominal=nominal), data, at=at), columns
-
-
-def _moving_apart(result: Calibration) -> tuple[Array, Array]:
-    """Return the covariance by noise and the mean square of what is held back, (n, n) [SI]."""
-    if not result.linear_penalty:
-        raise InputError("improvement", f"formulation '{result.formulation.name}'", "a squared penalty or none")
-    spread = result.spread
-    noise = spread.noise
-    change = influence(result).change
-    if np.isfinite(change).all():
-        jackknife = change.T @ change * (len(change) - 1) / len(change)
-        if np.trace(_scaled(result, jackknife)) > np.trace(_scaled(result, noise)):
-            noise = jackknife
-    return noise, spread.prior
-
-
-def _scaled(result: Calibration, C: Array) -> Array:
-    scale = result.problem.parameters.free.scale
-    return C / np.outer(scale, scale)

@@ -7,7 +7,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import influence
-from rpim_opt.calibration.leaving_out import Influence
+from rpim_opt.calibration.leverage import Influence
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import PartitionedProblem
@@ -36,7 +36,7 @@ def close(found: Influence, k: int, change: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("name", ["position", "markers", "pose", "mixed", "distance"])
-def test_changes_are_those_of_leaving_out(name: str) -> None:
+def test_changes_are_those_of_leverage(name: str) -> None:
     result = ro.calibrate(ro.load(name).problem, ro.tikhonov, weight=1.0)
     found = influence(result)
     assert len(found.label) == len(np.unique(result.problem.data.configuration))

@@ -1,10 +1,10 @@
-"""What every configuration does to the result: the change of each parameter if it had not been measured."""
+"""Influence: the change of every parameter if a configuration had not been measured."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.terms import term
 from rpim_opt.convex.trust import SMALL
 from rpim_opt.data.dataset import Dataset
@@ -22,14 +22,13 @@ from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
 
 TINY = 1e-300
-"""Where numbers end that something may be divided by."""
+"""Divisors are no smaller."""
 ALONE = 1e-9
-"""A configuration decides a direction alone where it leaves less than this part of what is known of it to others."""
-UNSEEN = 1e-9
-"""Standard deviations below, in scales, are rounding: the data do not see the parameter, and nothing moves it."""
+"""A configuration decides a direction alone where others know less than this share of it."""
+UNIDENTIFIABLE = 1e-9
+"""Standard deviations below, in scales, are rounding: the data do not see the parameter."""
 BALANCED = 1e-4
-"""What the slopes of weighted equations and penalty may leave of each other at the solution, relative to those of the
-data at nominal."""
+"""Gradient of weighted equations and penalty at the solution, relative to that of the data at nominal."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,27 +77,8 @@ class Influence(Tabled):
 
     @property
     def standardized(self) -> Array:
-        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS).
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
-        >>> moved = ro.calibration.influence(result).standardized
-        >>> moved.shape, bool(np.abs(moved).max() > 0.5)
-        ((40, 34), True)
-        """
+        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS)."""
         return np.divide(self.change, self.deviation, out=np.zeros_like(self.change), where=self.deviation > 0)
-
-    def to_frame(self) -> Any:
-        """Return a data frame (pandas), one row a configuration; a parameter's change in its unit, ``a2_mm``.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
-        >>> frame = ro.calibration.influence(result).to_frame()
-        >>> frame.shape, list(frame.columns[:6])
-        ((9, 31), ['label', 'configuration', 'leverage', 'cook', 'weight', 'alpha1_deg'])
-        """
-        return super().to_frame()
 
     def _short(self) -> str:
         most = int(np.argmax(self.cook))
@@ -129,7 +109,7 @@ class Influence(Tabled):
 
 
 @one_blas_thread  # small matrices: threads would wait for each other longer than they compute
-def influence(result: Calibration) -> Influence:
+def influence(result: Outcome) -> Influence:
     """Return what leaving out every configuration would do to every parameter.
 
     At the solution z the data's equations A z ~ b with their weights W and the penalty w |L z - c|^2 have the
@@ -163,74 +143,84 @@ def influence(result: Calibration) -> Influence:
     >>> print(f"{robust.weight[list(robust.label).index('c39')]:.3f}")
     0.020
     """
-    program = result.program
-    if not program.linear_penalty:
-        found = f"formulation '{result.formulation.name}'"
-        raise InputError("influence", found, "a squared penalty or none")
-    free = _moving(result)
-    pieces = list(_weighted(result))
-    R = _triangle([piece.model for piece in pieces])
-    _require_balance(result, R, free)
-    T = _inverse_root(result, R, free)
-    parts = [_of_piece(piece, result.z, T) for piece in pieces]
+    if not result.linear_penalty:
+        raise InputError("influence", f"formulation '{result.formulation.name}'", "a squared penalty or none")
+    stated = result.problem.parameters.free
+    n = len(stated)
+    blocks = list(_weighted(result))
+    R = None
+    for block in blocks:
+        R = reduced_equations(block.model.A, block.model.b, R)
+    if R is None:
+        raise InputError("data", "no row", "at least one")
+    A, b = R[:, :n], R[:, n]
+    L, c = np.zeros((0, n)), np.zeros(0)
+    form = result.program.penalty_form
+    if form is not None:
+        root = np.sqrt(result.penalty_weight)
+        L, c = root * form.matrix, root * form.c
+    at_bound = {each.name for each in result.held}
+    free = np.array([name not in at_bound for name in stated.names])
+    gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
+    if np.linalg.norm(gradient[free]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
+        raise _unweighted(result)
+    T = _inverse_root(np.vstack([A, L]), free)
+    parts = [_left_out(block, result.z, T) for block in blocks]
     leverage, change, squares = (np.concatenate(each) for each in zip(*parts, strict=True))
     used = float(np.sum(leverage))
-    spare = sum(len(piece.model.b) for piece in pieces) - used
+    spare = sum(len(block.model.b) for block in blocks) - used
     variance = 1.0
     if spare > 1e-6:
         variance = float(np.sum(squares)) / spare
-    moved = change @ R[:, :-1].T
-    spread = np.sqrt(variance * np.sum((R[:, :-1] @ T @ T.T) ** 2, axis=0))
-    spread[spread < UNSEEN] = 0.0
-    stated = result.problem.parameters.free
+    moved = change @ A.T
+    spread = np.sqrt(variance * np.sum((A @ T @ T.T) ** 2, axis=0))
+    spread[spread < UNIDENTIFIABLE] = 0.0
     return Influence(
-        label=tuple(label for piece in pieces for label in piece.label),
-        configuration=np.concatenate([piece.configuration for piece in pieces]),
+        label=tuple(label for block in blocks for label in block.label),
+        configuration=np.concatenate([block.configuration for block in blocks]),
         parameters=stated.names,
         dimensions=stated.dimensions,
         leverage=leverage,
         cook=np.sum(moved**2, axis=1) / (max(used, TINY) * max(variance, TINY)),
         change=change * stated.scale,
         deviation=spread * stated.scale,
-        weight=np.concatenate([piece.weight for piece in pieces]),
+        weight=np.concatenate([block.weight for block in blocks]),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """Weighted equations of some configurations, sorted by them; how many each has, and its mean weight."""
+class _Block(NamedTuple):
+    """Weighted equations sorted by configuration; how many each configuration has, and its mean weight."""
 
     model: LinearModel
-    count: np.ndarray
+    equations: np.ndarray
     weight: Array
     configuration: np.ndarray
     label: tuple[str, ...]
 
 
-def _weighted(result: Calibration) -> Iterator[_Piece]:
+def _weighted(result: Outcome) -> Iterator[_Block]:
     """Yield the equations of the last linearization, with the weights that the loss ended with."""
     model = result.program.model
     if model.stands_for is None and isinstance(result.problem, CalibrationProblem):
         if result.squared_loss:
             model = result.program.squared
-        yield _piece(result, model, result.problem.data)
+        yield _block(result, model, result.problem.data)
         return
     for part in in_parts(result.problem).rows():
-        yield _piece(result, part.linearize(result.x), part.data)
+        yield _block(result, part.linearize(result.x), part.data)
 
 
-def _piece(result: Calibration, model: LinearModel, data: Dataset) -> _Piece:
+def _block(result: Outcome, model: LinearModel, data: Dataset) -> _Block:
     order = np.argsort(model.group, kind="stable")
     model = replace(model, A=model.A[order], b=model.b[order], group=model.group[order])
     numbers, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
     weight = _weights(result, model, which, len(count))
     first = dict(zip(data.configuration[::-1], data.label[::-1], strict=True))
     label = tuple(first[number] for number in numbers)
-    mean = np.bincount(which, weight) / count
-    return _Piece(model.scaled(np.sqrt(weight)), count, mean, numbers, label)
+    return _Block(model.scaled(np.sqrt(weight)), count, np.bincount(which, weight) / count, numbers, label)
 
 
-def _weights(result: Calibration, model: LinearModel, which: np.ndarray, configurations: int) -> Array:
+def _weights(result: Outcome, model: LinearModel, which: np.ndarray, configurations: int) -> Array:
     """Return loss'(v) / (2 v) of every equation (m,): the squares that the loss ended with."""
     if result.squared_loss:
         return np.ones(len(model.b))
@@ -244,72 +234,33 @@ def _weights(result: Calibration, model: LinearModel, which: np.ndarray, configu
     if slope is None:
         raise _unweighted(result)
     each = np.maximum(slope, 0.0) / (2 * v)
-    if stated.loss_over == "configuration":
-        return each[which]
-    return each
+    return each[which] if stated.loss_over == "configuration" else each
 
 
-def _unweighted(result: Calibration) -> InputError:
+def _unweighted(result: Outcome) -> InputError:
     found = f"formulation '{result.formulation.name}'"
     return InputError("influence", found, "a loss that weighs its equations by their residuals: squares, Huber's")
 
 
-def _triangle(models: list[LinearModel]) -> Array:
-    """Return the triangle (n+1, n+1) of all weighted equations."""
-    R = None
-    for model in models:
-        R = reduced_equations(model.A, model.b, R)
-    if R is None:
-        raise InputError("data", "no row", "at least one")
-    return R
-
-
-def _price(result: Calibration) -> tuple[Array, Array]:
-    """Return L and c, times the root of the weight, of the penalty |L z - c|^2."""
-    form = result.program.penalty_form
-    root = np.sqrt(result.penalty_weight)
-    if form is None:
-        return np.zeros((0, len(result.z))), np.zeros(0)
-    return root * form.matrix, root * form.c
-
-
-def _moving(result: Calibration) -> np.ndarray:
-    """Return which parameters (n,) no bound holds."""
-    held = {each.name for each in result.held}
-    return np.array([name not in held for name in result.problem.parameters.free.names])
-
-
-def _require_balance(result: Calibration, R: Array, free: np.ndarray) -> None:
-    """Refuse a solution that is none of the weighted equations: the loss is no matter of weights."""
-    n = len(result.z)
-    A, b = R[:, :n], R[:, n]
-    L, c = _price(result)
-    slope = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
-    if np.linalg.norm(slope[free]) > BALANCED * np.linalg.norm(A.T @ b):
-        raise _unweighted(result)
-
-
-def _inverse_root(result: Calibration, R: Array, free: np.ndarray) -> Array:
-    """Return T (n, k) with H^-1 = T T' over the parameters that move, and what decides them."""
-    n = len(result.z)
-    rows = np.vstack([R[:, :n], _price(result)[0]])[:, free]
-    _, s, Vt = np.linalg.svd(rows, full_matrices=False)
-    seen = s > RANK_TOLERANCE * np.max(s, initial=0.0)
-    T = np.zeros((n, np.count_nonzero(seen)))
-    T[free] = Vt[seen].T / s[seen]
+def _inverse_root(rows: Array, free: np.ndarray) -> Array:
+    """Return T (n, k) with H^-1 = T T' over the free parameters, of rows with H = rows' rows."""
+    _, s, Vt = np.linalg.svd(rows[:, free], full_matrices=False)
+    identifiable = s > RANK_TOLERANCE * np.max(s, initial=0.0)
+    T = np.zeros((len(free), np.count_nonzero(identifiable)))
+    T[free] = Vt[identifiable].T / s[identifiable]
     return T
 
 
-def _of_piece(piece: _Piece, z: Array, T: Array) -> tuple[Array, Array, Array]:
+def _left_out(block: _Block, z: Array, T: Array) -> tuple[Array, Array, Array]:
     """Return leverages (C,), changes (C, n) in scales, and the sum of squares (C,) of the configurations."""
-    residual = piece.model.A @ z - piece.model.b
-    Q = piece.model.A @ T
-    first = np.cumsum(piece.count) - piece.count
+    residual = block.model.A @ z - block.model.b
+    Q = block.model.A @ T
+    first = np.cumsum(block.equations) - block.equations
     leverage = np.empty(len(first))
     squares = np.empty(len(first))
     change = np.empty((len(first), len(z)))
-    for count in np.unique(piece.count):
-        chosen = np.flatnonzero(piece.count == count)
+    for count in np.unique(block.equations):
+        chosen = np.flatnonzero(block.equations == count)
         rows = first[chosen][:, None] + np.arange(count)
         q, r = Q[rows], residual[rows]
         hat = q @ q.transpose(0, 2, 1)
