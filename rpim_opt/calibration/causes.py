@@ -1,4 +1,4 @@
-"""Why a fit is bad: the mistakes that `inspect` knows are looked for when a calibration leaves too much."""
+"""Likely causes of a bad fit: the mistakes that `inspect` knows are looked for when residuals are too large."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
@@ -29,9 +28,9 @@ from rpim_opt.problem.problem import CalibrationProblem
 
 BAD = "The fit is bad"
 HOPELESS = 20.0
-"""Beyond so many times something is said even if nothing explains them."""
+"""Residuals over the stated noise from which something is said even if nothing explains them."""
 SCALES = 10.0
-"""A robot's parameter that deviates by more scales than this was not expected so."""
+"""Scales by which a parameter of the robot may deviate."""
 LARGEST = {"length": 0.02, "angle": 0.05}
 """A machined and assembled robot deviates by less than this [m, rad]."""
 
@@ -83,9 +82,20 @@ def likely_causes(result: Outcome) -> list[str]:
     shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
     if result.learned is not None:
         shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
+    if result.mapping is not None:
+        shared += result.mapping.doubts
     kept = kept_rows(result)
     errors, pixels = (np.where(kept, problem.errors(result.x, of), np.nan) for of in ("length", "pixel"))
-    signs = _signs(result, problem, errors, pixels)
+    ratios = noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")
+    figures = f"{three_digits(1e3 * rms(errors))} mm", f"{three_digits(rms(pixels))} px"
+    signs = [
+        f"its errors have an RMS of {figure}, {three_digits(ratio)} times the stated noise"
+        for figure, ratio in zip(figures, ratios, strict=True)
+        if ratio > NOISY
+    ]
+    if not result.converged:
+        signs.append("it did not converge")
+    signs += _large(result, problem)
     head: list[str] = []
     causes: tuple[Cause, ...] = ()
     if signs:
@@ -93,11 +103,9 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = find_causes(result)
     elif not kept.all():
         causes = tuple(map(Cause, _of_rows(problem)))
-    if result.mapping is not None:
-        shared += result.mapping.doubts
     if causes or shared:
         return [*head, *(f"Likely: {cause.sentence}" for cause in causes), *shared]
-    if max(noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")) > HOPELESS:
+    if max(ratios) > HOPELESS:
         return [*head, NOTHING]
     return []
 
@@ -129,16 +137,6 @@ def better_fitting(result: Outcome, data: Dataset) -> Better | None:
     """Return the reading of new measurements that fits far better; None where they are near, or none does.
 
     Asked where their errors are beyond `HOPELESS` times what the instrument is stated to have.
-
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.causes import better_fitting
-    >>> instance = ro.load("position")
-    >>> result = ro.calibrate(instance.problem)
-    >>> block = instance.validation.blocks[0]
-    >>> wrong = replace(instance.validation, blocks=(replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]]),))
-    >>> better_fitting(result, instance.validation), better_fitting(result, wrong).what
-    (None, 'joints 2 and 3 exchanged')
     """
     problem = result.problem.sample().on(data)
     if len(problem.arms) > 1 or noise_ratio(problem, result.errors(data)) <= HOPELESS:
@@ -163,12 +161,7 @@ def misread(result: Outcome, data: Dataset) -> str:
 
 
 def mistakes(causes: Sequence[str]) -> list[str]:
-    """Return the mistakes among `likely_causes`, without how a fit is bad.
-
-    >>> from rpim_opt.calibration.causes import NOTHING, mistakes
-    >>> mistakes(["The fit is bad: ...", NOTHING]), mistakes(["The fit is bad: ...", "Likely: ..."]), mistakes([])
-    ([], ['Likely: ...'], [])
-    """
+    """Return the mistakes among `likely_causes`, without how a fit is bad."""
     return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
 
 
@@ -177,25 +170,6 @@ def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
     yield from rows_without_values(problem)
     if len(problem.arms) == 1:
         yield from exchanged_rows(problem)
-
-
-def _signs(result: Outcome, problem: CalibrationProblem, errors: Array, pixels: Array) -> list[str]:
-    """Return how a fit shows that it is bad."""
-    signs = []
-    ratio = noise_ratio(problem, errors)
-    if ratio > NOISY:
-        signs.append(_large_errors(f"{three_digits(1e3 * rms(errors))} mm", ratio))
-    ratio = noise_ratio(problem, pixels, "pixel")
-    if ratio > NOISY:
-        signs.append(_large_errors(f"{three_digits(rms(pixels))} px", ratio))
-    if not result.converged:
-        signs.append("it did not converge")
-    signs += _large(result, problem)
-    return signs
-
-
-def _large_errors(rms: str, ratio: float) -> str:
-    return f"its errors have an RMS of {rms}, {three_digits(ratio)} times the stated noise"
 
 
 def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:

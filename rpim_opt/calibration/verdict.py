@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
+from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameter_names import own_name
-
-if TYPE_CHECKING:
-    from rpim_opt.calibration.outcome import Outcome
-    from rpim_opt.problem.source import Source
 
 NOISY = 3.0
 """Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
@@ -87,30 +84,24 @@ class Verdict:
 
 
 def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
-    """Return the verdict on a calibration.
+    """Return the verdict on a calibration, with likely mistakes in its data, a sentence each.
 
-    Not delivered is a robot whose fit did not converge; whose kept rows have residuals beyond 3 times the stated noise
-    and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors on
-    held-out rows are larger than the nominal robot's; whose data were computed; and one with a likely mistake.
-
-    The limits were set on 48 tables with mistakes and 36 good folders; none is a limit on joint zeros, which may be off
-    by 180 degrees.
-
-    Parameters
-    ----------
-    result
-        The calibration.
-    causes
-        Likely mistakes in its data, a sentence each.
+    Not delivered is a robot whose fit did not converge; whose residuals without outliers are beyond 3 times the stated
+    noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
+    on held-out rows are larger than the nominal robot's; whose data were computed; and one with a likely mistake. The
+    limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not limited.
     """
     reasons = [] if result.converged else [result.message]
-    reasons += [*_residuals(result), *_repeatability(result), *_deviations(result), *_excluded(result)]
+    kept = kept_rows(result)
+    reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
+    if np.mean(~kept) > EXCLUDED:
+        reasons.append(f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_held_out(result), *_computed(result), *causes]
     return Verdict(tuple(dict.fromkeys(reasons)))
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
-    """Return which rows (N,) are no outliers: neither excluded before the fit nor let go by a robust loss."""
+    """Return which rows (N,) are no outliers: neither excluded before the fit nor flagged after a robust loss."""
     labels: set[str] = set()
     if result.learned is not None:
         labels |= {row.label for row in result.learned.left_out}
@@ -143,9 +134,7 @@ def stated_variance(problem: Source, dimension: str) -> Array:
 def rms(errors: Array) -> float:
     """Return the root mean square of errors that are numbers; 0 where there is none."""
     finite = errors[np.isfinite(errors)]
-    if not len(finite):
-        return 0.0
-    return float(np.sqrt(np.mean(finite**2)))
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else 0.0
 
 
 def worse_than_nominal(nominal: Array, identified: Array) -> bool:
@@ -156,20 +145,25 @@ def worse_than_nominal(nominal: Array, identified: Array) -> bool:
     both = np.isfinite(nominal) & np.isfinite(identified)
     difference = identified[both] ** 2 - nominal[both] ** 2
     rows = len(difference)
-    if not rows:
-        return False
     if rows < ROWS:
         return rms(identified[both]) > 2 * rms(nominal[both])
     return bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(rows))
 
 
+def worse_sentence(nominal: Array, identified: Array) -> str:
+    """Say by how much errors (N,) [m] on held-out rows are larger than the nominal robot's."""
+    return (
+        f"Errors on {len(nominal)} held-out rows are larger than the nominal robot's: RMS "
+        f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
+    )
+
+
 # --- reasons ------------------------------------------------------------------------------------------------------
 
 
-def _residuals(result: Outcome) -> Iterator[str]:
+def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
     problem = result.problem
-    kept = kept_rows(result)
     lengths, angles, pixels = (
         np.where(kept, result.errors(dimension=each), np.nan) for each in ("length", "angle", "pixel")
     )
@@ -228,7 +222,10 @@ def _deviations(result: Outcome) -> Iterator[str]:
     for name, x in zip(result.problem.parameters.free.names, result.x, strict=True):
         kind = own_name(name).rstrip("0123456789")
         joint = own_name(name).removeprefix(kind)
-        if kind not in MACHINED or not joint or (kind == "d" and _slides(result.problem, name, int(joint))):
+        if kind not in MACHINED or not joint:
+            continue
+        types = result.problem.arms[name.rpartition(".")[0]].joint_types
+        if kind == "d" and types[int(joint) - 1] == "prismatic":  # the zero of that joint
             continue
         unit, largest = MACHINED[kind]
         said = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
@@ -236,17 +233,6 @@ def _deviations(result: Outcome) -> Iterator[str]:
         worst = max(worst, (float(abs(x)) / largest, said))
     if worst[1]:
         yield worst[1]
-
-
-def _slides(problem: Source, name: str, joint: int) -> bool:
-    """Whether a length d is the zero of a prismatic joint."""
-    return problem.arms[name.rpartition(".")[0]].joint_types[joint - 1] == "prismatic"
-
-
-def _excluded(result: Outcome) -> Iterator[str]:
-    kept = kept_rows(result)
-    if np.mean(~kept) > EXCLUDED:
-        yield f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}."
 
 
 def _held_out(result: Outcome) -> Iterator[str]:
@@ -263,24 +249,14 @@ def _held_out(result: Outcome) -> Iterator[str]:
         yield worse_sentence(nominal, identified)
 
 
-def worse_sentence(nominal: Array, identified: Array) -> str:
-    """Say by how much errors (N,) [m] on held-out rows are larger than the nominal robot's."""
-    return (
-        f"Errors on {len(nominal)} held-out rows are larger than the nominal robot's: RMS "
-        f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
-    )
-
-
 def _computed(result: Outcome) -> Iterator[str]:
     """Say that the nominal robot explains the data to rounding: they were computed with it."""
     problem = result.problem
     frames = int((problem.parameters.placed & problem.parameters.identified).sum())
-    if result.program.model.equations < SPARE * frames + 1:
+    measured = stated_variance(problem, "length") > 0
+    if result.program.model.equations < SPARE * frames + 1 or not measured.any():
         return
     errors = result.nominal_errors()
-    measured = stated_variance(problem, "length") > 0
-    if not measured.any():
-        return
     nominal = rms(errors[measured])
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         yield (
