@@ -29,14 +29,7 @@ class Baseline(NamedTuple):
 
 
 def linear_least_squares(problem: CalibrationProblem) -> Baseline:
-    """LSM of the paper: one step of least squares from nominal, of smallest norm in units of the scales.
-
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> found = ro.baselines.linear_least_squares(problem)
-    >>> found.x.shape, found.iterations
-    ((34,), 1)
-    """
+    """LSM of the paper: one step of least squares from nominal, of smallest norm in units of the scales."""
     scale = problem.parameters.free.scale
     model = problem.linearize(np.zeros_like(scale))
     return Baseline(scale * np.linalg.lstsq(model.A, model.b, rcond=1e-12)[0], 1, "linear least squares")
@@ -47,24 +40,11 @@ def gauss_newton(
 ) -> Baseline:
     """Gauss-Newton: least-squares steps of smallest norm, repeated until they are shorter than ``tolerance`` scales.
 
-    Nothing holds back directions that the data do not see well: they wander where noise sends them. Where parameters
-    are redundant, the cut-off decides: a direction that no data see has a singular value of rounding at nominal, and a
-    larger one where deviations are not exact; with a cut-off of 1e-12 it is taken for one that is seen, and runs away.
+    Weakly identifiable directions wander where noise sends them. Singular values below ``cutoff`` times the largest are
+    taken for zero: that of a redundant direction is rounding at nominal, and larger where deviations are not exact.
 
-    Parameters
-    ----------
-    problem
-        What was measured, and what is to be identified.
-    iterations, tolerance
-        When to stop.
-    cutoff
-        Singular values below so much of the largest are taken for zero.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> ro.baselines.gauss_newton(problem).iterations < 20
+    >>> ro.baselines.gauss_newton(ro.load("position").problem).iterations < 20
     True
     """
     scale = problem.parameters.free.scale
@@ -80,15 +60,7 @@ def gauss_newton(
 
 
 def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
-    """Levenberg-Marquardt as in SciPy (MINPACK), on whitened residuals, analytic Jacobian, 200 evaluations.
-
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> found = ro.baselines.levenberg_marquardt(problem)
-    >>> other = ro.baselines.gauss_newton(problem)
-    >>> bool(abs(problem.errors(found.x) - problem.errors(other.x)).max() < 1e-4)  # [m]
-    True
-    """
+    """Levenberg-Marquardt as in SciPy (MINPACK), on whitened residuals, analytic Jacobian, 200 evaluations."""
     scale = problem.parameters.free.scale
 
     def residual(z: Array) -> Array:
@@ -113,22 +85,6 @@ def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, precon
 
     As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by
     the column norms of the Jacobian, which is what makes it move at all along the weak directions.
-
-    Parameters
-    ----------
-    problem
-        What was measured, and what is to be identified.
-    iterations
-        When to stop.
-    preconditioned
-        Whether deviations are divided by the column norms.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("paper_arm").problem
-    >>> ro.baselines.gradient_descent(problem, iterations=100).iterations  # not at rest
-    100
     """
     scale = problem.parameters.free.scale
     model = problem.linearize(np.zeros_like(scale))
@@ -158,26 +114,10 @@ def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, precon
 
 
 def extended_kalman_filter(problem: CalibrationProblem, passes: int = 1) -> Baseline:
-    """Filter one configuration after the other (extended Kalman filter), scales as prior, declared noise as noise.
+    """Filter one configuration after the other (extended Kalman filter), scales as prior, stated noise as noise.
 
     Linearizes each configuration at the estimate so far; with more passes the prior is taken again, at the last
     estimate (iterated filter), which ends at the Tikhonov solution of weight 1.
-
-    Parameters
-    ----------
-    problem
-        What was measured, and what is to be identified.
-    passes
-        How often all configurations are gone through.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("paper_arm").problem
-    >>> found = ro.baselines.extended_kalman_filter(problem, passes=8)
-    >>> tikhonov = ro.calibrate(problem, ro.tikhonov, weight=1.0)
-    >>> bool(abs((found.x - tikhonov.x) / problem.parameters.free.scale).max() < 1e-6)
-    True
     """
     scale = problem.parameters.free.scale
     groups = np.unique(problem.data.configuration)

@@ -35,14 +35,10 @@ class Certificate(NamedTuple):
     the scales; ``decrease`` what that step promises, relative to the objective, or None where it is not known.
 
     >>> import rpim_opt as ro
-    >>> problem = ro.load("paper_arm").problem
-    >>> result = ro.calibrate(problem, ro.bounded, weight=1e-3)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.bounded, weight=1e-3)
     >>> evidence = result.certificate
     >>> evidence.holds(result.z), evidence.decrease < 1e-9, evidence.violation, evidence.gradient < 1e-6
     (True, True, 0.0, True)
-    >>> early = ro.calibrate(problem, ro.bounded, weight=1e-3, max_iterations=1)
-    >>> early.certificate.holds(early.z)
-    False
     """
 
     gradient: float | None
@@ -65,23 +61,12 @@ def certified(
     residual: Callable[[Array], Array] | None = None,
     before: Program | None = None,
 ) -> Certificate:
-    """Return the evidence that z (n,) minimizes the nonlinear problem.
+    """Return the evidence that z (n,) minimizes the nonlinear problem: the formulation's functions are asked anew.
 
-    Parameters
-    ----------
-    formulation
-        Whose functions are asked anew.
-    model, slope
-        The problem linearized at z, anew, and the norm of the data's gradient where the loop began.
-    z, weight
-        What is certified.
-    floor
-        Below what an objective is as good as zero.
-    residual
-        The nonlinear problem's whitened residual b - A z at z (n,), where there is one: the model's derivative is held
-        against its differences, and replaced by them where it is not theirs.
-    before
-        A program of the formulation: what CVXPY made of its functions serves again where they answer the same.
+    ``model`` is the problem linearized at z, anew; ``slope`` the norm of the data's gradient where the loop began;
+    ``floor`` the objective below which one has vanished. Where ``residual`` gives the whitened residual b - A z at
+    z (n,), the model's derivative is compared with its differences, and replaced by them where it is not theirs. What
+    CVXPY made of the functions of the program ``before`` serves again where they answer the same.
     """
     if residual is not None:
         model = _differentiated(model, residual, z)

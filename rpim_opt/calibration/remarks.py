@@ -9,7 +9,8 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import listed
-from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.verdict import rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
@@ -22,57 +23,37 @@ HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified",
 # --- cameras ----------------------------------------------------------------------------------------------------------
 
 
-def camera_remarks(result: Calibration) -> list[str]:
-    """Return remarks on a camera's views; nothing where there are none.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.remarks import camera_remarks
-    >>> camera_remarks(ro.load("paper_arm").calibrate())
-    []
-    >>> said = camera_remarks(ro.load("camera").calibrate(weight=1.0))
-    >>> said[1].split(",")[0]
-    'Expected position error of the flange over its joint ranges'
-    """
-    blocks = camera_blocks(result.problem.sample().data)
-    if not blocks:
+def camera_remarks(result: Outcome) -> list[str]:
+    """Return remarks on a camera's views; nothing where there are none."""
+    if not camera_blocks(result.problem.sample().data):
         return []
-    before = _rms(result.nominal_errors(dimension="pixel"))
-    after = _rms(result.errors(dimension="pixel"))
+    from rpim_opt.calibration.expected import improvement  # which no other measurement asks for
+
+    before, after = (rms(errors(dimension="pixel")) for errors in (result.nominal_errors, result.errors))
     remarks = [
         f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; in millimetres, the distance of the "
         "line of sight from the point. It measures how well views agree, not how well the robot is identified."
     ]
-    remarks += _positions(result)
+    found = improvement(result)
+    if found is None:
+        remarks.append("This result does not determine the expected position error of the flange.")
+    else:
+        remarks.append(
+            "Expected position error of the flange over its joint ranges, base and tool fitted: "
+            f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % of it within "
+            f"{1e3 * found.within:.3g} mm along any axis)."
+        )
+        if not found.improves:
+            remarks.append(
+                "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the "
+                "board nearer or larger, or an instrument that measures positions would."
+            )
     if not any("stretch" in name for name in result.problem.parameters.free.names):
         remarks.append(
             "Views do not identify the size of the board: an error of it scales the robot by the same factor "
             "(identify board_stretch_x and board_stretch_y where it was printed)."
         )
     return remarks
-
-
-def _positions(result: Calibration) -> list[str]:
-    from rpim_opt.calibration.expected import improvement  # which no other measurement asks for
-
-    found = improvement(result)
-    if found is None:
-        return ["This result does not determine the expected position error of the flange."]
-    figures = (
-        "Expected position error of the flange over its joint ranges, base and tool fitted: "
-        f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % of it within "
-        f"{1e3 * found.within:.3g} mm along any axis)."
-    )
-    if found.improves:
-        return [figures]
-    return [
-        figures,
-        "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the board "
-        "nearer or larger, or an instrument that measures positions would.",
-    ]
-
-
-def _rms(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(errors**2)))
 
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
@@ -94,24 +75,7 @@ class Scatter(NamedTuple):
 
 
 def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
-    """Return the scatter of every point or plane that rows touched, the worst first; nothing where none did.
-
-    Parameters
-    ----------
-    data
-        The measurements.
-    nominal, error
-        (N,) errors before and after calibration [m].
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.remarks import scatter
-    >>> data = ro.data.touches(np.zeros((4, 6)), ["A", "B", "A", "B"], sigma=1e-4)
-    >>> [each.name for each in scatter(data, np.zeros(4), np.array([1e-4, 3e-4, 2e-4, 3e-4]))]
-    ['B', 'A']
-    """
+    """Return the scatter of every point or plane that rows touched, the worst first, from errors (N,) [m]."""
     found = []
     for name, rows in _touched(data):
         before = float(np.sqrt(np.mean(nominal[rows] ** 2)))
@@ -147,14 +111,7 @@ def scatter_rows(found: Sequence[Scatter]) -> list[list[str]]:
 
 
 def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
-    """Say of which points that rows touched the calibration has touches of its own: those are not held back.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.remarks import known_points
-    >>> instance = ro.load("contact")
-    >>> known_points(instance.problem, instance.validation)  # four sockets elsewhere
-    []
-    """
+    """Say of which points that rows touched the calibration has touches of its own: those are not held out."""
     known = {name for name, _ in _touched(problem.data)}
     both = [name for name, _ in _touched(data) if name in known]
     if not both:
@@ -163,15 +120,7 @@ def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
 
 
 def contact_remarks(problem: CalibrationProblem) -> list[str]:
-    """Return remarks on errors of touches; nothing where there are none.
-
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.calibration.remarks import contact_remarks
-    >>> contact_remarks(ro.load("paper_arm").problem)
-    []
-    >>> contact_remarks(ro.load("contact").problem)[0][:58]
-    'Error of a touch: the distance of the tool from the mean o'
-    """
+    """Return remarks on errors of touches; nothing where there are none."""
     if problem.touches is None:
         return []
     nearest = []

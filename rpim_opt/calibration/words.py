@@ -15,6 +15,7 @@ from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.calibration.verdict import Verdict
 from rpim_opt.convex.select import disagreement
 from rpim_opt.data.record import Earlier
@@ -49,31 +50,18 @@ TWO_SIDED, ONE_SIDED = 1.96, 1.645
 """Standard normal quantiles of intervals and of bounds with 95 % confidence."""
 
 
-def standard_deviations(result: Outcome) -> Array:
-    """Return standard deviations (n,) [SI]; infinite where the formulation has none (lasso, minimax)."""
-    try:
-        return np.sqrt(np.diag(result.covariance))
-    except InputError:  # a penalty that is no prior, or a loss that no squared one stands for
-        return np.full(len(result.x), np.inf)
-
-
 def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
     """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit."""
     free = result.problem.parameters.free
-    values, std = free.values(result.x), standard_deviations(result)
+    values = free.values(result.x)
+    C = known_covariance(result)
     rows: list[dict[str, Any]] = []
     for i, name in enumerate(free.names):
         unit, si = display(free.dimensions[i])
-        row = {
-            "name": name,
-            "unit": unit,
-            "nominal": float(free.nominal[i] / si),
-            "identified": float(values[i] / si),
-            "deviation": float(result.x[i] / si),
-            "std": None,
-        }
-        if np.isfinite(std[i]):
-            row["std"] = float(std[i] / si)
+        row: dict[str, Any] = {"name": name, "unit": unit, "nominal": float(free.nominal[i] / si)}
+        row |= {"identified": float(values[i] / si), "deviation": float(result.x[i] / si), "std": None}
+        if C is not None and np.isfinite(C[i, i]):
+            row["std"] = float(np.sqrt(C[i, i]) / si)
         rows.append(row)
     return rows
 
@@ -373,16 +361,8 @@ def _excluded(learned: Learned) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------
 
 
-def frame_rows(result: Outcome, what: str) -> list[dict[str, Any]]:
-    """Return the rows of one of the `FRAMES`."""
-    if what not in FRAMES:
-        raise InputError("to_frame", f"'{what}'", choices(what, FRAMES))
-    return FRAMES[what](result)
-
-
 def _parameter_frame(result: Outcome) -> list[dict[str, Any]]:
-    rows = parameter_rows(result)
-    return [{"parameter": row["name"], **{key: row[key] for key in row if key != "name"}} for row in rows]
+    return [{"parameter": row.pop("name"), **row} for row in parameter_rows(result)]
 
 
 def _error_frame(result: Outcome) -> list[dict[str, Any]]:
@@ -399,3 +379,10 @@ FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
     "prices": lambda result: [price._asdict() for price in result.prices],
 }
 """Tables of a result by name."""
+
+
+def frame_rows(result: Outcome, what: str) -> list[dict[str, Any]]:
+    """Return the rows of one of the `FRAMES`."""
+    if what not in FRAMES:
+        raise InputError("to_frame", f"'{what}'", choices(what, FRAMES))
+    return FRAMES[what](result)

@@ -41,7 +41,6 @@ def test_a_parameter_without_covariance_has_a_dash() -> None:
     lasso = ro.calibrate(ro.load("paper_arm").problem, ro.lasso, 1.0)
     assert all(row["std"] is None for row in lasso.parameter_rows())
     assert lasso.parameter_table().splitlines()[-1].rstrip().endswith("-")
-    assert np.isinf(words.standard_deviations(lasso)).all()
 
 
 def flagged(count: int, squared_loss: bool = False) -> list[str]:
