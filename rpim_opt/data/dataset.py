@@ -160,10 +160,7 @@ class Dataset(Tabled):
 
     @property
     def q(self) -> Array:
-        """Joint values of the controller at every row's first point, (N, dof) [rad or m].
-
-        Zero for joints that a row's robot does not have, where there are several robots.
-        """
+        """Joint values at every row's first point, (N, dof) [rad or m]; zero where its robot has fewer."""
         q = np.zeros((len(self), max(block.q.shape[2] for block in self.blocks)))
         for block in self.blocks:
             q[block.row, : block.q.shape[2]] = block.q[:, 0]
@@ -194,8 +191,6 @@ class Dataset(Tabled):
 
         Rows that name no session are one more. Sessions that share a configuration stand together.
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> data = ro.load("position").problem.data
         >>> days = ro.Dataset.of(data.q, data.blocks[0].y, 3e-5, session=["Monday"] * 15 + ["Tuesday"] * 25)
@@ -297,22 +292,8 @@ class Dataset(Tabled):
         return self.take([i for i, label in enumerate(self.label) if label not in labels])
 
     def configurations(self, count: int, seed: int) -> Dataset:
-        """Return the rows of some configurations drawn at random.
+        """Return the rows of so many configurations drawn at random; the same seed gives the same rows.
 
-        Parameters
-        ----------
-        count
-            How many configurations.
-        seed
-            Of the draw: the same seed gives the same rows.
-
-        Raises
-        ------
-        InputError
-            For a count below 1 or above the number of configurations.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> data = ro.load("markers").problem.data  # three reflectors: three rows a configuration
         >>> len(data), len(data.configurations(5, seed=0))
@@ -400,19 +381,11 @@ class Dataset(Tabled):
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
-        """Return several datasets as one.
+        """Return several datasets of a robot as one.
 
-        Rows of different parts belong to the same configuration when their joint values are equal.
+        Rows of different parts belong to the same configuration when their joint values are equal. The ``names`` of the
+        parts precede labels, ``name:label``, where labels occur twice.
 
-        Parameters
-        ----------
-        parts
-            The datasets, of a robot.
-        names
-            What precedes the labels of each part, ``name:label``, where labels occur twice.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> data = ro.load("paper_arm").problem.data
         >>> twice = ro.Dataset.together([data, data], ["morning", "evening"])
@@ -429,13 +402,7 @@ class Dataset(Tabled):
 
 
 def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | None:
-    """Return the names (N,) of the rows' sessions; None where there are none.
-
-    Raises
-    ------
-    InputError
-        For more or fewer names than rows, and two that differ in signs alone.
-    """
+    """Return the names (N,) of the rows' sessions, None where there are none; refuse two that differ in signs alone."""
     if not len(names):
         return None
     found = np.array([str(name) for name in names], dtype=object)

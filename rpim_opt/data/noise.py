@@ -14,17 +14,13 @@ from rpim_opt.basics.units import SMALLEST, quantities, with_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import Numbers
 
-TRACKER = {
-    "range": ("length", "ratio"),
-    "transverse": ("length",),
-    "angle": ("angle",),
-    "x": ("length",),
-    "y": ("length",),
-    "z": ("length",),
-}
+TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
+           "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""
 DEFINITE = 1e-9
 """A correlation matrix whose smallest eigenvalue is not above this is no covariance."""
+COVERAGE = 2.0
+"""Coverage factor of expanded uncertainties, the columns u95."""
 
 
 @dataclass(frozen=True)
@@ -77,27 +73,23 @@ class LaserTracker:
 def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
     """Return what holds where a table states no uncertainty: standard deviations [SI], perhaps a ``tracker``."""
     declared: dict[str, Any] = {}
-    if noise.get("tracker") is not None:
-        declared["tracker"] = _tracker(noise["tracker"], kind)
-    plain = {key: value for key, value in noise.items() if key != "tracker"}
+    plain = dict(noise)
+    stated = plain.pop("tracker", None)
+    if stated is not None:
+        if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
+            raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
+        given = quantities(stated, TRACKER, "table noise.tracker")
+        terms = {"range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in given.items()}
+        if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
+            raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
+        declared["tracker"] = LaserTracker(**terms)
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
     for (stem, _), value in quantities(plain, accepted, "table noise").items():
         if not value >= SMALLEST:
-            raise InputError(
-                f"table noise, key {stem}", f"{value:g}", f"a standard deviation > 0, from {SMALLEST:g} on"
-            )
+            asked = f"a standard deviation > 0, from {SMALLEST:g} on"
+            raise InputError(f"table noise, key {stem}", f"{value:g}", asked)
         declared[stem] = value
     return declared
-
-
-def _tracker(stated: Any, kind: Measurement) -> LaserTracker:
-    if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
-        raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
-    given = quantities(stated, TRACKER, "table noise.tracker")
-    terms = {"range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in given.items()}
-    if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
-        raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
-    return LaserTracker(**terms)
 
 
 def covariances(
@@ -107,74 +99,55 @@ def covariances(
 
     A standard deviation that a row states of itself replaces the declared one and the tracker's part of it.
     """
-    k = len(kind.components)
-    instrument = _instrument(declared.get("tracker"), kind, y)
-    spread = []
-    own = np.zeros(k, dtype=bool)
-    for i, (name, dimension) in enumerate(kind.components.items()):
-        value = _stated(columns, name, dimension)
-        own[i] = value is not None
-        if value is None:
-            value = _declared(columns, declared, kind, name, seen=bool(instrument[:, i, i].any()))
-        spread.append(np.atleast_1d(value))
-    deviation = np.stack(np.broadcast_arrays(*spread), axis=1)
-    covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(~own, ~own)
-    covariance = _with_stated(covariance, columns, list(kind.components), len(y))
+    names = list(kind.components)
+    k = len(names)
+    instrument = np.zeros((1, k, k))
+    if "tracker" in declared:
+        instrument = np.zeros((len(y), k, k))
+        axes = [list(kind.columns).index(axis) for axis in "xyz"]
+        instrument[:, :3, :3] = declared["tracker"].covariance(y[:, axes])
+    own = [_of_rows(columns, name, dimension) for name, dimension in kind.components.items()]
+    spread = [
+        _declared(columns, declared, kind, name, bool(instrument[:, i, i].any())) if stated is None else stated
+        for i, (name, stated) in enumerate(zip(names, own, strict=True))
+    ]
+    deviation = np.stack(np.broadcast_arrays(*map(np.atleast_1d, spread)), axis=1)
+    lacking = np.array([stated is None for stated in own])
+    covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(lacking, lacking)
+    pairs = [(a, b) for a in names for b in names if (f"cov_{a}_{b}", "") in columns]
+    if pairs:
+        covariance = np.broadcast_to(covariance, (len(y), k, k)).copy()
+    for a, b in pairs:
+        i, j = names.index(a), names.index(b)
+        covariance[:, i, j] = columns[f"cov_{a}_{b}", ""]
+        covariance[:, j, i] = covariance[:, i, j]
     _require_definite(covariance, label)
     return covariance
 
 
-def _instrument(tracker: LaserTracker | None, kind: Measurement, y: Array) -> Array:
-    k = len(kind.components)
-    if tracker is None:
-        return np.zeros((1, k, k))
-    instrument = np.zeros((len(y), k, k))
-    axes = [list(kind.columns).index(axis) for axis in "xyz"]
-    instrument[:, :3, :3] = tracker.covariance(y[:, axes])
-    return instrument
-
-
-def _stated(columns: Numbers, name: str, dimension: str) -> Array | None:
+def _of_rows(columns: Numbers, name: str, dimension: str) -> Array | None:
     """Return the standard deviations that rows state: of this component before those of all of its dimension."""
     sources = (
         ((f"sigma_{name}", ""), 1.0),
         (("sigma", dimension), 1.0),
-        ((f"u95_{name}", ""), 0.5),  # expanded uncertainties have coverage factor 2
-        (("u95", dimension), 0.5),
+        ((f"u95_{name}", ""), COVERAGE),
+        (("u95", dimension), COVERAGE),
     )
-    for key, factor in sources:
-        if key in columns:
-            return factor * columns[key]
-    return None
+    return next((columns[key] / factor for key, factor in sources if key in columns), None)
 
 
-def _declared(columns: Numbers, declared: Mapping[str, Any], kind: Measurement, name: str, seen: bool) -> float:
-    """Return the declared standard deviation of a component, zero where the instrument or a column has it all."""
+def _declared(columns: Numbers, declared: Mapping[str, Any], kind: Measurement, name: str, of_tracker: bool) -> float:
+    """Return the declared standard deviation of a component, zero where the tracker or a column has it all."""
     dimension = kind.components[name]
     common = next((key for key, of in kind.noise.items() if of == dimension), "")
     value = declared.get(name, declared.get(common))
     if value is not None:
         return value
-    if not seen and (f"cov_{name}_{name}", "") not in columns:
+    if not of_tracker and (f"cov_{name}_{name}", "") not in columns:
         column = with_unit(f"sigma_{name}", dimension, 2)[-1]
         accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
         raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
     return 0.0
-
-
-def _with_stated(covariance: Array, columns: Numbers, names: list[str], N: int) -> Array:
-    """Return the covariances with the entries that columns ``cov_x_y_mm2`` state."""
-    pairs = [(a, b) for a in names for b in names if (f"cov_{a}_{b}", "") in columns]
-    if not pairs:
-        return covariance
-    k = len(names)
-    whole = np.broadcast_to(covariance, (N, k, k)).copy()
-    for a, b in pairs:
-        i = names.index(a)
-        j = names.index(b)
-        whole[:, i, j] = columns[f"cov_{a}_{b}", ""]
-        whole[:, j, i] = whole[:, i, j]
-    return whole
 
 
 def _require_definite(covariance: Array, label: Sequence[str]) -> None:

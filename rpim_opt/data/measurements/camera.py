@@ -5,7 +5,7 @@ The pinhole has radial and tangential distortion; a board's points come from a t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,10 +51,6 @@ def pixels(
 
         u = fx [x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)] + cx
         v = fy [y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y] + cy
-
-    >>> from rpim_opt.data.measurements.camera import pixels
-    >>> pixels(0.1, 0.0, 1.0, fx=1000.0, fy=1000.0, cx=640.0, cy=480.0, k1=-0.1)
-    (739.9, 480.0)
     """
     x = X / Z
     y = Y / Z
@@ -65,42 +61,37 @@ def pixels(
     return fx * u + cx, fy * v + cy
 
 
-def _own(**values: Any) -> tuple[dict[str, Any], ca.SX]:
-    """Return intrinsics by their short names, and the point (3, 1) on its board, stretched [m]."""
-    intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
+def _on_the_flange(T: Any, point: Any) -> Any:
+    """Return a point of a board that stands in the cell in the camera's frame, T (4, 4) the camera in its frame."""
+    return T[:3, :3].T @ (point - T[:3, 3])
+
+
+def _beside_the_robot(T: Any, point: Any) -> Any:
+    """Return a point of a board that the robot carries in the frame of the camera, T (4, 4) the board in that."""
+    return T[:3, :3] @ point + T[:3, 3]
+
+
+Place = Callable[[Any, Any], Any]
+"""From T and a point (3, 1) on its board [m] to the point in the frame of the camera."""
+
+
+def _in_camera(place: Place, T: Any, values: Mapping[str, Any]) -> Any:
     x = values["target_x"] * (1 + values["board_stretch_x"])
     y = values["target_y"] * (1 + values["board_stretch_y"])
-    return intrinsics, ca.vertcat(x, y, values["target_z"])
+    return place(T, ca.vertcat(x, y, values["target_z"]))
 
 
-def _seen(point: ca.SX, intrinsics: dict[str, Any]) -> ca.SX:
-    return ca.vertcat(*pixels(*ca.vertsplit(point), **intrinsics))
+def _pixels_of(place: Place) -> Callable[..., Any]:
+    def model(T: Any, **values: Any) -> Any:
+        intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
+        return ca.vertcat(*pixels(*ca.vertsplit(_in_camera(place, T, values)), **intrinsics))
+
+    return model
 
 
-def on_the_flange(T: Any, **values: Any) -> ca.SX:
-    """Return the pixels of a point of a board that stands in the cell, T (4, 4) the camera in the board's frame."""
-    intrinsics, point = _own(**values)
-    return _seen(T[:3, :3].T @ (point - T[:3, 3]), intrinsics)
-
-
-def beside_the_robot(T: Any, **values: Any) -> ca.SX:
-    """Return the pixels of a point of a board that the robot carries, T (4, 4) the board in the camera's frame."""
-    intrinsics, point = _own(**values)
-    return _seen(T[:3, :3] @ point + T[:3, 3], intrinsics)
-
-
-def metres_on_the_flange(T: Any, **values: Any) -> ca.SX:
+def _metres_of(place: Place) -> Callable[..., Any]:
     """Return how far apart lines of sight through neighbouring pixels are at the point [m]: Z / f."""
-    intrinsics, point = _own(**values)
-    depth = ca.dot(T[:3, 2], point - T[:3, 3])
-    return depth / ca.sqrt(intrinsics["fx"] * intrinsics["fy"])
-
-
-def metres_beside_the_robot(T: Any, **values: Any) -> ca.SX:
-    """Return the same where the robot carries the board."""
-    intrinsics, point = _own(**values)
-    depth = (T[:3, :3] @ point + T[:3, 3])[2]
-    return depth / ca.sqrt(intrinsics["fx"] * intrinsics["fy"])
+    return lambda T, **values: _in_camera(place, T, values)[2] / ca.sqrt(values["camera_fx"] * values["camera_fy"])
 
 
 def has_pixels(tables: Sequence[Columns]) -> bool:
@@ -118,7 +109,7 @@ _WORDS = Words(
 )
 eye_in_hand = Measurement(
     "eye_in_hand",
-    model=on_the_flange,
+    model=_pixels_of(_on_the_flange),
     columns={"u": "pixel", "v": "pixel"},
     noise={"pixel": "pixel"},
     parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
@@ -133,7 +124,7 @@ eye_in_hand = Measurement(
     shown_by=has_pixels,
     registers=True,
     turning=True,
-    metres=metres_on_the_flange,
+    metres=_metres_of(_on_the_flange),
 )
 """A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
 in the board's frame, which is the instrument's."""
@@ -141,8 +132,8 @@ in the board's frame, which is the instrument's."""
 eye_to_hand = replace(
     eye_in_hand,
     name="eye_to_hand",
-    model=beside_the_robot,
-    metres=metres_beside_the_robot,
+    model=_pixels_of(_beside_the_robot),
+    metres=_metres_of(_beside_the_robot),
     words=_WORDS._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
 )
 """A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
@@ -205,21 +196,19 @@ def read_board(source: Any) -> dict[str, Array]:
     >>> ro.data.read_board({"point": ["a", "b"], "x_mm": [0, 25], "y_mm": [0, 0]})["b"]
     array([0.025, 0.   , 0.   ])
     """
+    accepted = "point, x_mm, y_mm, perhaps z_mm"
     try:
-        return _points(read_columns(source))
+        table = read_columns(source)
+        names = texts(table.get("point", ()), "point")
+        if not names:
+            raise InputError("the header", f"no column point among {', '.join(table)}", accepted)
+        require_unique(names, "point")
+        places = quantities_of(table, {axis: ["length"] for axis in "xyz"}, ["point"], names)
+        if ("x", "") not in places or ("y", "") not in places:
+            raise InputError("the header", f"columns {', '.join(table)}", accepted)
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
-
-
-def _points(table: Columns) -> dict[str, Array]:
-    names = texts(table.get("point", ()), "point")
-    if not names:
-        raise InputError("the header", f"no column point among {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
-    require_unique(names, "point")
-    places = quantities_of(table, {axis: ["length"] for axis in "xyz"}, ["point"], names)
     flat = {("z", ""): np.zeros(len(names)), **places}
-    if ("x", "") not in flat or ("y", "") not in flat:
-        raise InputError("the header", f"columns {', '.join(table)}", "point, x_mm, y_mm, perhaps z_mm")
     return dict(zip(names, np.column_stack([flat[axis, ""] for axis in "xyz"]), strict=True))
 
 
@@ -272,20 +261,7 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
 
 
 def on_board(table: Columns, board: Board) -> Columns:
-    """Return the columns of a table of corners with where their points are on the board.
-
-    Parameters
-    ----------
-    table
-        With a column point.
-    board
-        The points by name, of one board or several.
-
-    Raises
-    ------
-    InputError
-        For a table without points, with places of its own, or with a point that no board has.
-    """
+    """Return the columns of a table of corners, with a column point, and where these are on one board or several."""
     own = [name for name in table if split_unit(name)[0] in TARGET]
     if own:
         raise InputError("the header", f"column '{own[0]}' beside a target", "one of them")

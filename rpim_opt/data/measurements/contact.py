@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -139,28 +140,22 @@ class KnownAngle:
     --------
     >>> import rpim_opt as ro
     >>> known = ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5)
-    >>> known.measurement.name, known.value
+    >>> known.measurement.name, known.value  # by how much the angle differs from that [rad]
     ('known_square', 0.0)
     """
 
     between: tuple[str, str]
     parallel: bool
     sigma: float
+    value: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
         _require_sound(self)
 
     @property
-    def value(self) -> float:
-        """By how much the angle differs from that [rad]: not at all."""
-        return 0.0
-
-    @property
     def measurement(self) -> Measurement:
         """The model of its row."""
-        if self.parallel:
-            return known_parallel
-        return known_square
+        return known_parallel if self.parallel else known_square
 
 
 Known = KnownDistance | KnownAngle
@@ -204,25 +199,23 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     """
     if not known:
         return data
-    touched = _first_touches(data)
-    for each in known:
-        _require_touched(each, touched)
-    blocks = [_stating(each, touched, len(data) + i) for i, each in enumerate(known)]
-    label = (*data.label, *_labels(known))
-    alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
-    configuration = np.concatenate([data.configuration, alone])
-    return Dataset((*data.blocks, *blocks), label, configuration).grouped_by_points()
-
-
-def _labels(known: Sequence[Known]) -> list[str]:
-    """Return what the rows are called, ``A to B``; planes may have both an angle and a distance."""
+    touched: dict[str, Block] = {}  # the first touch of every point, a block of one row
+    for block in data.blocks:
+        if block.point is not None and block.measurement.touching:
+            for name, i in zip(*np.unique(block.point[:, 0].astype(str), return_index=True), strict=True):
+                touched.setdefault(str(name), block.take(np.array([i]), np.array([0])))
+    blocks = []
     labels: list[str] = []
-    for each in known:
+    for i, each in enumerate(known):
+        _require_touched(each, touched)
+        blocks.append(_stating(each, touched, len(data) + i))
         label = " to ".join(each.between)
-        if label in labels:
+        if label in labels:  # planes may have both an angle and a distance
             label = f"{label}, {each.measurement.name.removeprefix('known_')}"
         labels.append(label)
-    return labels
+    alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
+    configuration = np.concatenate([data.configuration, alone])
+    return Dataset((*data.blocks, *blocks), (*data.label, *labels), configuration).grouped_by_points()
 
 
 def _require_touched(known: Known, touched: Mapping[str, Block]) -> None:
@@ -236,17 +229,6 @@ def _require_touched(known: Known, touched: Mapping[str, Block]) -> None:
         raise InputError(where, f"between '{known.between[0]}' and '{known.between[1]}'", accepted)
 
 
-def _first_touches(data: Dataset) -> dict[str, Block]:
-    """Return the first touch of every point, a block of one row."""
-    found: dict[str, Block] = {}
-    for block in data.blocks:
-        if block.point is not None and block.measurement.touching:
-            _, first = np.unique(block.point[:, 0].astype(str), return_index=True)
-            for i in first:
-                found.setdefault(str(block.point[i, 0]), block.take(np.array([i]), np.array([0])))
-    return found
-
-
 def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
     """Return the row that states a distance; its joint values are those of a touch of either point."""
     first, second = (touched[name] for name in known.between)
@@ -254,9 +236,7 @@ def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
         second = first
 
     def both(one: Array | None, other: Array | None) -> Array | None:
-        if one is None or other is None:
-            return None
-        return np.concatenate([one, other], axis=1)
+        return None if one is None or other is None else np.concatenate([one, other], axis=1)
 
     return Block(
         known.measurement,
@@ -304,10 +284,7 @@ def touches(
     >>> data.configuration.tolist()
     [0, 1, 0, 1]
     """
-    kind = revisit
-    if planes:
-        kind = revisit_plane
-    data = Dataset.of(q, np.empty((len(q), 0)), sigma, label, kind)
+    data = Dataset.of(q, np.empty((len(q), 0)), sigma, label, revisit_plane if planes else revisit)
     if len(point) != len(data):
         raise InputError("point", f"{len(point)} names", f"{len(data)}, one a touch")
     names = np.array([str(name) for name in point], dtype=object)[:, None]

@@ -5,6 +5,7 @@ Every other module of this folder is one type, which `registry` finds by its ``T
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -38,14 +39,6 @@ class Words(NamedTuple):
 
 
 REFLECTOR = Words()
-
-
-def _difference(y: Any, modelled: Any) -> Any:
-    return y - modelled
-
-
-def _sum(modelled: Array, error: Array) -> Array:
-    return modelled + error
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,8 +144,8 @@ class Measurement(Brief):
     parameters: Mapping[str, str] = field(default_factory=dict)
     frames: tuple[str, ...] = ()
     points: int = 1
-    minus: Callable[[Any, Any], Any] = _difference
-    plus: Callable[[Array, Array], Array] = _sum
+    minus: Callable[[Any, Any], Any] = operator.sub
+    plus: Callable[[Array, Array], Array] = operator.add
     start: Callable[[Array, Array], Mapping[str, float]] | None = None
     forms: tuple[tuple[Mapping[str, str], Callable[[Array], Array]], ...] = ()
     prepare: Callable[[Array], Array] = lambda y: y
@@ -175,12 +168,7 @@ class Measurement(Brief):
 
     @property
     def by_camera(self) -> bool:
-        """Whether a row is where a camera sees a point of a board.
-
-        >>> import rpim_opt as ro
-        >>> [ro.load(name).problem.data.blocks[0].measurement.by_camera for name in ("position", "camera")]
-        [False, True]
-        """
+        """Whether a row is where a camera sees a point of a board."""
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:
@@ -196,16 +184,12 @@ class Measurement(Brief):
 
     def __reduce__(self) -> Any:
         """Ready measurements travel to other processes by name, so that they stay the same there."""
-        known = _ready().get(self.name) is self
-        return (_ready_one, (self.name,)) if known else super().__reduce__()
+        known = _ready(self.name) is self
+        return (_ready, (self.name,)) if known else super().__reduce__()
 
 
-def _ready() -> Mapping[str, Measurement]:
-    return import_module("rpim_opt.data.measurements.registry").READY
-
-
-def _ready_one(name: str) -> Measurement:
-    return _ready()[name]
+def _ready(name: str) -> Measurement | None:
+    return import_module("rpim_opt.data.measurements.registry").READY.get(name)
 
 
 def of_fixture(parameter: str, fixture: str) -> str:

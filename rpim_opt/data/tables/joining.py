@@ -111,14 +111,14 @@ def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
     return columns
 
 
-def _beside(joints: Columns, left: Sequence[int], values: Columns, right: Sequence[int], names: list[str]) -> Columns:
+def _beside(joints: Whole, left: Sequence[int], values: Whole, right: Sequence[int], names: list[str]) -> Columns:
     """Return rows of joints beside rows of measured values, whose columns go before.
 
     Their names are labels where each is another, otherwise configurations.
     """
-    own = {name: cells for name, cells in joints.items() if name not in values}
+    own = {name: cells for name, cells in joints.columns.items() if name not in values.columns}
     whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
-    whole |= {name: [cells[i] for i in right] for name, cells in values.items()}
+    whole |= {name: [cells[i] for i in right] for name, cells in values.columns.items()}
     whole.pop("label", None)
     if len(set(names)) == len(names):
         return {"label": names, **whole}
@@ -143,14 +143,13 @@ def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
         accepted = "--key with a column that both have, --key row, or --time-tolerance for the nearest time"
         raise InputError(f"the key {how}", found, accepted)
     names = [right[i] for i in rows]
-    whole = _beside(joints.columns, [place[name] for name in names], values.columns, rows, names)
     notes = [*joints.notes, *values.notes]
     notes.append(f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured.")
-    known = set(right)
+    known = set(names)
     lonely = [name for name in left if name not in known] + [name for name in right if name not in place]
     if lonely:
         notes.append(f"without a partner, left out: {listed(lonely)}.")
-    return Whole(whole, tuple(notes))
+    return Whole(_beside(joints, [place[name] for name in names], values, rows, names), tuple(notes))
 
 
 def _keys(
@@ -213,7 +212,7 @@ def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str,
         raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
     labels = _labels(values.columns)
     right = pairs.right.tolist()
-    whole = _beside(joints.columns, pairs.left.tolist(), values.columns, right, [labels[i] for i in right])
+    whole = _beside(joints, pairs.left.tolist(), values, right, [labels[i] for i in right])
     note = (
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(pairs.apart).max():.3g} s at most, {pairs.apart.mean():+.3g} s on average."
