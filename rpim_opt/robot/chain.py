@@ -26,15 +26,6 @@ SAME_PLACE = (0.01, 0.1)
 class Described:
     """A robot as a file describes it: what the file calls the tip is at base @ MDH chain(q) @ tool.
 
-    Parameters
-    ----------
-    robot
-        The arm.
-    base, tool
-        (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them.
-    names
-        The file's names of the joints.
-
     Examples
     --------
     >>> import rpim_opt as ro
@@ -45,9 +36,9 @@ class Described:
     """
 
     robot: Robot
-    base: Array
-    tool: Array
-    names: tuple[str, ...] = ()
+    base: Array  # (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them
+    tool: Array  # (6,)
+    names: tuple[str, ...] = ()  # the file's, of the joints
 
 
 @dataclass(frozen=True, eq=False)

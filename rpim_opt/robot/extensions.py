@@ -120,18 +120,9 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
 
     Minus the slope of the potential energy: positive where gravity turns the joint the positive way.
 
-    Parameters
-    ----------
-    robot
-        Its `Gravity` says where gravity points and what it pulls at.
-    q
-        (N, dof) joint values of the controller [rad or m].
-    payload
-        Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
-
-    Returns
-    -------
-    (N, dof) [Nm], about the axes of the table; zero for prismatic joints.
+    At joint values q (N, dof) of the controller [rad or m]; ``payload`` is the mass at the flange [kg], one or (N,),
+    instead of that of the robot's `Gravity`. Returned are (N, dof) [Nm], about the axes of the table; zero for
+    prismatic joints.
 
     Examples
     --------
@@ -210,10 +201,7 @@ def bending_joints(robot: Robot) -> list[int]:
 def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return the parameters of every family that may be added to a robot's geometry, by what they describe.
 
-    Parameters
-    ----------
-    robot
-        The nominal robot; compliances are those of the joints that gravity bends, `bending_joints`.
+    Compliances are those of the joints that gravity bends.
 
     Examples
     --------

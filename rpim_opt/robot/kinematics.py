@@ -187,12 +187,7 @@ def _flange(joint_types: tuple[str, ...]) -> ca.Function:
 def forward_kinematics(robot: Robot, q: Array) -> Array:
     """Return the transforms (N, 4, 4) from the robot's base to its flange, the product of the links of `Robot`.
 
-    Parameters
-    ----------
-    robot
-        The arm; base and tool are no part of it.
-    q
-        (N, dof) joint values of the controller [rad or m].
+    At joint values q (N, dof) of the controller [rad or m]; base and tool are no part of it.
 
     Examples
     --------

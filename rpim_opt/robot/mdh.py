@@ -77,15 +77,10 @@ class Gravity:
             raise InputError("gravity", f"{len(self.masses)} masses, {len(self.centres)} centres", "one centre a mass")
 
     def mounted(self, mounting: str | Sequence[float], base: ArrayLike | None = None) -> Gravity:
-        """Return the same masses on a robot that is mounted so.
+        """Return the same masses on a robot mounted on "floor", "ceiling" or "wall", or where gravity points so (3,).
 
-        Parameters
-        ----------
-        mounting
-            ``"floor"``, ``"ceiling"``, ``"wall"`` (the base's x axis points up), or where gravity points, three numbers
-            in the robot's base.
-        base
-            (3, 3) rotation of frame 0 of the table in the base that is meant, a URDF's root link for instance.
+        The base's x axis points up on a wall. ``base`` (3, 3) is the rotation of frame 0 of the table in the base that
+        is meant, a URDF's root link for instance.
         """
         if isinstance(mounting, str):
             if mounting not in MOUNTINGS:

@@ -269,19 +269,10 @@ class Parameters(Tabled):
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
         """Return the same table with other scales, given as in a problem file's ``[scale]``.
 
-        Parameters
-        ----------
-        table
-            Keys: ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, ``joint_offset_mrad`` for
-            every theta, or a pattern or a parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a
-            pattern, a pattern before a group.
-        file
-            What an error names as the place of the table.
-
-        Raises
-        ------
-        InputError
-            For unknown keys, missing or wrong units, and values that are not greater than zero.
+        Keys are ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, ``joint_offset_mrad`` for
+        every theta, or a pattern or a parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a pattern,
+        a pattern before a group. Unknown keys, missing or wrong units, and values that are not positive are refused; an
+        error names ``file``.
 
         Examples
         --------
@@ -293,9 +284,7 @@ class Parameters(Tabled):
         return replace(self, scale=overlay(self, self.scale, table, "table scale", file=file))
 
     def toleranced(self, table: Mapping[str, float], file: object = None) -> Parameters:
-        """Return the same table with other tolerances, given as in a problem file's ``[tolerance]``.
-
-        Arguments and errors as for `scaled`.
+        """Return the same table with other tolerances, as `scaled` does with scales.
 
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters.toleranced({"length_mm": 0.5})

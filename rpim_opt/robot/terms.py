@@ -53,19 +53,6 @@ class Weight:
 class Posture:
     """An arm in one configuration, as the joints of the model see it.
 
-    Parameters
-    ----------
-    q
-        Joint values of the model [rad or m].
-    torque
-        Measured joint torques [Nm]; None where those of gravity stand for them.
-    approach
-        Directions of the joints' last movement, -1, 0 or +1; None where they are not known.
-    weight
-        Gravity; None for none.
-    columns
-        Further columns of the data by name [SI].
-
     Examples
     --------
     >>> import rpim_opt as ro
@@ -73,11 +60,11 @@ class Posture:
     True
     """
 
-    q: Sequence[Symbol]
-    torque: Sequence[Symbol] | None = None
-    approach: Sequence[Symbol] | None = None
-    weight: Weight | None = None
-    columns: Mapping[str, Symbol] = field(default_factory=dict)
+    q: Sequence[Symbol]  # of the model [rad or m]
+    torque: Sequence[Symbol] | None = None  # measured [Nm]; None where those of gravity stand for them
+    approach: Sequence[Symbol] | None = None  # directions of the last movement, -1, 0 or +1; None where not known
+    weight: Weight | None = None  # gravity; None for none
+    columns: Mapping[str, Symbol] = field(default_factory=dict)  # further columns of the data by name [SI]
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,14 +294,11 @@ def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | N
 
 
 class Curve(NamedTuple):
-    """Where the transmission error of a joint is a Fourier series: `transmission` is the term.
+    """Where the transmission error of a joint is a Fourier series: `transmission` is the term."""
 
-    Joint (from 1), centre and period [rad] of the angles, and the number of harmonics.
-    """
-
-    joint: int
-    centre: float
-    period: float
+    joint: int  # from 1
+    centre: float  # of the angles [rad]
+    period: float  # [rad]
     harmonics: int
 
 
@@ -335,11 +319,6 @@ def transmission(curve: Curve) -> Transmission:
 
     Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
     that f returns to what nobody measured beyond it, and stays there.
-
-    Parameters
-    ----------
-    curve
-        The joint, the angles and the number of harmonics.
 
     Examples
     --------
@@ -378,16 +357,8 @@ def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
 class Model:
     """The kinematics of an arm, opened: the product of its links, with terms of a user's own.
 
-    Parameters
-    ----------
-    terms
-        What moves joints, links, the base or the tool besides the terms that every arm has (``ratio``, ``ecc_cos``,
-        ..., ``compliance``, ``backlash``, ``bend``).
-
-    Raises
-    ------
-    InputError
-        For two parameters of one name, and one column in two dimensions.
+    ``terms`` move joints, links, the base or the tool besides those that every arm has (``ratio``, ``ecc_cos``, ...,
+    ``compliance``, ``backlash``, ``bend``); two parameters of one name, or one column in two dimensions, are refused.
 
     Examples
     --------
@@ -436,13 +407,7 @@ class Model:
         return tuple(term.curve for term in self.terms if isinstance(term, Transmission))
 
     def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of all its parameters.
-
-        Parameters
-        ----------
-        joint_types
-            Of the arm.
-        """
+        """Return the names of all its parameters on an arm with these joints."""
         return tuple(name for name, _ in entries_of(self, joint_types))
 
 

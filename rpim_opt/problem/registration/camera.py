@@ -60,17 +60,8 @@ def view_pose(points: Array, xy: Array) -> Array:
     By a homography for points in a plane, the direct linear transform for others, and least squares from there; of a
     plane's two poses that look alike the one that fits better.
 
-    Parameters
-    ----------
-    points
-        (P, 3) on the board [m].
-    xy
-        (P, 2) directions, as `normalized` has them.
-
-    Raises
-    ------
-    InputError
-        For fewer than four points of a plane, or six in space, and points on a line.
+    ``points`` are (P, 3) on the board [m], ``xy`` (P, 2) directions, as `normalized` has them. Refused are fewer than
+    four points of a plane, or six in space, and points on a line.
 
     Examples
     --------

@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye
-from rpim_opt.problem.registration.loops import FULL, LOSSES, Loops, Solved, Solver, of_motions, of_poses
+from rpim_opt.problem.registration.loops import LOSSES, Loops, Solved, of_motions, of_poses, solve
 
 GAP = 1e-3
 """What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
@@ -35,32 +35,9 @@ class CertifiedStart:
         bound <= cost of any bases, tools and scale whatever
         gap    = (cost - bound) / (1 + cost)
 
-    Parameters
-    ----------
-    bases
-        (4, 4) transform of the robot's base in each instrument's frame [m], by instrument.
-    tools
-        (4, 4) transform of each tool or target in the flange frame [m], by marker; not turned where positions alone
-        were measured.
-    scale
-        The metre's part that the instrument calls one; 1 unless it was asked for.
-    cost, bound, gap
-        As above. Where a loss weighs outliers, the bound is that of the sum of squares with the final weights.
-    rank_ratio
-        Second over first eigenvalue of the moment matrix: zero where the relaxation is tight and the optimum the only
-        one.
-    uncertainty
-        Standard deviation of the least certain rotation [rad].
-    radius
-        Angle [rad] from these rotations beyond which all others fit worse by more than noise explains; proven as the
-        bound is.
-    weights
-        (N,) that the loss gives the measurements; one for those that count in full.
-    certified
-        Whether the optimum is global, the only one and determined, and, where outliers were expected, so many
-        measurements agree with it that no other can have as many.
-    reason
-        Why it is certified or not, in a sentence.
+    Angles are in rad; ``bound`` and ``radius`` are proven. Where outliers are left out, the bound is that of the sum of
+    squares of the others. ``certified`` says that the optimum is global, the only one and determined, and, where
+    outliers were expected, that so many measurements agree with it that no other can have as many.
 
     Examples
     --------
@@ -73,18 +50,18 @@ class CertifiedStart:
     (True, True)
     """
 
-    bases: Mapping[str, Array]
-    tools: Mapping[str, Array]
-    scale: float
+    bases: Mapping[str, Array]  # (4, 4) transform of the robot's base in each instrument's frame [m], by instrument
+    tools: Mapping[str, Array]  # (4, 4) of each target in the flange frame, by marker; not turned by positions alone
+    scale: float  # the metre's part that the instrument calls one; 1 unless it was asked for
     cost: float
     bound: float
     gap: float
-    rank_ratio: float
-    uncertainty: float
-    radius: float
-    weights: Array
+    rank_ratio: float  # second over first eigenvalue of the moment matrix: zero where the relaxation is tight
+    uncertainty: float  # standard deviation of the least certain rotation
+    radius: float  # angle from these rotations beyond which all others fit worse by more than noise explains
+    weights: Array  # (N,) that the loss gives the measurements; one for those that count
     certified: bool
-    reason: str
+    reason: str  # why it is certified or not, in a sentence
 
 
 def _judged(
@@ -97,7 +74,7 @@ def _judged(
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
     radius = best.radius(float(chdtri(loops.unknowns, AS_WELL)))
-    full = int(np.sum(solved.weights > FULL))
+    full = int(np.sum(solved.weights))
     several = solved.weights.min() < 1 and not solved.alone
     doubts = {
         f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
@@ -106,7 +83,7 @@ def _judged(
         f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
         f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
         "the measurements do not determine the scale": scale <= 0,
-        "the weights of the loss did not settle": not solved.settled,
+        "the weights of the loss did not converge": not solved.settled,
         f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
     }
     doubt = next((text for text, true in doubts.items() if true), "")
@@ -154,20 +131,19 @@ def certified_hand_eye(
     flange
         (N, 4, 4) transforms of the flange in the robot's base [m].
     measured
-        (N, 4, 4) of the tool in the instrument's frame; or positions (N, 3), whose loops end with r's first part.
-        A pose without orientation has NaN for its rotation.
+        (N, 4, 4) of the tool in the instrument's frame, NaN for rotations that were not measured; or positions (N, 3).
     marker, instrument
         (N,) names of what was seen (reflector, target) and by what (camera); by default one of each.
     sigma
         Standard deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of
-        the robot, which is not as its drawing says.
+        the robot, which differs from the nominal one.
     expected, spread
         (3,) where markers are in the flange frame [m], and the standard deviation of that [m]. A direction that the
         measurements do not show stays there in any case.
     scaled
         Whether the unit of the instrument's lengths is unknown.
     loss
-        "squares", "huber" or "truncated", which leaves out what is wrong.
+        "squares", or "truncated", which leaves outliers out.
 
     Raises
     ------
@@ -201,7 +177,7 @@ def certified_hand_eye(
         with suppress(InputError):
             Z, X = hand_eye(flange, measured)
             candidates.append(np.stack([Z[:3, :3], X[:3, :3].T]))
-    solved = Solver(loops, loss).solve(candidates)
+    solved = solve(loops, loss, candidates)
     R = solved.smallest.rotations
     count = len(instruments)
     scale = 1 / solved.v[loops.linear - 1] if scaled else 1.0
@@ -243,7 +219,7 @@ def certified_motions(
     scaled
         Whether the unit of lengths in B is unknown (a single camera).
     loss
-        "squares", "huber" or "truncated".
+        "squares" or "truncated".
 
     Raises
     ------
@@ -270,7 +246,7 @@ def certified_motions(
         raise InputError("B", "motions without a rotation", "rotations of all motions")
     place = np.asarray(expected, dtype=float)
     loops = of_motions(A, B, _deviations(sigma, len(A)), place, spread, scaled)
-    solved = Solver(loops, loss).solve()
+    solved = solve(loops, loss)
     scale = 1 / solved.v[3] if scaled else 1.0
     tool = _transform(solved.smallest.rotations[0], solved.v[:3] * scale)
     return _judged(solved, loops, {}, {"": tool}, scale)

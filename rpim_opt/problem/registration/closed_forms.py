@@ -21,17 +21,8 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
 
     The rotation is proper (det R = 1), by singular value decomposition (Umeyama 1991, IEEE PAMI 13:376).
 
-    Parameters
-    ----------
-    source, target
-        (N, 3) points [m].
-    weights
-        (N,) q_i; 1 by default.
-
-    Raises
-    ------
-    InputError
-        For fewer than three points, points that coincide, or points on a line: their rotation is arbitrary.
+    ``source`` and ``target`` are N points (N, 3) [m], ``weights`` (N,) q_i, 1 by default. Refused are fewer than three
+    points, points that coincide, and points on a line: their rotation is arbitrary.
 
     Examples
     --------
@@ -69,20 +60,9 @@ def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), 
     Minimizes the differences of measured and modelled distances, | |y_j - y_i| - |p_j - p_i + (R_j - R_i) o| |^2,
     over pairs of configurations, by Levenberg-Marquardt from ``start``.
 
-    Parameters
-    ----------
-    flange
-        (N, 4, 4) transforms of the flange [m].
-    points
-        (N, 3) measured positions [m], in any frame.
-    start, spread
-        (3,) where the offset is expected [m], and its standard deviation [m] against errors of the distances of 5 mm:
-        a direction that the configurations do not show stays there.
-
-    Raises
-    ------
-    InputError
-        For fewer than two configurations.
+    ``flange`` are (N, 4, 4) transforms [m], ``points`` (N, 3) measured positions in any frame [m]; ``start`` (3,) is
+    where the offset is expected, and ``spread`` the standard deviation of that against errors of the distances of 5 mm
+    [m]: a direction that the configurations do not show stays there. Refused are fewer than two configurations.
 
     Examples
     --------
@@ -117,17 +97,9 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     Rotations by the Kronecker product and one singular value decomposition (Shah 2013, J. Mechanisms and
     Robotics 5:031007), translations by linear least squares, the tool's as near to ``start`` as the data allow.
 
-    Parameters
-    ----------
-    flange, measured
-        (N, 4, 4) transforms of the flange in the base, and of the tool in the instrument's frame.
-    start
-        (3,) expected offset of the tool [m].
-
-    Raises
-    ------
-    InputError
-        For fewer than three poses, or rotations about one axis only.
+    ``flange`` and ``measured`` are (N, 4, 4) transforms of the flange in the base, and of the tool in the instrument's
+    frame; ``start`` (3,) is the expected offset of the tool [m]. Refused are fewer than three poses, and rotations
+    about one axis only.
 
     Examples
     --------
@@ -151,7 +123,7 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     if s[1] > (1 - 1e-6) * s[0]:
         raise InputError("poses", "rotations about one axis only", "poses turned about two axes")
     V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
-    sign = 1.0 if np.linalg.det(V) > 0 else -1.0
+    sign = np.sign(np.linalg.det(V))
     Z, X = np.eye(4), np.eye(4)
     Z[:3, :3], X[:3, :3] = proper(sign * V), proper(sign * W).T
     A = np.concatenate([np.hstack([Z[:3, :3] @ R, np.eye(3)]) for R in RA])

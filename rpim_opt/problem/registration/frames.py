@@ -354,14 +354,9 @@ def starting_parameters(
         Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
         parameters is stated is located from the nominal robot.
     temperature
-        At which lengths are as on the drawing [K], where the data state temperatures; their mean by default.
+        At which lengths are nominal [K], where the data state temperatures; their mean by default.
     sessions
         Names of sessions that are not among the data, where these are the first of several parts.
-
-    Raises
-    ------
-    InputError
-        For a marker of the data without a reflector, and data that do not determine what they have to.
 
     Examples
     --------
@@ -504,18 +499,9 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
         minimize    |Sigma^-1/2 r(S z)|^2 + |z|^2
 
-    over the identified parameters of base, reflectors, anchors and the like, in units of their scales; the robot is as
-    its drawing says. By Marquardt's damped Gauss-Newton steps.
-
-    Parameters
-    ----------
-    problem
-        In memory or in parts. One that identifies no frame comes back as it is, at nominal.
-
-    Returns
-    -------
-    The problem of the frames (all other parameters nominal; where frames were stated far off, counted from where the
-    data put them, `relocated`), and the deviations (f,) [SI].
+    over the identified parameters of base, reflectors, anchors and the like, in units of their scales, of the nominal
+    robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off are
+    counted from where the data put them) and the deviations (f,) [SI]; one without frames comes back as it is.
 
     Examples
     --------

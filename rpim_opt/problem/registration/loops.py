@@ -18,24 +18,20 @@ from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, 
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
 SINGULAR = 1e-13
-LOSSES = ("squares", "huber", "truncated")
-QUANTILES = {"huber": 0.90, "truncated": 0.99}
-"""Which part of good measurements a loss leaves as they are: the squares of their errors are chi-squared."""
+LOSSES = ("squares", "truncated")
+QUANTILE = 0.99
+"""Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
 GRADUATION = 1.6
 """Factor by which the truncated loss comes nearer to itself from one iteration to the next."""
 MOST_ITERATIONS = 100
-FULL = 0.999
-"""Weight from which a measurement agrees."""
 SETTLED = 1e-6
-"""Change of weights below which they have converged."""
+"""Costs that differ by less, relatively, are one."""
 FEWEST = 3
 """Measurements that have to have a weight."""
 MOST_PAIRED = 2000
 """Measurements up to which all pairs are compared."""
-FEW = 10
-"""Measurements of which each is left out in turn, and how many sets are begun with at most."""
-ASKED = 40
-"""Measurements, evenly spread, of which is asked what they go with."""
+ASKED, FEW = 40, 10
+"""Measurements, evenly spread, of which is asked what they go with, and sets that are begun with then."""
 ROUNDING = 1e-7
 """Error of an angle from its cosine [rad]."""
 SURPRISE = 1e-4
@@ -227,22 +223,6 @@ def likeliest(pairs: np.ndarray) -> np.ndarray:
     return core(pairs, bisect_left(counts, True, key=lambda count: not core(pairs, count).any()) - 1)
 
 
-def _likely(pairs: np.ndarray, among: np.ndarray) -> list[np.ndarray]:
-    """Return smaller sets (N,) to begin with, the larger first: the likeliest of those that one of some goes with.
-
-    And, where some are few, all but one of them: turning alike, it may be wrong all the same.
-    """
-    sets = []
-    members = np.flatnonzero(among)
-    for each in members[:: 1 + len(members) // ASKED]:
-        near = np.flatnonzero(pairs[each])
-        sets.append(np.isin(np.arange(len(pairs)), near[likeliest(pairs[np.ix_(near, near)])]))
-    if len(members) <= FEW:
-        sets += [among & (np.arange(len(pairs)) != each) for each in members]
-    distinct = {each.tobytes(): each for each in sets if np.sum(each) >= FEWEST and not np.array_equal(each, among)}
-    return sorted(distinct.values(), key=lambda each: -int(np.sum(each)))[:FEW]
-
-
 def _alone(loops: Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
     """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
 
@@ -272,124 +252,95 @@ class Solved:
     alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
 
 
-@dataclass(frozen=True, eq=False)
-class Solver:
-    """The least of a loss of |J_i v|, global where it is the sum of squares and the bound meets it.
+def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
+    """Return the least of a loss of r = |J_i v|, global where it is the sum of squares and the bound meets it.
 
     ::
 
-        squares    r^2                                    r = |J_i v|
-        huber      r^2,  2 c r - c^2 beyond c             c^2 a quantile of chi-squared
-        truncated  min(r^2, c^2)
+        squares    r^2
+        truncated  min(r^2, c^2)        c^2 a quantile of chi-squared
 
-    From the relaxation's optimum of the squares Huber's loss follows repeated weights c / r, and the truncated loss
-    graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127), by Newton's steps; the last weighted problem is the
-    relaxation's again. The truncated loss begins with the largest core of measurements that turn alike, and if not all
-    of that agree, with all of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
+    The truncated loss begins with the largest core of measurements that turn alike, and if not all of that agree, with
+    all of them and parts of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
     """
+    every = np.ones(len(loops.rows), dtype=bool)
+    if loss == "squares":
+        return Solver(loops, np.full(len(every), np.inf)).weighted(every.astype(float), candidates)
+    beyond = chdtri(loops.equations, 1 - QUANTILE)
+    solver = Solver(loops, beyond)
+    pairs = compatible(loops, beyond)
+    first = likeliest(pairs)
+    found = [solver.graduated(first), *filter(None, map(solver.begun, candidates))]
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(solver.graduated(every))
+    most = max(each.weights.sum() for each in found)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // ASKED]]
+        parts = sorted(np.unique([likeliest(some) for some in around], axis=0), key=np.sum)[-FEW:]
+        found += [solver.graduated(part) for part in parts if part.sum() >= FEWEST]
+    least = min(each.cost for each in found)
+    best = next(each for each in found if each.cost * (1 - SETTLED) <= least)  # the first, up to rounding
+    return replace(best, alone=_alone(loops, best.squares, best.weights > 0, beyond))
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Weighted sums of squares of loops, and the truncated loss by them; ``beyond`` (N,) are the c^2."""
 
     loops: Loops
-    loss: str
+    beyond: Array
 
-    def solve(self, candidates: Sequence[Array] = ()) -> Solved:
-        """Return the least of the loss."""
-        every = np.ones(len(self.loops.rows))
-        if self.loss == "squares":
-            return self._weighted(every, candidates)
-        if self.loss == "huber":
-            found = self._repeated(self._weighted(every, candidates))
-        else:
-            found = self._truncated(candidates)
-        return replace(found, alone=_alone(self.loops, found.squares, found.weights > FULL, self._beyond))
-
-    @property
-    def _beyond(self) -> Array:
-        """Squares (N,) from which the loss is no square."""
-        return chdtri(self.loops.equations, 1 - QUANTILES[self.loss])
-
-    def _weights(self, squares: Array) -> Array:
-        if self.loss == "huber":
-            return np.sqrt(self._beyond / np.maximum(squares, self._beyond))
-        return (squares <= self._beyond).astype(float)
-
-    def _cost(self, v: Array, squares: Array) -> float:
-        losses = squares
-        if self.loss == "truncated":
-            losses = np.minimum(squares, self._beyond)
-        elif self.loss == "huber":
-            straight = 2 * np.sqrt(self._beyond * squares) - self._beyond
-            losses = np.where(squares > self._beyond, straight, squares)
-        return float(np.sum(losses) + np.sum((self.loops.prior @ v) ** 2))
-
-    def _weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> Solved:
-        """Return the solution of a weighted sum of squares: by the relaxation, or from rotations near it."""
+    def weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> Solved:
+        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps from rotations."""
         triangle = self.loops.triangle(weights)
         L = self.loops.form(triangle)
         best = smallest(L, candidates) if near is None else nearest(L, near)
         v = self.loops.completed(triangle, lifted(best.rotations))
         squares = self.loops.squares(v)
-        return Solved(v, best, weights, squares, self._cost(v, squares))
+        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.loops.prior @ v) ** 2))
+        return Solved(v, best, weights, squares, cost)
 
-    def _repeated(self, solved: Solved) -> Solved:
+    def repeated(self, solved: Solved) -> Solved:
         """Return the fixed point of weights and solution, the last of which is the relaxation's."""
         settled = False
         for _ in range(MOST_ITERATIONS):
-            weights = self._weights(solved.squares)
-            if np.sum(weights > 0) < FEWEST:
+            weights = (solved.squares <= self.beyond).astype(float)
+            if weights.sum() < FEWEST:
                 break
-            if np.max(np.abs(weights - solved.weights)) >= SETTLED:
-                solved = self._weighted(weights, near=solved.smallest.rotations)
+            if not np.array_equal(weights, solved.weights):
+                solved = self.weighted(weights, near=solved.smallest.rotations)
                 continue
             settled = bool(np.isfinite(solved.smallest.bound))
             if settled:
                 break
-            solved = self._weighted(weights, [solved.smallest.rotations])
+            solved = self.weighted(weights, [solved.smallest.rotations])
         if not np.isfinite(solved.smallest.bound):
-            solved = self._weighted(solved.weights, [solved.smallest.rotations])
+            solved = self.weighted(solved.weights, [solved.smallest.rotations])
         return replace(solved, settled=settled)
 
-    def _truncated(self, candidates: Sequence[Array]) -> Solved:
-        """Return the least of the truncated loss from the likeliest measurements, all of them, and candidates.
+    def graduated(self, among: np.ndarray) -> Solved:
+        """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
 
-        Where too few of the likeliest agree with that, parts of them are begun with, too.
+        Losses of some measurements (N,) from squares to the truncated one, each from the last: that of parameter mu has
+        weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them sqrt(mu (mu + 1) c^2 / r^2) - mu.
         """
-        pairs = compatible(self.loops, self._beyond)
-        first = likeliest(pairs)
-        found = [self._graduated(first), *filter(None, map(self._from, candidates))]
-        if not np.array_equal(found[0].weights > 0, first):
-            found.append(self._graduated(np.ones(len(pairs), dtype=bool)))
-        best = _least(found)
-        if best.weights.sum() < first.sum() - 1:
-            best = _least([best, *map(self._graduated, _likely(pairs, first))])
-        return best
-
-    def _graduated(self, among: np.ndarray) -> Solved:
-        """Return a least of the truncated loss: losses of some (N,) from squares to it, each from the last.
-
-        The loss of parameter mu has weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them
-        sqrt(mu (mu + 1) c^2 / r^2) - mu.
-        """
-        solved = self._weighted(among.astype(float))
-        mu = 1 / max(2 * float(np.max(among * solved.squares / self._beyond)) - 1, 1e-3)
+        solved = self.weighted(among.astype(float))
+        mu = 1 / max(2 * float(np.max(among * solved.squares / self.beyond)) - 1, 1e-3)
         for _ in range(MOST_ITERATIONS):
-            between = np.sqrt(mu * (mu + 1) * self._beyond / np.maximum(solved.squares, 1e-300)) - mu
+            between = np.sqrt(mu * (mu + 1) * self.beyond / np.maximum(solved.squares, 1e-300)) - mu
             weights = among * np.clip(between, 0.0, 1.0)
             if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
                 break
-            solved = self._weighted(weights, near=solved.smallest.rotations)
+            solved = self.weighted(weights, near=solved.smallest.rotations)
             mu *= GRADUATION
-        return self._repeated(solved)
+        return self.repeated(solved)
 
-    def _from(self, rotations: Array) -> Solved | None:
+    def begun(self, rotations: Array) -> Solved | None:
         """Return the least of the truncated loss near rotations; None where fewer than three measurements are near."""
-        triangle = self.loops.triangle(np.ones(len(self.loops.rows)))
-        weights = self._weights(self.loops.squares(self.loops.completed(triangle, lifted(rotations))))
-        if np.sum(weights) < FEWEST:
+        triangle = self.loops.triangle(np.ones(len(self.beyond)))
+        squares = self.loops.squares(self.loops.completed(triangle, lifted(rotations)))
+        weights = (squares <= self.beyond).astype(float)
+        if weights.sum() < FEWEST:
             return None
-        return self._repeated(self._weighted(weights, [rotations]))
-
-
-def _least(found: Sequence[Solved]) -> Solved:
-    """Return the first of those that cost least, up to rounding."""
-    least = min(each.cost for each in found)
-    return next(each for each in found if each.cost * (1 - SETTLED) <= least)
+        return self.repeated(self.weighted(weights, [rotations]))

@@ -283,18 +283,8 @@ def write_robot(robot: Robot, path: str | Path) -> None:
 
     Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere.
 
-    Parameters
-    ----------
-    robot
-        The robot, `Calibration.robot` for instance.
-    path
-        The file; whole or not written at all.
-
-    Raises
-    ------
-    InputError
-        For another ending, one of two limits infinite, or in CSV, which has no place for them, a coupling of joints,
-        a mounting other than on the floor, a payload.
+    The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV, which
+    has no place for them, a coupling of joints, a mounting other than on the floor, and a payload.
 
     Examples
     --------
@@ -331,21 +321,8 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     (``SetRobotParams(robot, dhm, poseBase, poseTool)``, RoboDK/RoboDK-API, C#), but documents neither the columns'
     order nor a file that can be read: transfer the numbers by name, and compare a pose before you rely on them.
 
-    Parameters
-    ----------
-    robot
-        The robot, `Calibration.robot` for instance.
-    path
-        The CSV file.
-
-    Returns
-    -------
-    A warning where axes are so nearly parallel that rounded numbers lose the robot.
-
-    Raises
-    ------
-    InputError
-        For signs or couplings of joints, and what `without_beta` refuses.
+    Returned is a warning where axes are so nearly parallel that rounded numbers lose the robot; refused are signs or
+    couplings of joints, and a beta after the last joint.
 
     Examples
     --------

@@ -59,19 +59,11 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of the chain's highest link, wherever the first
     axis points, and pulls at the masses that the file states; where joints move the base itself, no masses are read.
 
-    Parameters
-    ----------
-    path
-        A URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults (``rpim-opt[xacro]``).
-    base, tip
-        Names of any two links; the root, and the only leaf below the base.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the element, what was found and what is accepted: no URDF, document types and entities, links
-        or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
-        or mimic joints between base and tip, no or several candidates for base or tip.
+    ``path`` is a URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults
+    (``rpim-opt[xacro]``); ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the
+    base. An error names the file, the element, what was found and what is accepted: document types and entities, links
+    or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints or
+    mimic joints between base and tip, no or several candidates for base or tip.
 
     Examples
     --------
@@ -115,8 +107,7 @@ def write_urdf(
         The original, or a file ``.xacro``: then what it expands to is. Its `read_urdf` with the same base and tip has
         to be the robot whose parameters were identified.
     robot
-        The robot with identified parameters, `Calibration.robot` or `use.identified`, which refuses what
-        a URDF cannot express.
+        The robot with identified parameters, `Calibration.robot` or `use.identified`.
     target
         Where to write; may be ``source``, unless that is a xacro file.
     base, tip
@@ -124,11 +115,7 @@ def write_urdf(
     base_frame, tool_frame
         (6,) identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; those of the original where not given.
 
-    Raises
-    ------
-    InputError
-        As `read_urdf`, and for another robot, couplings, or a tool or last beta for which the chain has no fixed
-        joint after its last moving one.
+    Refused are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
 
     Examples
     --------
