@@ -100,22 +100,17 @@ class _Vectorized(NamedTuple):
     shapes: tuple[tuple[int, int], ...]
 
 
-class _Effort:
-    """Rows at which a function was evaluated."""
-
-    rows = 0
-
-
 @lru_cache(maxsize=256)
-def _effort(_: ca.Function) -> _Effort:
-    return _Effort()
+def _evaluated(_: ca.Function) -> list[int]:
+    """Return a list with the number of rows at which a function was evaluated, to be counted up."""
+    return [0]
 
 
 def _quickest(function: ca.Function, shared: int, rows: int) -> _Vectorized | None:
     """Return how a function is evaluated at some rows more; None for one row after the other."""
-    effort = _effort(function)
-    effort.rows += rows
-    if effort.rows < PAYS:
+    evaluated = _evaluated(function)
+    evaluated[0] += rows
+    if evaluated[0] < PAYS:
         return None
     width = WIDTH
     while rows <= width // 2 and width > NARROW:  # few of them are evaluated for nothing
@@ -153,7 +148,8 @@ def _widen(scalar: ca.Function, width: int) -> ca.Function | None:
         source = scalar.instruction_input(k)
         target = scalar.instruction_output(k)
         if operation == ca.OP_OUTPUT:
-            outputs[target[1]] = _dense(values[source[0]], width)
+            dense = ca.densify(values[source[0]])
+            outputs[target[1]] = dense if dense.numel() == width else ca.repmat(dense, width, 1)
         elif operation == ca.OP_INPUT:
             values[target[0]] = inputs[source[0]][source[1]]
         elif operation == ca.OP_CONST:
@@ -168,50 +164,30 @@ def _widen(scalar: ca.Function, width: int) -> ca.Function | None:
     return ca.Function("vectorized", [common, table], [ca.horzcat(*outputs)])
 
 
-def _dense(values: ca.MX, width: int) -> ca.MX:
-    """Return a number of every row (width, 1), where it may be one for all."""
-    values = ca.densify(values)
-    if values.numel() == width:
-        return values
-    return ca.repmat(values, width, 1)
-
-
 class _Memory:
-    """Inputs and outputs of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width)."""
+    """Inputs and outputs of both functions in one thread: ``table`` (k, width) gives ``numbers`` (n, width).
+
+    They are set once: CasADi takes longer to set them than to evaluate.
+    """
 
     def __init__(self, vectorized: _Vectorized):
         common, rows = vectorized.common, vectorized.rows
-        self.constants = np.zeros(rows.size1_in(0))
-        self.width = vectorized.width
+        constants = np.zeros(rows.size1_in(0))
         self.shared = [np.zeros(common.size1_in(i)) for i in range(common.n_in())]
-        self.table = np.zeros((rows.size2_in(1), self.width))
-        self.numbers = np.zeros((rows.size2_out(0), self.width))
-        self._common = _buffer(common, self.shared, self.constants)
-        self._rows = _buffer(rows, [self.constants, self.table], self.numbers)
-
-    def share(self, shared: Sequence[Array]) -> None:
-        """Take the inputs that are the same for all rows."""
-        for own, values in zip(self.shared, shared, strict=True):
-            own[:] = values
-        self._common[1]()
-
-    def evaluate(self, rows: Array) -> Array:
-        """Return the numbers (n, N) of at most ``width`` rows (N, k); the last one stands for those missing."""
-        N = len(rows)
-        self.table[:, :N] = rows.T
-        self.table[:, N:] = rows[-1][:, None]
-        self._rows[1]()
-        return self.numbers[:, :N]
+        self.table = np.zeros((rows.size2_in(1), vectorized.width))
+        self.numbers = np.zeros((rows.size2_out(0), vectorized.width))
+        self.common = _buffer(common, self.shared, constants)
+        self.rows = _buffer(rows, [constants, self.table], self.numbers)
 
 
 def _buffer(function: ca.Function, inputs: Sequence[Array], output: Array) -> Any:
-    """Return a buffer and what evaluates the function in it; both and the arrays have to be kept."""
+    """Return a buffer, what evaluates the function in it, and the arrays, all of which have to be kept."""
     made: tuple[Any, Any] = function.buffer()  # CasADi's stubs ask for sizes, which its wrapper takes from the arrays
     buffer, trigger = made
     for i, values in enumerate(inputs):
         buffer.set_arg(i, values.data)
     buffer.set_res(0, output.data)
-    return buffer, trigger
+    return trigger, buffer, inputs, output
 
 
 @lru_cache(maxsize=64)
@@ -226,10 +202,17 @@ def _evaluate(
 
     def evaluate(begin: int) -> None:
         memory = _memory(vectorized, threading.get_ident())
-        memory.share(shared)
-        for start in range(begin, min(begin + SHARE, len(rows)), memory.width):
-            part = slice(start, min(start + memory.width, begin + SHARE))
-            numbers = memory.evaluate(rows[part])
+        for own, values in zip(memory.shared, shared, strict=True):
+            own[:] = values
+        memory.common[0]()
+        end = min(begin + SHARE, len(rows))
+        for start in range(begin, end, vectorized.width):
+            part = slice(start, min(start + vectorized.width, end))
+            count = part.stop - start
+            memory.table[:, :count] = rows[part].T
+            memory.table[:, count:] = rows[part.stop - 1][:, None]  # stands for those missing
+            memory.rows[0]()
+            numbers = memory.numbers[:, :count]
             if factors is not None:
                 numbers *= factors[:, None]
             for into, values in zip(results, _split(numbers, results), strict=True):
