@@ -277,8 +277,11 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
         members = np.flatnonzero(first)
         around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // ASKED]]
-        parts = sorted(np.unique([likeliest(some) for some in around], axis=0), key=np.sum)[-FEW:]
-        found += [solver.graduated(part) for part in parts if part.sum() >= FEWEST]
+        parts = [likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        found += [solver.graduated(part) for part in distinct if part.sum() >= FEWEST]
     least = min(each.cost for each in found)
     best = next(each for each in found if each.cost * (1 - SETTLED) <= least)  # the first, up to rounding
     return replace(best, alone=_alone(loops, best.squares, best.weights > 0, beyond))
