@@ -150,7 +150,7 @@ ELSEWHERE = {
     "rpim_opt.calibration.acceptance",
     "rpim_opt.calibration.expected",
     "rpim_opt.calibration.group_weights",
-    "rpim_opt.convex.conflict",
+    "rpim_opt.convex.infeasible",
     "rpim_opt.bayes.population",
     "rpim_opt.convex.tolerances",
     "rpim_opt.robot.formats.urdf",

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rpim_opt import cli
-from rpim_opt.convex.solvers.small import Unsolved
+from rpim_opt.convex.solvers.conic import Unsolved
 from rpim_opt.store.problem_file import problems_folder
 
 KEYS = {"nominal", "identification", "validation", "weight", "selector", "formulation", "converged", "iterations",

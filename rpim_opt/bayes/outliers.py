@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.trust import RARE
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, error_dimensions

@@ -11,10 +11,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.statements import listed
-from rpim_opt.convex.atoms import SQUARES, cp, named
 from rpim_opt.convex.constraints import Ready
+from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
-from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 

@@ -18,9 +18,8 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration.at_weight import calibrated
 from rpim_opt.calibration.loop import Iteration, Options, nearby, require_finite, require_start
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.formulation import Formulation, tikhonov
-from rpim_opt.convex.named import formulation_of, weight_of
-from rpim_opt.convex.select import Selector
+from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
+from rpim_opt.convex.select import Selector, weight_of
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
 from rpim_opt.problem.source import Source

@@ -14,7 +14,7 @@ from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.convex.terms import term
+from rpim_opt.convex.expressions import term
 from rpim_opt.convex.trust import SMALL
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_equations

@@ -15,10 +15,9 @@ from rpim_opt.basics.threads import phase
 from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.majorize import Squares, on_triangles
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
-from rpim_opt.convex.trust import trusted_rows
+from rpim_opt.convex.trust import Squares, trusted_rows
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.parts import in_parts
@@ -273,14 +272,10 @@ class Loop:
         bend = (ahead - (model.b - model.A @ state.z) + CURVATURE_STEP * along) / CURVATURE_STEP**2
         if not np.isfinite(bend).all() or np.linalg.norm(bend) <= CURVATURE * np.linalg.norm(along):
             return straight
-        by = None
-        if self.options.solver is None:
-            by = state.program.moved(bend, state.choice.weight, _term(state))
-        if by is None:
-            try:
-                by = self._solved(state.program.on(model.with_values(model.b + bend)), state) - straight
-            except NoSolutionFound:
-                return straight
+        try:
+            by = self._solved(state.program.on(model.with_values(model.b + bend)), state) - straight
+        except NoSolutionFound:
+            return straight
         if 2 * np.linalg.norm(state.size * by) > CURVATURE_TURN * np.linalg.norm(state.size * step):
             return straight
         return straight + by
@@ -397,7 +392,7 @@ def minimize(
     those of the solution. Where solutions jump to and fro, the next round linearizes between them.
     """
     ended = _certified(problem, formulation, weight, start, options, (start, None))
-    if not ended.state.program.predicts:
+    if not ended.state.program.structure.predicts:
         return ended
     history = ended.state.history
     about = farthest = ended.x
@@ -437,7 +432,7 @@ def _certified(
     loop, state = _rested(problem, formulation, weight, start, options, about)
     model, residual = state.program.model, None
     if loop.reweigh is not None:
-        formulation, _ = on_triangles(formulation, lambda: state.program.model.equations)
+        formulation, _ = in_blocks(formulation, lambda: state.program.model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = problem.frozen()
         model = around(anew.linearize(loop.scale * state.z), *about)
@@ -463,7 +458,7 @@ def _rested(
     source = in_parts(problem.frozen())
     solved, reweigh = formulation, None
     if not source.keeps_rows:
-        solved, reweigh = on_triangles(formulation, lambda: sum(len(part.owners) for part in source.rows()))
+        solved, reweigh = in_blocks(formulation, lambda: sum(len(part.owners) for part in source.rows()))
     loop = Loop(source, formulation, reweigh, options, about)
     try:
         state = begun(loop, solved, weight_choice(weight, formulation.penalty is not None), start)

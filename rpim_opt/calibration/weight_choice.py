@@ -8,10 +8,9 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import phase
-from rpim_opt.convex.named import selector_of
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
-from rpim_opt.convex.select import Selection, Selector
+from rpim_opt.convex.select import Selection, Selector, selector_of
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this share of the solution, then stays."""

@@ -12,9 +12,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display, fits
-from rpim_opt.convex.atoms import cp
+from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
-from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.workspace import within_box, within_ranges
 from rpim_opt.robot.parameters import Parameters
 

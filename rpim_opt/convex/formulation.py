@@ -11,8 +11,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.text import Brief, counted
-from rpim_opt.convex.atoms import ATOMS, LARGEST, NORM1, SQUARES, SUM, cp, named
 from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
+from rpim_opt.convex.expressions import ATOMS, LARGEST, NORM1, SQUARES, SUM, cp, named
 from rpim_opt.robot.parameters import Parameters
 
 Function = Callable[[Any], Any]

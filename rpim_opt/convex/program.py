@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,41 +15,37 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import Brief
 from rpim_opt.basics.threads import one_blas_thread, phase
-from rpim_opt.convex.atoms import OPTIMAL, cp
 from rpim_opt.convex.constraints import Box
+from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
-from rpim_opt.convex.posed import Posed, Unposed, posed
-from rpim_opt.convex.quadratic import Ridge, ridge
-from rpim_opt.convex.solvers.newton import Rows
-from rpim_opt.convex.solvers.small import Squares, Unsolved, nearest
+from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
+from rpim_opt.convex.solvers.conic import Damping, Squares, Unsolved, box_sides, nearest
+from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import Minimum, Warm, minimum
-from rpim_opt.convex.structure import Quadratic
-from rpim_opt.convex.terms import substituted
+from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.convex.trust import Trusted, kept_equations, outlying
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
-FAR_APART = 1e-6
-"""Ratio of pivots below which a formula for the change of a minimum is not trusted."""
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 DIFFERENCE = 1e-4
 """Change of a solution, in scales, over which it is differentiated."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
+STATUS = {
+    "PrimalInfeasible": "infeasible",
+    "AlmostPrimalInfeasible": "infeasible_inaccurate",
+    "DualInfeasible": "unbounded",
+    "AlmostDualInfeasible": "unbounded",
+}
+"""CVXPY's words for Clarabel's."""
 
 
 def feasibility_tolerance(z: Array) -> float:
     """Return by how many scales z (n,) may miss its constraints."""
     return FEASIBLE * max(1.0, float(np.max(np.abs(z), initial=0.0)))
-
-
-class Damping(NamedTuple):
-    """|size (z - centre)|^2, added to the objective: the term of Levenberg and Marquardt. Both (n,)."""
-
-    centre: Array
-    size: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,7 +130,7 @@ class Program(Brief):
 
     formulation: Formulation
     model: LinearModel
-    _posed: Posed
+    structure: Structure
     _kept: dict[str, Any] = field(default_factory=dict, repr=False)  # shared with all programs that `on` makes of this
 
     def __reduce__(self) -> Any:
@@ -144,82 +140,51 @@ class Program(Brief):
         return f"'{self.formulation.name}' on {self.model._short()}"
 
     def on(self, model: LinearModel) -> Program:
-        """Return the program for another model of the same shape, without asking the functions anew."""
-        return Program(self.formulation, model, self._posed, self._kept)
+        """Return the program for another model of the same shape, without calling the functions anew."""
+        return Program(self.formulation, model, self.structure, self._kept)
 
     def anew(self, formulation: Formulation, model: LinearModel, z: Array) -> Program:
-        """Return the program of a formulation whose functions are asked once more, to begin near z (n,).
+        """Return the program of a formulation whose functions are called once more, to begin near z (n,).
 
-        Where they answer what they answered to this program, what CVXPY made of that and the last minimum serve again.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> program.anew(ro.robust, program.model, program.solve(1.0).z).solve(1.0).status
-        'optimal'
+        Where they return what they returned to this program, its canonical forms and last minimum serve again.
         """
         again = pose(formulation, model)
-        if self.formulation == formulation and again._posed.like(self._posed):
+        if self.formulation == formulation and again.structure.like(self.structure):
             return self.on(model)
         return again.beginning(z)
 
     def without(self, out: np.ndarray) -> Program:
-        """Return the program without some equations, ``out`` (m,), which become rows of zeros.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("blunders").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> some = program.without(program.model.group == 7)  # the worst configuration
-        >>> some.solve(1.0).loss < program.solve(1.0).loss
-        True
-        """
+        """Return the program without some equations, ``out`` (m,), which become rows of zeros."""
         return self.apart(self.model.scaled(np.where(out, 0.0, 1.0)))
 
     def apart(self, model: LinearModel) -> Program:
-        """Return the program for another model, whose solutions leave those of this one nothing to begin with.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> nothing = program.apart(program.model.with_values(0 * program.model.b)).solve(1.0)
-        >>> bool(np.abs(nothing.z).max() < 1e-9)
-        True
-        """
+        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
         return replace(self, model=model, _kept={"warm": self._warm.begun(self._warm.z)})
 
     def on_squares(self, model: LinearModel) -> Program:
-        """Return the same penalty and constraints with the squares of other equations as the loss.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("blunders").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> squares = program.on_squares(program.model)
-        >>> [(p.quadratic, p.separable, p.squared_rows, p.on_triangles) for p in (program, squares)]
-        [(False, True, False, False), (True, False, True, True)]
-        >>> program.rows[0].shape, squares.rows[0].shape
-        ((150, 34), (35, 34))
-        """
+        """Return the same penalty and constraints with the squares of other equations as the loss."""
         if "squares" not in self._kept:
-            posed = self._posed.on_squares()
-            self._kept["squares"] = posed, {"warm": Warm(posed.canonical)}
-        posed, kept = self._kept["squares"]
-        return Program(posed.formulation, model, posed, kept)
+            made = self.structure.on_squares()
+            self._kept["squares"] = made, {"warm": Warm(made.canonical)}
+        made, kept = self._kept["squares"]
+        return Program(made.formulation, model, made, kept)
+
+    def beginning(self, z: Array) -> Program:
+        """Return the same program, whose next minimum is looked for from z (n,) on."""
+        self._kept["warm"] = self._warm.begun(z)
+        return self
 
     # --- structure -----------------------------------------------------------------------------------------------
 
     @property
     def loss_form(self) -> Quadratic | None:
         """The quadratic of the residual that the loss is; None where it is something else."""
-        return self._posed.loss_form
+        return self.structure.loss_form
 
     @property
     def penalty_form(self) -> Quadratic | None:
         """The quadratic |L z - c|^2 that the penalty is; None where it is something else, or there is none."""
-        return self._posed.penalty_form
+        return self.structure.penalty_form
 
     @property
     def linear_penalty(self) -> bool:
@@ -234,27 +199,12 @@ class Program(Brief):
     @property
     def separable(self) -> bool:
         """Whether the loss is a sum over equations or configurations, but no square."""
-        return self._posed.loss is not None and self._posed.loss.summands is not None
+        return self.structure.loss is not None and self.structure.loss.summands is not None
 
     @property
     def constrained(self) -> bool:
         """Whether there are constraints, or ``largest`` is one."""
-        return self._posed.constrained
-
-    @property
-    def polyhedral(self) -> bool:
-        """Whether penalty and constraints are squares, equations and inequalities, without other cones."""
-        return self._posed.canonical.polyhedral
-
-    @property
-    def predicts(self) -> bool:
-        """Whether constraints asked for positions, which are linear about some point."""
-        return self._posed.predicts
-
-    @property
-    def inner(self) -> bool:
-        """Whether loss or penalty have variables of their own."""
-        return bool(self._posed.inner)
+        return self.structure.constrained
 
     @property
     def closed_form(self) -> bool:
@@ -271,28 +221,17 @@ class Program(Brief):
         bounded Tikhonov  False True True True
         lasso             False False False False
         Huber             False False True False
-        >>> p.polyhedral, p.predicts, p.inner
-        (True, False, False)
-        >>> lower, upper = ro.convex.pose(ro.bounded, model).box
-        >>> float(upper.max())  # in units of the scales
-        10.0
         """
         return self.quadratic and not self.constrained
 
     @property
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) of z, infinite where there is none; None where a constraint is no `Box`."""
-        return self._posed.box
+        return self.structure.box
 
     @cached_property
     def squared(self) -> LinearModel:
-        """The equations whose squares a quadratic loss sums: |L (A z - b) - c|^2.
-
-        Raises
-        ------
-        InputError
-            For another loss.
-        """
+        """The equations whose squares a quadratic loss sums, |L (A z - b) - c|^2; InputError for another loss."""
         form = self.loss_form
         if form is None:
             raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
@@ -305,31 +244,19 @@ class Program(Brief):
 
     @property
     def on_triangles(self) -> bool:
-        """Whether triangles of some of the equations, instead of these, give this program of them."""
-        return self._posed.equations == self.model.A.shape[1] + 1 and self.squared_rows
+        """Whether QR factors of some of the equations, instead of these, give this program of them."""
+        return self.structure.equations == self.model.A.shape[1] + 1 and self.squared_rows
 
     @cached_property
     def ridge(self) -> Ridge:
-        """The closed form of a program with quadratic loss and penalty, its constraints left out.
-
-        >>> import cvxpy as cp
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> mine = ro.Formulation("about one", penalty=lambda z: cp.sum_squares(2 * (z - 1)))
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(mine, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> program.penalty_form.value(np.zeros(34)), program.loss_form.diagonal, program.squared.equations
-        (136.0, True, 120)
-        >>> round(program.ridge.degrees_of_freedom(1.0), 1)
-        26.1
-        """
+        """The closed form of a program with quadratic loss and penalty, its constraints left out."""
         return ridge(self.squared, self.penalty_form)
 
     @property
     def rows(self) -> tuple[Array, Array]:
-        """A (m, n) and b (m,) as the posed residual has them: the triangle, where that says all."""
+        """A (m, n) and b (m,) of the residual that the loss gets: the QR factor, where that says all."""
         n = self.model.A.shape[1]
-        if self._posed.equations == len(self.model.b):
+        if self.structure.equations == len(self.model.b):
             return self.model.A, self.model.b
         return self.model.triangle[:, :n], self.model.triangle[:, n]
 
@@ -337,24 +264,24 @@ class Program(Brief):
     def _rows(self) -> Rows:
         """The equations in the order in which the solver has them."""
         A, b = self.rows
-        order = self._posed.order
+        order = self.structure.order
         if order is not None:
             A, b = A[order], b[order]
-        return Rows(A, b, self._posed.sizes, self.model.triangle)
+        return Rows(A, b, self.structure.sizes, self.model.triangle)
 
     @property
     def _squares(self) -> Squares | None:
         """The quadratic part of the loss, reduced to n + 1 rows."""
-        form = self._posed._quadratic_of_r
+        form = self.structure.quadratic_of_r
         if form is None:
             return None
-        R, n = (self.squared if self.loss_form is not None else _squared(self.model, form)).triangle, self._posed.n
+        R, n = (self.squared if self.loss_form is not None else _squared(self.model, form)).triangle, self.structure.n
         return Squares(R[:, :n], R[:, n], np.zeros(n))
 
     @property
     def _warm(self) -> Warm:
         if "warm" not in self._kept:
-            self._kept["warm"] = Warm(self._posed.canonical)
+            self._kept["warm"] = Warm(self.structure.canonical)
         return self._kept["warm"]
 
     # --- values --------------------------------------------------------------------------------------------------
@@ -362,56 +289,29 @@ class Program(Brief):
     def value(self, z: Array, weight: float = 1.0) -> tuple[float, float]:
         """Return loss(A z - b) and penalty(z); variables of the functions' own are at their best for the weight.
 
-        Parameters
-        ----------
-        z
-            (n,) in units of the scales.
-        weight
-            Of the penalty; it matters to variables of the functions' own alone.
+        z is (n,) in units of the scales; the weight matters to variables of the functions' own alone.
         """
-        key = z.tobytes(), weight if self.inner else 0.0
+        key = z.tobytes(), weight if self.structure.inner else 0.0
         if key not in self._values:
             A, b = self.rows
-            loss, penalty = self._posed.values(z, A @ z - b, weight)
+            loss, penalty = self.structure.values(z, A @ z - b, weight)
             self._values[key] = loss + self.model.offset, penalty
         return self._values[key]
 
     @cached_property
     def _values(self) -> dict[Any, tuple[float, float]]:
-        """Values where they were asked for: a loop asks for those of one point again and again."""
-        return {}
+        return {}  # a loop evaluates one point again and again
 
     def objective(self, z: Array, weight: float) -> float:
         """Return loss(A z - b) + weight penalty(z); infinite outside their domain. Arguments as for `value`."""
         loss, penalty = self.value(z, weight)
-        if weight == 0:
-            return loss
-        return loss + weight * penalty
+        return loss if weight == 0 else loss + weight * penalty
 
     def inside(self, z: Array, towards: Array, weight: float) -> Array:
         """Return z (n,), or where it lies just outside the functions' domain a point inside.
 
         An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
         towards another, or towards nominal, or away from it where that lies outside.
-
-        Parameters
-        ----------
-        z, towards
-            (n,) in units of the scales.
-        weight
-            Of the penalty.
-
-        Examples
-        --------
-        >>> import cvxpy as cp
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> mine = ro.Formulation("entropy", penalty=lambda z: cp.sum(cp.kl_div(z + 1, 1)))
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(mine, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = np.full(34, -1 - 1e-12)  # the entropy ends at -1
-        >>> program.objective(z, 1.0), bool(np.isfinite(program.objective(program.inside(z, z, 1.0), 1.0)))
-        (inf, True)
         """
         for share in (0.0, 1e-9, 1e-7, 1e-5, 1e-3, 1e-1):
             for anchor in (np.zeros_like(z), towards, 2 * z):
@@ -433,12 +333,8 @@ class Program(Brief):
         >>> problem = ro.load("position").problem
         >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
         >>> z = program.solve().z
-        >>> round(program.violation(3 * z), 6), bool(np.allclose(program.nearest(3 * z), z, atol=1e-6))
-        (4.0, True)
-        >>> program.excess(z), round(float(program.norms(z).max()), 1)  # sigmas
-        (0.0, 16.4)
-        >>> program.meets(z), program.meets(2 * z)
-        (True, False)
+        >>> round(program.violation(3 * z), 6), program.meets(z), program.meets(2 * z)
+        (4.0, True, False)
         """
         return max(self._distance(z), self.excess(z))
 
@@ -448,13 +344,11 @@ class Program(Brief):
             lower, upper = self.box
             return float(np.max(np.maximum(lower - z, z - upper), initial=0.0))
         found = self._projected(z)
-        if found is None:
-            return float("inf")
-        return float(np.linalg.norm(found - z))
+        return float("inf") if found is None else float(np.linalg.norm(found - z))
 
     def excess(self, z: Array) -> float:
         """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
-        if not self._posed.limited:
+        if not self.structure.limited:
             return 0.0
         return max(0.0, float(np.max(self.norms(z))) / self.formulation.largest - 1)
 
@@ -463,84 +357,54 @@ class Program(Brief):
         if self.box is not None:
             return np.clip(z, *self.box)
         found = self._projected(z)
-        if found is None or np.linalg.norm(found - z) <= TOUCHING:
-            return z
-        return found
+        return z if found is None or np.linalg.norm(found - z) <= TOUCHING else found
 
     def _projected(self, z: Array) -> Array | None:
         """Return the point of the constraints of z that is nearest to z (n,); None where the solver finds none."""
-        if not self.formulation.constraints or self._posed.met(z):
+        if not self.formulation.constraints or self.structure.met(z):
             return z
-        return nearest(self._posed.canonical, z)
+        return nearest(self.structure.canonical, z)
 
     def meets(self, z: Array) -> bool:
         """Whether z (n,) meets its constraints as well as is asked for."""
         return self._distance(z) <= feasibility_tolerance(z) and self.excess(z) <= FEASIBLE
 
     def gradient(self, z: Array, weight: float) -> Array | None:
-        """Return the gradient (n,) of the objective, asked of the functions; None where CVXPY knows none.
+        """Return the gradient (n,) of the objective by the functions; None where CVXPY knows none.
 
         Arguments as for `value`.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> slopes = [np.linalg.norm(program.gradient(z, 1.0)) for z in (np.zeros(34), program.solve(1.0).z)]
-        >>> bool(slopes[1] < 1e-6 * slopes[0])
-        True
         """
         A, b = self.rows
-        slope = self._posed.loss_slope(A @ z - b)
+        slope = self.structure.loss_slope(A @ z - b)
         if slope is None or len(slope) != len(b):
             return None
         gradient = A.T @ slope
         if self.formulation.penalty is None or weight == 0:
             return gradient
-        price = self._posed.penalty_slope(z)
-        if price is None:
-            return None
-        return gradient + weight * price
-
-    # --- what a robust loss trusts -------------------------------------------------------------------------------
+        of_penalty = self.structure.penalty_slope(z)
+        return None if of_penalty is None else gradient + weight * of_penalty
 
     def trust(self, z: Array) -> Trusted | None:
         """Return what a robust loss trusts at z (n,); None for a squared loss, which trusts everything.
 
-        Raises
-        ------
-        InputError
-            For a loss without a slope, or one that rests on few equations (minimax).
+        InputError for a loss without a slope, or one that rests on few equations (minimax).
         """
         if self.loss_form is not None:
             return None
-        return self._trusting(z)[0]
-
-    def _trusting(self, z: Array) -> tuple[Trusted, np.ndarray]:
-        """Return what the loss trusts at z (n,), and which equations (m,) those are."""
-        which, count = self.model.members
-        norms = self.norms(z)
-        keep = (norms <= outlying(norms, count))[which]
-        return self._posed.trusted(norms, count), keep
+        return self.structure.trusted(self.norms(z), self.model.members[1])
 
     def trusted(self, z: Array) -> LinearModel:
-        """Return the squared-loss model that a robust fit amounts to: what it trusts at z (n,), weighed as it does.
+        """Return the squared-loss model that a robust fit amounts to: the rows that it trusts at z (n,), downweighted.
 
         Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model, and it is what
         every rule for the weight sees. With a squared loss it is that loss's. InputError as for `trust`.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("blunders").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = program.solve(1.0).z
-        >>> program.model.equations, program.trusted(z).equations, round(program.trust(z).factor, 3)
-        (150, 132, 1.0)
         """
-        if self.loss_form is not None:
+        trust = self.trust(z)
+        if trust is None:
             return self.squared
-        trust, keep = self._trusting(z)
-        return kept_equations(self.model, keep, trust.factor)
+        which, count = self.model.members
+        lengths = self.norms(z)
+        return kept_equations(self.model, (lengths <= outlying(lengths, count))[which], trust.factor)
 
     # --- solutions -----------------------------------------------------------------------------------------------
 
@@ -562,22 +426,21 @@ class Program(Brief):
             cp.Parameter(b.shape, name="b", value=b),
             cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
         )
-        asked = self._posed.asked
-        loss, penalty, groups = asked.live
-        return self._written(data, (asked.over_r(loss), penalty, groups), None)[0]
+        loss, penalty, groups = self.structure.answers.live
+        return self._written(data, (self.structure.of_r(loss), penalty, groups), None)[0]
 
     def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
         """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
-        posed, asked = self._posed, self._posed.asked
+        shape, answers = self.structure, self.structure.answers
         loss, penalty, groups = stated
         A, b, weight = data
-        z, r = cp.Variable(posed.n, name="z"), cp.Variable(posed.equations, name="r")
-        instead = {id(asked.z): z, id(asked.r): r}
+        z, r = cp.Variable(shape.n, name="z"), cp.Variable(shape.equations, name="r")
+        instead = {id(answers.z): z, id(answers.r): r}
         groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
-        if posed.limited:
-            every.append(substituted(posed.limit_of_norms, instead))
+        if shape.limited:
+            every.append(substituted(shape.limit_of_norms, instead))
         total = substituted(loss, instead) + self.model.offset
         if penalty is not None:
             price = substituted(penalty, instead)
@@ -604,8 +467,7 @@ class Program(Brief):
         """Return the solution at a weight.
 
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
-        than a squared one they may go anywhere: give it a penalty with a weight, or constraints. Quadratic programs
-        have a formula; what solves the others is the table of `solvers.solve.minimum`.
+        than a squared one they may go anywhere: give it a penalty with a weight, or constraints.
 
         Parameters
         ----------
@@ -632,7 +494,7 @@ class Program(Brief):
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif self.closed_form:
             estimate = self._at(self._formula(weight, damping), weight)
-        elif self._posed.joint:
+        elif self.structure.joint:
             estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
             estimate = self._by_structure(weight, damping, accuracy)
@@ -657,94 +519,29 @@ class Program(Brief):
         found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
         return [found[weight] for weight in checked.tolist()]
 
-    def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum is looked for from z (n,) on.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = program.solve(1.0).z
-        >>> bool(np.allclose(program.beginning(0.9 * z).solve(1.0).z, z))
-        True
-        """
-        self._kept["warm"] = self._warm.begun(z)
-        return self
-
-    def moved(self, by: Array, weight: float, damping: Damping | None = None) -> Array | None:
-        """Return by how far the minimum (n,) of `solve` moves where b moves; None where no formula says it.
-
-        Parameters
-        ----------
-        by
-            (m,) by how much b moves.
-        weight, damping
-            As for `solve`.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> by = np.linspace(-1, 1, 120)
-        >>> there = program.on(program.model.with_values(program.model.b + by))
-        >>> bool(np.allclose(program.moved(by, 1.0), there.solve(1.0).z - program.solve(1.0).z, atol=1e-9))
-        True
-        """
-        if not self.closed_form or not self.squared_rows:
-            return None
-        A, _ = self._stacked(weight, damping)
-        L: Any = np.linalg.qr(A, mode="r")
-        pivots = np.abs(np.diag(L))
-        if len(L) < A.shape[1] or pivots.min(initial=1.0) <= FAR_APART * pivots.max(initial=0.0):
-            return None
-        return np.linalg.solve(L, np.linalg.solve(L.T, self.model.A.T @ by))
-
     def solve_with_slope(self, weight: float) -> tuple[Estimate, Array | None]:
-        """Return the solution of a loss that is no square, and where the solver tells it the loss's slope (m,).
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("blunders").problem
-        >>> program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> estimate, _ = program.solve_with_slope(1.0)
-        >>> bool(abs(estimate.objective / program.solve(1.0).objective - 1) < 1e-9)
-        True
-        """
+        """Return the solution of a loss that is no square, and the loss's slope (m,) where the solver tells it."""
         weight = self._weight(weight)
-        if self._posed.joint:
+        if self.structure.joint:
             return self.solve(weight), None
         try:
-            found = minimum(self._posed.loss, self._rows, self._warm, weight, self._squares)
+            found = minimum(self.structure.loss, self._rows, self._warm, weight, self._squares)
         except Unsolved:
             return self.solve(weight), None
         slope = found.slope
-        if slope is not None and self._posed.order is not None:
+        if slope is not None and self.structure.order is not None:
             slope = np.empty_like(slope)
-            slope[self._posed.order] = found.slope
+            slope[self.structure.order] = found.slope
         return self._at(found.z, weight), slope
 
     def derivative(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e.
-
-        By differences of the small program's solutions, in steps that move a parameter by `DIFFERENCE` of a scale.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.bounded, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> D, U = program.derivative(program.solve(1e-3))
-        >>> D.shape, U.shape
-        ((26, 20), (27, 20))
-        """
-        squares, n = self._squares, self._posed.n
-        if squares is None:
-            raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
+        """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e."""
+        R, n = self.squared.triangle, self.structure.n
+        squares = Squares(R[:, :n], R[:, n], np.zeros(n))
         _, s, V = np.linalg.svd(squares.R)
         seen = s > RANK_TOLERANCE * s[0]
         s, V = s[seen], V[: len(s)][seen]
-        small, at = self._warm.program(n + 1), self._posed.canonical.at
+        small, at = self._warm.program(n + 1), self.structure.canonical.at
         here = estimate.z
         D = np.empty((n, len(s)))
         for j in range(len(s)):
@@ -759,25 +556,14 @@ class Program(Brief):
     def tangent(self, z: Array, weight: float) -> Array | None:
         """Return orthonormal directions (n, k) along which z may move with its active constraints; None for all.
 
-        Equations, and inequalities and cones with a multiplier, linearized at z; variables of the functions' own move
-        along. Arguments as for `value`.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(1.0, "*"),))
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = program.solve().z
-        >>> moves = program.tangent(z, 0.0)
-        >>> moves.shape, bool(np.abs(moves.T @ z).max() < 1e-4)  # on the sphere
-        ((26, 25), True)
+        Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along.
         """
-        if not self.formulation.constraints or self.predicts:
+        if not self.formulation.constraints or self.structure.predicts:
             return None
         found = self.apart(self.model)._minimum_at(z, weight)
         if found is None:
             return None
-        p = self._posed.canonical
+        p = self.structure.canonical
         limit = ACTIVE * max(np.abs(found.dual).max(initial=0.0), TOUCHING)
         dense = p.A if isinstance(p.A, np.ndarray) else p.A.toarray()
         linear = np.arange(p.linear)
@@ -800,33 +586,13 @@ class Program(Brief):
 
     def _minimum_at(self, z: Array, weight: float) -> Minimum | None:
         """Return the minimum next to a solution z (n,), with its multipliers; None where it is not found."""
-        if self._posed.joint:
+        if self.structure.joint:
             return None
         self.beginning(z)
         try:
-            return minimum(self._posed.loss, self._rows, self._warm, weight, self._squares)
+            return minimum(self.structure.loss, self._rows, self._warm, weight, self._squares)
         except Unsolved:
             return None
-
-    def largest_slope(self, slope: Array) -> float:
-        """Return max { -slope'z : penalty(z) <= 1 } of a slope (n,), its dual norm; 0 where it is not bounded.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> round(program.largest_slope(np.linspace(-3.0, 1.0, 26)), 6)  # the largest magnitude
-        3.0
-        """
-        asked = self._posed.asked
-        problem = cp.Problem(cp.Minimize(slope @ asked.z), [asked.penalty <= 1])
-        asked.z.save_value(None)
-        try:
-            problem.solve(solver=cp.CLARABEL)
-        except cp.SolverError:
-            return 0.0
-        value: Any = problem.value
-        return -float(value) if problem.status == cp.OPTIMAL else 0.0
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
@@ -842,30 +608,23 @@ class Program(Brief):
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
 
-    def _stacked(self, weight: float, damping: Damping | None) -> tuple[Array, Array]:
-        """Return rows whose squares are the objective of a quadratic program."""
-        n = self._posed.n
+    def _formula(self, weight: float, damping: Damping | None) -> Array:
+        """Return the unconstrained minimum (n,) of a quadratic program."""
+        form, n = self.penalty_form, self.structure.n
+        z = self.ridge.minima(np.array([weight]))[0] if damping is None else np.zeros(n)
+        if damping is None and (form is None or (form.diagonal and bool((form.L == 1).all()))):
+            return z
         R = self.squared.triangle
         A, b = [R[:, :n]], [R[:, n]]
-        if self.penalty_form is not None and weight > 0:
-            A.append(np.sqrt(weight) * self.penalty_form.matrix)
-            b.append(np.sqrt(weight) * self.penalty_form.c)
+        if form is not None and weight > 0:  # a penalty that hardly holds some directions costs the formula digits
+            A.append(np.sqrt(weight) * form.matrix)
+            b.append(np.sqrt(weight) * form.c)
         if damping is not None:
             A.append(np.diag(damping.size))
             b.append(damping.size * damping.centre)
-        return np.vstack(A), np.concatenate(b)
-
-    def _formula(self, weight: float, damping: Damping | None) -> Array:
-        """Return the unconstrained minimum (n,) of a quadratic program."""
-        form = self.penalty_form
-        if damping is None:
-            z = self.ridge.minima(np.array([weight]))[0]
-            if form is None or (form.diagonal and bool((form.L == 1).all())):
-                return z
-            A, b = self._stacked(weight, None)  # a penalty that hardly holds some directions costs the formula digits
-            return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
-        A, b = self._stacked(weight, damping)
-        return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0], dtype=float)
+        stacked = np.vstack(A)
+        rcond = RANK_TOLERANCE if damping is None else None
+        return z + np.linalg.lstsq(stacked, np.concatenate(b) - stacked @ z, rcond=rcond)[0]
 
     def _quadratic_values(self, Z: Array) -> tuple[Array, Array]:
         """Return loss and penalty (K,) of many points Z (K, n) of a quadratic program."""
@@ -878,11 +637,10 @@ class Program(Brief):
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
-        size, centre = (None, None) if damping is None else (damping.size, damping.centre)
         try:
             with phase("solve"):
-                loss, rows, squares = self._posed.loss, self._rows, self._squares
-                found = minimum(loss, rows, self._warm, weight, squares, size, centre, accuracy)
+                loss, rows, squares = self.structure.loss, self._rows, self._squares
+                found = minimum(loss, rows, self._warm, weight, squares, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
@@ -893,20 +651,34 @@ class Program(Brief):
 
     def _duals(self, found: Minimum, weight: float) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
-        posed = self._posed
-        if not posed.formulation.constraints:
+        canonical = self.structure.canonical
+        if not self.formulation.constraints:
             return ()
-        if posed.canonical.cones is None:
-            return _of_boxes(posed.limits, found.dual)
-        values = posed.canonical.duals(found.x, found.dual)
-        groups = [[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in posed.constraints]
-        return self._by_function(groups)
+        if canonical.cones is None:
+            stated = np.empty_like(found.dual)
+            stated[canonical.order] = found.dual
+            sides = [_sides(low, high) for low, high in self.structure.limits]
+            parts = np.split(stated, np.cumsum([len(each) for each in sides])[:-1])
+            return tuple(self._of_box(each, part) for each, part in zip(sides, parts, strict=True))
+        values = canonical.duals(found.x, found.dual)
+        groups = self.structure.constraints
+        return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])
 
     def _by_function(self, groups: list[list[Array]]) -> tuple[Array, ...]:
-        """Return multipliers by constraint function: of a box (n,), as if loosened on the side that holds."""
-        together = [np.concatenate([np.empty(0), *group]) for group in groups]
-        pairs = zip(self._posed.formulation.constraints, together, strict=True)
-        return tuple(_of_box(*c.bounds(self.model.parameters), v) if isinstance(c, Box) else v for c, v in pairs)
+        """Return multipliers by constraint function: of a box (n,), as if loosened on the side that is active."""
+        found = []
+        for constraint, group in zip(self.formulation.constraints, groups, strict=True):
+            values = np.concatenate([np.empty(0), *group])
+            if isinstance(constraint, Box):
+                values = self._of_box(_sides(*constraint.bounds(self.model.parameters)), values)
+            found.append(values)
+        return tuple(found)
+
+    def _of_box(self, sides: np.ndarray, values: Array) -> Array:
+        """Return multipliers (n,) by component from those of the rows of a box."""
+        found = np.zeros(self.structure.n)
+        np.add.at(found, sides, np.abs(values))
+        return found
 
     def _by_cvxpy(
         self,
@@ -919,8 +691,8 @@ class Program(Brief):
     ) -> Estimate:
         """Return the minimum that a solver of CVXPY finds; ``first`` is why another way failed before."""
         _require_installed(solver)
-        asked = self._posed.asked
-        stated = asked.loss, asked.penalty, asked.constraints
+        answers = self.structure.answers
+        stated = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
         problem, z, groups = self._written((*self.rows, weight), stated, damping)
         for variable in problem.variables():
             variable.save_value(None)
@@ -946,24 +718,15 @@ class Program(Brief):
 
     def _failure(self, status: str, weight: float) -> NoSolutionFound:
         """Return why there is no solution."""
-        from rpim_opt.convex.conflict import advice, conflict  # of programs without a solution
+        from rpim_opt.convex.infeasible import advice, conflict  # of programs without a solution
 
         contradiction = None
         if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
-            contradiction = conflict(self._posed, self.model)
+            contradiction = conflict(self.structure, self.model)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point
-        text = advice(self._posed, status, contradiction)
+        text = advice(self.structure, status, contradiction)
         return NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
-
-
-STATUS = {
-    "PrimalInfeasible": "infeasible",
-    "AlmostPrimalInfeasible": "infeasible_inaccurate",
-    "DualInfeasible": "unbounded",
-    "AlmostDualInfeasible": "unbounded",
-}
-"""CVXPY's words for Clarabel's."""
 
 
 def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
@@ -980,27 +743,9 @@ def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
     return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant)
 
 
-def _of_boxes(limits: Sequence[tuple[Array, Array]], dual: Array) -> tuple[Array, ...]:
-    """Return the multipliers (n,) of boxes, from those of the rows of `Canonical.box`."""
-    fixed = [low == high for low, high in limits]
-    parts = list(np.split(dual, np.cumsum([np.count_nonzero(f) for f in fixed])))
-    rest = parts.pop()
-    found = []
-    for (low, high), f, part in zip(limits, fixed, parts, strict=True):
-        counts = [np.count_nonzero(np.isfinite(side) & ~f) for side in (low, high)]
-        sides, rest = rest[: sum(counts)], rest[sum(counts) :]
-        found.append(_of_box(low, high, np.concatenate([part, sides])))
-    return tuple(found)
-
-
-def _of_box(lower: Array, upper: Array, values: Array) -> Array:
-    """Return the multipliers (n,) of a box: of fixed components, then of lower and of upper bounds."""
-    sides = [lower == upper, np.isfinite(lower) & (lower < upper), np.isfinite(upper) & (lower < upper)]
-    found = np.zeros(len(lower))
-    for side in sides:
-        part, values = np.split(values, [np.count_nonzero(side)])
-        found[side] += np.abs(part)
-    return found
+def _sides(lower: Array, upper: Array) -> np.ndarray:
+    """Return the components that the rows of a box bound: fixed ones, lower and upper bounds."""
+    return np.concatenate([np.flatnonzero(side) for side in box_sides(lower, upper)])
 
 
 def _require_installed(solver: Any) -> None:
@@ -1034,6 +779,4 @@ def pose(formulation: Formulation | str, model: LinearModel) -> Program:
     (True, 2)
     """
     formulation = formulation_of(formulation)
-    if not formulation.solvable:
-        return Program(formulation, model, Unposed(formulation, model))
-    return Program(formulation, model, posed(formulation, model))
+    return Program(formulation, model, structure(formulation, model))

@@ -1,4 +1,4 @@
-"""Closed forms: squared loss and squared penalty, at any weight, from one singular value decomposition."""
+"""Quadratic forms: recognized in CVXPY's canonical form; with a squared loss, minimized at any weight by one SVD."""
 
 from __future__ import annotations
 
@@ -7,11 +7,149 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.linalg import qr
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.structure import Quadratic, identity
+from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+
+DENSE = 2000
+"""Variables up to which a quadratic with products of different variables is factored."""
+ROUNDING = 1e-12
+"""Eigenvalues and slopes below this part of the largest are what rounding leaves of zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """A convex quadratic f(v) = |L v - c|^2 + constant of v (n,); L is (k, n), or (n,) where it is diagonal."""
+
+    L: Array
+    c: Array
+    constant: float = 0.0
+
+    @property
+    def diagonal(self) -> bool:
+        """Whether f is a sum over the components of v."""
+        return self.L.ndim == 1
+
+    @property
+    def matrix(self) -> Array:
+        """L as a matrix (k, n)."""
+        return np.diag(self.L) if self.diagonal else self.L
+
+    def times(self, v: Array) -> Array:
+        """Return L v, for v (n,) or a matrix (n, j)."""
+        if not self.diagonal:
+            return self.L @ v
+        if v.ndim == 1:
+            return self.L * v
+        return self.L[:, None] * v
+
+    @property
+    def size(self) -> float:
+        """Mean of |L e|^2 over the squares that it sums, for e of unit noise."""
+        rows = self.L**2
+        if not self.diagonal:
+            rows = np.sum(rows, axis=1)
+        return float(np.mean(rows[rows > 0]))
+
+    def value(self, v: Array) -> float:
+        """Return f(v)."""
+        residual = self.times(v) - self.c
+        return float(residual @ residual) + self.constant
+
+    def slope(self, v: Array) -> Array:
+        """Return the gradient 2 L'(L v - c), (n,)."""
+        residual = self.times(v) - self.c
+        return 2 * (self.L * residual if self.diagonal else self.L.T @ residual)
+
+
+def identity(n: int) -> Quadratic:
+    """Return |v|^2, which `cp.sum_squares` declares to be."""
+    return Quadratic(np.ones(n), np.zeros(n))
+
+
+def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
+    """Return the quadratic that an expression of one variable is; None where it is something else.
+
+    In CVXPY's canonical form 1/2 x'P x + q'x with A x + s = b it is one where all of s is zero (no inequality, no
+    cone) and the equations give the variables that CVXPY added.
+    """
+    if {v.id for v in expression.variables()} != {variable.id}:
+        return None
+    if not expression.is_quadratic() or cp.huber in expression.atoms():  # which CVXPY counts among quadratics
+        return None
+    variable.save_value(None)  # atoms ask for the value of what they are made of, and may get a stale one
+    data = cp.Problem(cp.Minimize(expression)).get_problem_data(cp.CLARABEL, solver_opts={})[0]
+    if data.get("P") is None or data["dims"].zero != len(data["b"]) or data.get("lower_bounds") is not None:
+        return None
+    reduced = _reduced(data, variable)
+    if reduced is None:
+        return None
+    H, g = reduced
+    variable.value = np.zeros(variable.size)
+    return _completed(H, g, float(expression.value))
+
+
+def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] | None:
+    """Return H (sparse) and g of 1/2 v'H v + g'v, with CVXPY's own variables eliminated."""
+    start = data["param_prob"].var_id_to_col[variable.id]
+    own = start + np.arange(variable.size)
+    rest = np.setdiff1d(np.arange(len(data["c"])), own)
+    P: Any = scipy.sparse.csr_array(data["P"])
+    A: Any = scipy.sparse.csc_array(data["A"])
+    if A.shape[0] != len(rest):
+        return None
+    H: Any = P[own][:, own]
+    g = data["c"][own]
+    if not len(rest):
+        return H, g
+    try:
+        factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(A[:, rest]))
+    except RuntimeError:  # singular: they do not follow from v
+        return None
+    M = -scipy.sparse.csr_array(factors.solve(A[:, own].toarray()))
+    d = factors.solve(np.asarray(data["b"], dtype=float))
+    cross, inner = P[own][:, rest], P[rest][:, rest]
+    H = H + cross @ M + M.T @ cross.T + M.T @ inner @ M
+    g = g + cross @ d + M.T @ (data["c"][rest] + inner @ d)
+    return H, g
+
+
+def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
+    """Complete the square of 1/2 v'H v + g'v + at_zero; None where it has no minimum, or is too large to factor."""
+    H = scipy.sparse.coo_array(H)
+    off = H.row != H.col
+    if not np.any(H.data[off]):
+        diagonal = np.bincount(H.row, H.data, minlength=len(g)) / 2
+        return _from_spectrum(diagonal, g, None, at_zero, 0.0)
+    if len(g) > DENSE:
+        return None
+    values, vectors = np.linalg.eigh(H.toarray() / 2)
+    return _from_spectrum(values, vectors.T @ g, vectors, at_zero)
+
+
+def _from_spectrum(
+    values: Array, slope: Array, vectors: Array | None, at_zero: float, rounding: float = ROUNDING
+) -> Quadratic | None:
+    """Return the quadratic sum values_i y_i^2 + slope_i y_i + at_zero in y = vectors'v."""
+    largest = float(np.max(values, initial=0.0))
+    curved = values > rounding * largest
+    flat_slope = float(np.max(np.abs(slope[~curved]), initial=0.0))
+    if largest <= 0 or np.min(values) < -ROUNDING * largest:
+        return None
+    if flat_slope > 1e-9 * max(float(np.max(np.abs(slope))), largest):
+        return None  # linear in some direction: no minimum of its own
+    root = np.sqrt(np.where(curved, values, 0.0))
+    c = np.divide(-slope, 2 * root, out=np.zeros_like(root), where=curved)
+    constant = at_zero - float(c @ c)
+    if vectors is None:
+        return Quadratic(root, c, constant)
+    return Quadratic((vectors[:, curved] * root[curved]).T, c[curved], constant)
+
+
+# --- closed forms ---
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,22 +161,9 @@ class Ridge:
 
         z(weight) = offset + B diag(s / (s^2 + weight)) beta,    beta = U'b
 
-    Directions that neither A nor L see stay where the penalty's centre, or nominal, has them.
-
-    Parameters
-    ----------
-    beta, s
-        (p,) each; s below `RANK_TOLERANCE` times the largest are zero.
-    B
-        (n, p) the directions in z.
-    offset
-        (n,) z at infinite weight.
-    perp
-        Square of what no z explains.
-    free
-        (n, f) the seen directions that L leaves free, scaled such that free free' is their covariance.
-    unseen
-        (n, u) orthonormal: L leaves them free, and A does not see them.
+    Directions that neither A nor L see stay where the penalty's centre, or nominal, has them. beta, s (p,), s below
+    `RANK_TOLERANCE` times the largest zero; B (n, p); offset (n,) is z at infinite weight; perp the square that no z
+    explains; free (n, f) the seen directions that L leaves free, with covariance free free'; unseen (n, u) the others.
     """
 
     beta: Array
@@ -51,7 +176,7 @@ class Ridge:
 
     @property
     def fixed(self) -> int:
-        """How many directions the data alone decide, because the penalty leaves them free."""
+        """Number of directions that the penalty leaves free and the data see."""
         return self.free.shape[1]
 
     @cached_property
@@ -73,7 +198,7 @@ class Ridge:
         return self.offset + gain @ self.B.T
 
     def degrees_of_freedom(self, weight: float) -> float:
-        """Return the trace of the influence matrix: free directions, and sum s^2 / (s^2 + weight)."""
+        """Return the trace of the influence matrix."""
         s2 = self.s[self.seen] ** 2
         return self.fixed + float(np.sum(s2 / (s2 + weight)))
 
@@ -84,7 +209,7 @@ class Ridge:
         return (self.B * by) @ self.B.T + self.free @ self.free.T
 
     def prior(self, weight: float) -> Array:
-        """Return the mean square (n, n) of what the penalty holds back, if z is as large as it expects."""
+        """Return the mean square (n, n) of the bias for deviations of the penalty's size."""
         total = self.s**2 + weight
         by = np.divide(weight, total**2, out=np.zeros_like(total), where=total > 0)
         return (self.B * by) @ self.B.T
@@ -96,13 +221,7 @@ class Ridge:
         return np.hstack([self.unseen, self.B[:, ~self.seen]])
 
     def hat_rows(self, A: Array) -> tuple[Array, Array]:
-        """Return Q (m, p') and Q0 (m, f): at a weight the influence matrix is Q diag(s^2 / (s^2 + weight)) Q' + Q0 Q0'.
-
-        Parameters
-        ----------
-        A
-            (m, n) all rows, of which the decomposition may know the triangle alone.
-        """
+        """Return Q (m, p') and Q0 (m, f) of the influence matrix Q diag(s^2 / (s^2 + weight)) Q' + Q0 Q0'; A (m, n)."""
         seen = self.seen
         return A @ self.B[:, seen] / self.s[seen], A @ self.free
 
@@ -179,10 +298,7 @@ def _free_directions(A: Array, N: Array) -> tuple[Array, Array, Array]:
 
 
 def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:
-    """Return what a penalty says of the robot's parameters whatever the frames (n,) are: they are left free.
-
-    That is the marginal of the normal prior that it stands for: the Schur complement of its precision L'L.
-    """
+    """Return the marginal of a normal prior with frames (n,) free: the Schur complement of its precision L'L."""
     if penalty.diagonal:
         return Quadratic(np.where(frames, 0.0, penalty.L), np.where(frames, 0.0, penalty.c))
     K = penalty.L.T @ penalty.L
@@ -198,17 +314,7 @@ def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:
 
 
 def ridge_within(model: LinearModel, penalty: Quadratic | None, moves: Array, z: Array) -> Ridge:
-    """Decompose a linear model and a squared penalty where z (n,) may move in some directions alone.
-
-    Parameters
-    ----------
-    model, penalty
-        As for `ridge`.
-    moves
-        (n, k) orthonormal; z + moves y are the points that count, and covariances are conditional on them.
-    z
-        A point that meets the constraints.
-    """
+    """Decompose a linear model and a squared penalty over z + moves y, moves (n, k) orthonormal."""
     form = penalty or identity(len(z))
     inside = ridge(
         replace(model, A=model.A @ moves, b=model.b - model.A @ z),

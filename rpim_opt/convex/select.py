@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound, pick
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import corner, l_curve
 from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
@@ -82,3 +83,20 @@ SELECTORS: dict[str, Selector] = {
     "quasi_optimality": quasi_optimality,
     "ncp": ncp,
 }
+LEARNED = "learned"
+"""Stands for hyperparameters that are estimated from the data, and no weight."""
+
+
+def weight_of(stated: Any) -> Any:
+    """Return a weight, a selector, weights of groups, or what a name stands for; None for "learned".
+
+    InputError for a name that no selector has.
+    """
+    if not isinstance(stated, str):
+        return stated
+    return None if stated == LEARNED else selector_of(stated, also=f"a number, a selector, {LEARNED}, ")
+
+
+def selector_of(stated: Selector | str, also: str = "a selector, ") -> Selector:
+    """Return a selector, or the ready one of that name; ``also`` is what else a user could state."""
+    return pick(SELECTORS, stated, "weight", also=also) if isinstance(stated, str) else stated

@@ -1,156 +1,569 @@
-"""What CVXPY's canonicalization says of a convex function: whether it is a quadratic, and which."""
+"""What a formulation's functions return for data of one shape, and the structure by which they are solved."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.atoms import cp
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.constraints import Box, Ready
+from rpim_opt.convex.expressions import (
+    NORM2,
+    SQUARES,
+    Frozen,
+    Term,
+    alike,
+    called,
+    cp,
+    fulfilled,
+    listed,
+    norms,
+    reason,
+    scalar,
+    substituted,
+    term,
+)
+from rpim_opt.convex.formulation import Formulation, lost
+from rpim_opt.convex.given import given
+from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
+from rpim_opt.convex.solvers.conic import Canonical
+from rpim_opt.convex.solvers.solve import Loss
+from rpim_opt.convex.trust import SMALL, Squares, Trusted, separable, trusted
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.robot.parameters import Parameters
 
-DENSE = 2000
-"""Variables up to which a quadratic with products of different variables is factored."""
-ROUNDING = 1e-12
-"""Eigenvalues and slopes below this part of the largest are what rounding leaves of zero."""
+INVARIANT = (SQUARES, NORM2)
+"""Losses that declare to see only the length of the residual: [A b] may be replaced by its QR factor."""
+FEW = 20_000
+"""Equations up to which another loss is canonicalized to see whether it is one of those."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Number of parameters and equations, their configurations (m,), and what functions see of the parameters."""
+
+    unknowns: int
+    equations: int
+    group: bytes
+    signature: tuple[Any, ...]
+    parameters: Parameters = field(compare=False)
+    groups: np.ndarray = field(compare=False)
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic:
-    """A convex quadratic f(v) = |L v - c|^2 + constant of v (n,).
+class Answers:
+    """Expressions that a formulation's functions returned, with private copies of the user's parameters and variables.
 
-    Parameters
-    ----------
-    L
-        (k, n); or (n,) where it is diagonal.
-    c
-        (k,).
-    constant
-        The smallest value.
+    ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
+    ``constraints`` of z; ``live`` are loss, penalty and constraints with the user's own parameters.
     """
 
-    L: Array
-    c: Array
-    constant: float = 0.0
+    z: cp.Variable
+    r: cp.Variable
+    loss: Term
+    penalty: Any
+    penalty_of_z: Any
+    differences: list[Array]
+    constraints: list[list[Any]]
+    own: list[cp.Variable]
+    live: tuple[Any, Any, list[list[Any]]]
+    predicts: bool
 
-    @property
-    def diagonal(self) -> bool:
-        """Whether f is a sum over the components of v."""
-        return self.L.ndim == 1
-
-    @property
-    def matrix(self) -> Array:
-        """L as a matrix (k, n)."""
-        if self.diagonal:
-            return np.diag(self.L)
-        return self.L
-
-    def times(self, v: Array) -> Array:
-        """Return L v, for v (n,) or a matrix (n, j)."""
-        if not self.diagonal:
-            return self.L @ v
-        if v.ndim == 1:
-            return self.L * v
-        return self.L[:, None] * v
-
-    @property
-    def size(self) -> float:
-        """Mean of |L e|^2 over the squares that it sums, for e of unit noise."""
-        rows = self.L**2
-        if not self.diagonal:
-            rows = np.sum(rows, axis=1)
-        return float(np.mean(rows[rows > 0]))
-
-    def value(self, v: Array) -> float:
-        """Return f(v)."""
-        residual = self.times(v) - self.c
-        return float(residual @ residual) + self.constant
+    def like(self, other: Answers) -> bool:
+        """Whether the functions returned the same another time."""
+        stated = [[a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts] for a in (self, other)]
+        pairs: dict[int, int] = {}
+        for mine, its in ((self.z, other.z), (self.loss.variable, other.loss.variable)):
+            pairs |= {id(mine): id(its), id(its): id(mine)}
+        try:
+            return alike(stated[0], stated[1], pairs)
+        except ValueError:  # something that has no truth value: then they may differ
+            return False
 
 
-def identity(n: int) -> Quadratic:
-    """Return |v|^2, which `cp.sum_squares` declares to be."""
-    return Quadratic(np.ones(n), np.zeros(n))
+def answers(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Answers:
+    """Call the functions of a formulation for so many equations."""
+    where = f"formulation '{formulation.name}'"
+    from rpim_opt.convex.unknown import Unknown  # imports CVXPY
+
+    z = Unknown(parameters.names)
+    r = cp.Variable(equations, name="r")
+    seen: cp.Variable = r
+    if formulation.loss_over == "configuration":
+        seen = cp.Variable(len(np.unique(groups)))
+    differences: list[Array] = []
+    penalized: cp.Variable = z
+    if formulation.penalty_over is not None:
+        differences = [np.asarray(D, dtype=float) for D in formulation.penalty_over(parameters)]
+        penalized = cp.Variable(len(differences))
+
+    def over_z(expression: Any) -> Any:
+        if expression is None or penalized is z:
+            return expression
+        return substituted(expression, {id(penalized): cp.hstack([cp.norm(D @ z) for D in differences])})
+
+    frozen = Frozen([z, r, seen, penalized], where)
+    live_loss = scalar(called(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
+    loss = Term(frozen(live_loss), seen)
+    live_penalty = penalty = None
+    if formulation.penalty is not None:
+        live_penalty = scalar(called(formulation.penalty, f"{where}, penalty", penalized), f"{where}, penalty")
+        penalty = Term(frozen(live_penalty), penalized)
+    known = given(z, parameters)
+    live = []
+    for k, constraint in enumerate(formulation.constraints):
+        name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
+        of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
+        live.append(listed(called(constraint, of, z, known), of))
+    penalty_of_z = None if penalty is None else over_z(penalty.expression)
+    if seen is not r:  # norms are convex and nonnegative, as absolute values are
+        _require_convex(f"{where}, loss", substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))}))
+    _require_convex(f"{where}, penalty", penalty_of_z)
+    predicts = bool(known.asked)
+    constraints = [[frozen(each) for each in group] for group in live]
+    stated = live_loss, over_z(live_penalty), live
+    return Answers(z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, stated, predicts)
 
 
-def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
-    """Return the quadratic that an expression of one variable is; None where it is something else.
+def _require_convex(where: str, expression: Any) -> None:
+    if expression is not None and not expression.is_convex():
+        accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+        raise InputError(where, "a program that is not convex", accepted)
 
-    CVXPY brings ``minimize expression`` to 1/2 x'P x + q'x with A x + s = b. It is a quadratic where all of s is zero
-    (no inequality, no cone) and the equations give what CVXPY added from v: then that is put in.
+
+def declared_form(function: Any, size: int) -> Quadratic | None:
+    """Return the quadratic of so many numbers that one of the package's own functions declares to be."""
+    if function == SQUARES:
+        return identity(size)
+    if isinstance(function, Ready):
+        return function.quadratic
+    return None
+
+
+def declared(formulation: Formulation) -> bool:
+    """Whether the functions declare what they are: quadratic forms of all equations and of z, in boxes."""
+    return (
+        formulation.ready
+        and formulation.loss == SQUARES
+        and formulation.loss_over == "equation"
+        and not np.isfinite(formulation.largest)
+        and formulation.penalty_over is None
+        and (formulation.penalty is None or declared_form(formulation.penalty, 1) is not None)
+        and all(isinstance(constraint, Box) for constraint in formulation.constraints)
+    )
+
+
+class Structure:
+    """A formulation for data of one shape: its functions' expressions of r and z, their structure and their values.
+
+    A formulation that is `declared` is called when an expression of it is first needed: what a formula or an active
+    set solves, it solves without CVXPY.
     """
-    if {v.id for v in expression.variables()} != {variable.id}:
-        return None
-    if not expression.is_quadratic() or cp.huber in expression.atoms():  # which CVXPY counts among quadratics
-        return None
-    variable.save_value(None)  # atoms ask for the value of what they are made of, and may get a stale one
-    data = cp.Problem(cp.Minimize(expression)).get_problem_data(cp.CLARABEL, solver_opts={})[0]
-    if data.get("P") is None or data["dims"].zero != len(data["b"]) or data.get("lower_bounds") is not None:
-        return None
-    reduced = _reduced(data, variable)
-    if reduced is None:
-        return None
-    H, g = reduced
-    variable.value = np.zeros(variable.size)
-    return _completed(H, g, float(expression.value))
+
+    def __init__(self, formulation: Formulation, shape: Shape):
+        self.formulation, self.parameters = formulation, shape.parameters
+        self.n, self.equations, self.groups = shape.unknowns, shape.equations, shape.groups
+        self.limited = bool(np.isfinite(formulation.largest))
+        self.constrained = bool(formulation.constraints) or self.limited
+        self._lock = threading.RLock()
+        self._called: Answers | None = None
+        self._declared = declared(formulation)
+        if self._declared:
+            self.box  # noqa: B018 - limits that do not fit the parameters are refused now
+        else:  # a user's functions may return another thing later
+            self.answers  # noqa: B018
+
+    @property
+    def answers(self) -> Answers:
+        """The expressions; the functions are called once, whichever thread needs them first."""
+        with self._lock:
+            if self._called is None:
+                self._called = answers(self.formulation, self.parameters, self.equations, self.groups)
+        return self._called
+
+    @property
+    def predicts(self) -> bool:
+        """Whether constraints use positions, which are linear about some point."""
+        return not self._declared and self.answers.predicts
+
+    @property
+    def over_norms(self) -> bool:
+        """Whether the loss gets the configurations' norms."""
+        return self.formulation.loss_over == "configuration"
+
+    @property
+    def constraints(self) -> list[list[Any]]:
+        """The constraints of z, one list for every function."""
+        return self.answers.constraints
+
+    @property
+    def flat(self) -> list[Any]:
+        """All constraints of z."""
+        return [constraint for group in self.constraints for constraint in group]
+
+    def of_r(self, stated: Any) -> Any:
+        """Return an expression of what the loss gets as one of r."""
+        seen, r = self.answers.loss.variable, self.answers.r
+        return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
+
+    @cached_property
+    def loss_of_r(self) -> Any:
+        """The loss as an expression of r."""
+        return self.of_r(self.answers.loss.expression)
+
+    @cached_property
+    def limit_of_norms(self) -> Any:
+        """The bound of the configurations' norms."""
+        return norms(self.answers.r, self.groups) <= self.formulation.largest
+
+    def on_squares(self) -> Structure:
+        """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
+        made = copy.copy(self)
+        for name in ("quadratic_of_r", "loss", "joint", "inner", "order", "sizes"):
+            vars(made).pop(name, None)
+        made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
+        made.equations, made.limited = self.n + 1, False
+        made.constrained = bool(self.formulation.constraints)
+        return made
+
+    def like(self, other: Structure) -> bool:
+        """Whether the functions returned the same another time, for data of the same shape."""
+        same = (self.n, self.equations) == (other.n, other.equations) and np.array_equal(self.groups, other.groups)
+        return same and not self._declared and self.answers.like(other.answers)
+
+    # --- structure ---------------------------------------------------------------------------------------------
+
+    @property
+    def loss_form(self) -> Quadratic | None:
+        """The quadratic of r that the loss is."""
+        return None if self.limited else self.quadratic_of_r
+
+    @cached_property
+    def quadratic_of_r(self) -> Quadratic | None:
+        """The quadratic of r that the loss is, whether or not ``largest`` bounds it."""
+        size = len(np.unique(self.groups)) if self.over_norms else self.equations
+        form = declared_form(self.formulation.loss, size)
+        if form is None:
+            form = quadratic(self.answers.loss.expression, self.answers.loss.variable)
+        if form is None or not self.over_norms:
+            return form
+        if not form.diagonal or form.c.any():
+            return None
+        which = np.unique(self.groups, return_inverse=True)[1]
+        return Quadratic(form.L[which], np.zeros(len(which)), form.constant)  # p_k v_k^2 = p_k |r_k|^2
+
+    @cached_property
+    def penalty_form(self) -> Quadratic | None:
+        """The quadratic of z that the penalty is."""
+        if self.formulation.penalty is None:
+            return None
+        groups = self.formulation.penalty_over is not None
+        form = declared_form(self.formulation.penalty, len(self.answers.differences) if groups else self.n)
+        if form is None:
+            form = quadratic(self.answers.penalty.expression, self.answers.penalty.variable)
+        if form is None or not groups:
+            return form
+        if not form.diagonal or form.c.any():
+            return None
+        L = np.vstack([root * D for root, D in zip(form.L, self.answers.differences, strict=True)])
+        return Quadratic(L, np.zeros(len(L)), form.constant)
+
+    @cached_property
+    def limits(self) -> list[tuple[Array, Array]]:
+        """Lower and upper bounds (n,) of every `Box`, in the order in which they are stated."""
+        boxes = [constraint for constraint in self.formulation.constraints if isinstance(constraint, Box)]
+        return [box.bounds(self.parameters) for box in boxes]
+
+    @property
+    def _boxes(self) -> bool:
+        return all(isinstance(constraint, Box) for constraint in self.formulation.constraints)
+
+    @cached_property
+    def box(self) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none."""
+        if not self._boxes:
+            return None
+        lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        for low, high in self.limits:
+            lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+        if self.limited or (lower > upper).any():
+            return None
+        return lower, upper
+
+    @cached_property
+    def canonical(self) -> Canonical:
+        """Penalty and constraints of z in canonical form."""
+        if self._boxes and (self.formulation.penalty is None or self.penalty_form is not None):
+            return Canonical.box(self.n, self.penalty_form, self.limits)
+        penalty = self.answers.penalty_of_z
+        with self._lock:
+            return Canonical(cp.Constant(0.0) if penalty is None else penalty, self.flat, self.answers.z)
+
+    @cached_property
+    def loss(self) -> Loss | None:
+        """The loss as the solver sees it, where it is no square, or limited by ``largest``."""
+        if self.loss_form is not None:
+            return None
+        with self._lock:
+            if not self.limited:
+                return Loss(self.answers.loss.expression, self.answers.loss.variable, (), self.over_norms)
+            expression = self.loss_of_r if self.quadratic_of_r is None else cp.Constant(0.0)  # squares are reduced
+            return Loss(expression, self.answers.r, (self.limit_of_norms,), False)
+
+    @cached_property
+    def order(self) -> np.ndarray | None:
+        """(m,) sorts equations by configurations; None where they stay as they are."""
+        if self.limited or not self.over_norms:
+            return None
+        order = np.argsort(self.groups, kind="stable")
+        return order if (np.diff(order) != 1).any() else None
+
+    @cached_property
+    def sizes(self) -> np.ndarray | None:
+        """(N,) equations of every configuration, where the loss gets norms."""
+        if self.limited or not self.over_norms:
+            return None
+        return np.unique(self.groups, return_counts=True)[1]
+
+    # --- values ------------------------------------------------------------------------------------------------
+
+    def _own_of(self, *stated: Any) -> set[int]:
+        """Return which of the functions' own variables some expressions and constraints have."""
+        if self._declared or not self.answers.own:
+            return set()
+        own = {variable.id for variable in self.answers.own}
+        return own & {v.id for each in stated if each is not None for v in each.variables()}
+
+    @cached_property
+    def inner(self) -> bool:
+        """Whether loss or penalty have variables of their own: a value is a minimum over them."""
+        return not self._declared and bool(self._own_of(self.answers.loss.expression, self.answers.penalty_of_z))
+
+    @cached_property
+    def joint(self) -> bool:
+        """Whether the loss shares variables with penalty or constraints: then they are one program."""
+        if self._declared:
+            return False
+        return bool(self._own_of(self.answers.loss.expression) & self._own_of(self.answers.penalty_of_z, *self.flat))
+
+    def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
+        """Return loss and penalty at numbers; variables of the functions' own are at their best."""
+        if not self.inner:
+            return self.loss_of(r), self.penalty_of(z)
+        with self._lock:
+            if self.joint:
+                return self._together(z, r, weight)
+            if self._own_of(self.answers.loss.expression):
+                loss = self._loss_at_best.at_best(self.seen(r))
+            else:
+                loss = self.loss_of(r)
+            if self._own_of(self.answers.penalty_of_z):
+                return loss, self._penalty_at_best.at_best(z)
+            return loss, self.penalty_of(z)
+
+    @cached_property
+    def _loss_at_best(self) -> Canonical:
+        return Canonical(self.answers.loss.expression, [], self.answers.loss.variable)
+
+    @cached_property
+    def _penalty_at_best(self) -> Canonical:
+        tied = [c for c in self.flat if self._own_of(c)]
+        return Canonical(self.answers.penalty_of_z, tied, self.answers.z)
+
+    def _together(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
+        """Minimize loss + weight penalty over variables that both share, z and r given."""
+        instead = {id(self.answers.z): cp.Constant(z), id(self.answers.r): cp.Constant(r)}
+        loss = substituted(self.loss_of_r, instead)
+        penalty: Any = cp.Constant(0.0)
+        if self.answers.penalty_of_z is not None:
+            penalty = substituted(self.answers.penalty_of_z, instead)
+        tied = [substituted(c, instead) for c in self.flat if self._own_of(c)]
+        problem = cp.Problem(cp.Minimize(loss + weight * penalty), tied)
+        for variable in problem.variables():
+            variable.save_value(None)
+        problem.solve(solver=cp.CLARABEL)
+        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+            return float("inf"), 0.0
+        return float(loss.value), float(penalty.value)
+
+    def loss_of(self, r: Array) -> float:
+        """Return the loss of a residual (m,)."""
+        if self.formulation.loss == SQUARES:  # of residuals or of norms
+            return float(r @ r)
+        return self.answers.loss(self.seen(r))
+
+    def penalty_of(self, z: Array) -> float:
+        """Return the penalty of z (n,)."""
+        if self.formulation.penalty is None:
+            return 0.0
+        if self.formulation.penalty_over is not None:
+            z = np.array([float(np.linalg.norm(D @ z)) for D in self.answers.differences])
+        form = declared_form(self.formulation.penalty, len(z))
+        return self.answers.penalty(z) if form is None else form.value(z)
+
+    def seen(self, r: Array) -> Array:
+        """Return what the loss gets of a residual: itself, or the norms of the configurations."""
+        return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
+
+    def loss_slope(self, r: Array) -> Array | None:
+        """Return the gradient (m,) of the loss by the residual; None where CVXPY knows none."""
+        if self.inner:
+            return None
+        if self.formulation.loss == SQUARES:
+            return 2 * r
+        seen = self.seen(r)
+        slope = self.answers.loss.slope(seen)
+        if slope is None or not self.over_norms:
+            return slope
+        return (slope / np.maximum(seen, 1e-150))[self.groups] * r
+
+    def penalty_slope(self, z: Array) -> Array | None:
+        """Return the gradient (n,) of the penalty by z; None where CVXPY knows none."""
+        if self.inner or self.formulation.penalty is None:
+            return None
+        if self.formulation.penalty_over is None:
+            form = declared_form(self.formulation.penalty, self.n)
+            return self.answers.penalty.slope(z) if form is None else form.slope(z)
+        own = cp.Variable(self.n)
+        return Term(substituted(self.answers.penalty_of_z, {id(self.answers.z): own}), own).slope(z)
+
+    def trusted(self, lengths: Array, count: np.ndarray) -> Trusted:
+        """Return the rows that the loss trusts, of configurations with these norms and numbers of equations (N,)."""
+
+        def slope_at(v: Array) -> Array | None:
+            if self.inner:
+                return None
+            size = self.answers.loss.variable.size
+            if size < len(v):  # a program of n + 1 rows
+                return term(self.formulation.loss, len(v), "loss").slope(v)
+            slope = self.answers.loss.slope(np.concatenate([v, np.full(size - len(v), SMALL)]))
+            return None if slope is None else slope[: len(v)]
+
+        return trusted(self.formulation.name, slope_at, lengths, count, self.formulation.loss_over)
+
+    def met(self, z: Array) -> bool:
+        """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
+        own = self.answers.z
+        with self._lock:
+            if any(variable is not own for limit in self.flat for variable in limit.variables()):
+                return False
+            own.save_value(z)
+            with np.errstate(all="ignore"):
+                return all(fulfilled(limit) for limit in self.flat)
 
 
-def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] | None:
-    """Return H (sparse) and g of 1/2 v'H v + g'v, with what CVXPY added put in from its equations."""
-    start = data["param_prob"].var_id_to_col[variable.id]
-    own = start + np.arange(variable.size)
-    rest = np.setdiff1d(np.arange(len(data["c"])), own)
-    P: Any = scipy.sparse.csr_array(data["P"])
-    A: Any = scipy.sparse.csc_array(data["A"])
-    if A.shape[0] != len(rest):
-        return None
-    H: Any = P[own][:, own]
-    g = data["c"][own]
-    if not len(rest):
-        return H, g
+def structure(formulation: Formulation, model: LinearModel) -> Structure:
+    """Return the structure of a formulation for the shape of a model; that of a ready one may be there already."""
+    if not formulation.solvable:
+        return Lost(formulation, model)
+    m, n = model.A.shape
+    if model.stands_for is not None:
+        formulation = _for_triangle(formulation, model.equations)
+    if formulation.loss in INVARIANT and formulation.loss_over == "equation" and not np.isfinite(formulation.largest):
+        m = n + 1
+    groups = model.members[0]
+    p = model.parameters
+    signature: tuple[Any, ...] = ()
+    if formulation.constraints or formulation.penalty_over is not None:
+        signature = (p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
+    shape = Shape(n, m, groups.tobytes(), signature, p, groups)
+    return _cached(formulation, shape) if formulation.ready else Structure(formulation, shape)
+
+
+@lru_cache(maxsize=64)
+def _cached(formulation: Formulation, shape: Shape) -> Structure:
+    return Structure(formulation, shape)
+
+
+def _for_triangle(formulation: Formulation, equations: int) -> Formulation:
+    """Return a formulation whose loss means of a QR factor what it means of the equations that this stands for.
+
+    A loss may depend on their number: a mean square of the equations is no mean of the factor's rows.
+    """
+    if not invariant(formulation, lambda: equations):
+        found = f"formulation '{formulation.name}'"
+        raise InputError(found, "equations of which only the triangle is kept", "a squared loss")
+    form = None
+    if formulation.loss not in INVARIANT:
+        form = _loss_form(formulation, equations)
+    if form is None:
+        return formulation
+    factor, constant = float(form.L[0] ** 2), form.constant
+    return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
+
+
+def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
+    """Return whether the loss sees only the length of the whole residual; ``equations`` counts them where needed."""
+    if formulation.loss_over != "equation" or np.isfinite(formulation.largest):
+        return False
+    if formulation.loss in INVARIANT:
+        return True
+    if formulation.ready:
+        return False
+    count = equations()
+    if count > FEW:
+        return False
+    form = _loss_form(formulation, count)
+    return form is not None and form.diagonal and not form.c.any() and bool(np.ptp(form.L) == 0)
+
+
+def _loss_form(formulation: Formulation, equations: int) -> Quadratic | None:
+    """Return the quadratic that a loss is of so many residuals; None where it is something else."""
     try:
-        factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(A[:, rest]))
-    except RuntimeError:  # singular: they do not follow from v
+        loss = term(formulation.loss, equations, f"formulation '{formulation.name}', loss")
+    except ValueError:  # it is made for another number of residuals
         return None
-    M = -scipy.sparse.csr_array(factors.solve(A[:, own].toarray()))
-    d = factors.solve(np.asarray(data["b"], dtype=float))
-    cross, inner = P[own][:, rest], P[rest][:, rest]
-    H = H + cross @ M + M.T @ cross.T + M.T @ inner @ M
-    g = g + cross @ d + M.T @ (data["c"][rest] + inner @ d)
-    return H, g
+    return quadratic(loss.expression, loss.variable)
 
 
-def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
-    """Complete the square of 1/2 v'H v + g'v + at_zero; None where it has no minimum, or is too large to factor."""
-    H = scipy.sparse.coo_array(H)
-    off = H.row != H.col
-    if not np.any(H.data[off]):
-        diagonal = np.bincount(H.row, H.data, minlength=len(g)) / 2
-        return _from_spectrum(diagonal, g, None, at_zero, 0.0)
-    if len(g) > DENSE:
-        return None
-    values, vectors = np.linalg.eigh(H.toarray() / 2)
-    return _from_spectrum(values, vectors.T @ g, vectors, at_zero)
+class Lost(Structure):
+    """The structure of a formulation whose functions a file could not hold; their quadratic forms may be known."""
+
+    def __init__(
+        self,
+        formulation: Formulation,
+        model: LinearModel,
+        loss_form: Quadratic | None = None,
+        penalty_form: Quadratic | None = None,
+    ):
+        self.formulation, self.parameters = formulation, model.parameters
+        self.n, self.equations, self.groups = model.A.shape[1], len(model.b), model.members[0]
+        self.limited, self.constrained = False, True
+        self.quadratic_of_r, self.penalty_form, self.box = loss_form, penalty_form, None
+        self._declared = True
+        self.values = self.trusted = lost(formulation.name)
+
+    @property
+    def answers(self) -> Answers:
+        """Raises InputError."""
+        return lost(self.formulation.name)()
+
+    @property
+    def constraints(self) -> list[list[Any]]:
+        """None: nobody can call the functions again."""
+        return []
 
 
-def _from_spectrum(
-    values: Array, slope: Array, vectors: Array | None, at_zero: float, rounding: float = ROUNDING
-) -> Quadratic | None:
-    """Return the quadratic sum values_i y_i^2 + slope_i y_i + at_zero in y = vectors'v.
+def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, Squares | None]:
+    """Return the formulation by which blocks of rows are solved, and what makes its squares of their equations.
 
-    Values below ``rounding`` times the largest are zero. Those of a diagonal are known one by one: none is too small.
+    A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
+    that is no sum over rows, and for a ``largest``.
     """
-    largest = float(np.max(values, initial=0.0))
-    curved = values > rounding * largest
-    flat_slope = float(np.max(np.abs(slope[~curved]), initial=0.0))
-    if largest <= 0 or np.min(values) < -ROUNDING * largest:
-        return None
-    if flat_slope > 1e-9 * max(float(np.max(np.abs(slope))), largest):
-        return None  # linear in some direction: no minimum of its own
-    root = np.sqrt(np.where(curved, values, 0.0))
-    c = np.divide(-slope, 2 * root, out=np.zeros_like(root), where=curved)
-    constant = at_zero - float(c @ c)
-    if vectors is None:
-        return Quadratic(root, c, constant)
-    return Quadratic((vectors[:, curved] * root[curved]).T, c[curved], constant)
+    if invariant(formulation, equations):
+        return formulation, None
+    where = f"formulation '{formulation.name}'"
+    accepted = "a squared loss, or a sum over configurations or equations (robust)"
+    if np.isfinite(formulation.largest):
+        raise InputError(where, "a largest norm, with measurements in parts", accepted)
+    if not separable(formulation.loss, formulation.loss_over):
+        raise InputError(where, "a loss that is no sum, with measurements in parts", accepted)
+    squares = Squares(formulation.loss, formulation.name, formulation.loss_over)
+    return replace(formulation, loss=SQUARES, loss_over="equation"), squares

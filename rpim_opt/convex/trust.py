@@ -1,17 +1,19 @@
-"""Which configurations a robust loss trusts, and the squares that its fit amounts to."""
+"""Robust losses as squares: of the configurations that they trust, and of all rows, some at a time (blocks)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import scipy
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.expressions import Term, term
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.terms import term
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.source import Source
 
@@ -19,43 +21,43 @@ RARE = 0.01
 """What part of good sets of data have any configuration that counts as an outlier."""
 SMALL = 1e-6
 """Residuals are taken as no smaller, in sigmas: below, a norm has no slope of its own."""
+SHARE, STEP = 0.3, 1e-4
+"""A step is expected to move a residual by this part of what the last one did, and by this part of it at least."""
+CROSSING = 0.3
+"""Where a loss has a kink at zero: residuals that moved by more than this part of themselves may yet end there."""
+LEAST_CURVATURE = 1e-3
+"""Curvature along a residual, relative to that across it, where the loss has less: a square needs some."""
+SEPARATE = 1e-9
+"""How exactly a loss of several residuals is the sum of their losses, relative."""
 
 
 def _quantiles(beyond: float, count: np.ndarray) -> Array:
-    """Return which chi-squared numbers with ``count`` (N,) degrees of freedom exceed with a probability."""
+    """Return upper quantiles of the chi-squared distributions with ``count`` (N,) degrees of freedom."""
     several, which = np.unique(count, return_inverse=True)
     return chdtri(several, beyond)[which]
 
 
 def noise_level(norms: Array, count: np.ndarray) -> float:
-    """Return the noise that whitened norms (N,) with ``count`` equations show: median(norm / median of chi_k).
-
-    At least 1, which is the declared noise.
-    """
+    """Return median(norm / median of chi_k) of whitened norms (N,) with k = ``count`` equations, at least 1."""
     return max(1.0, float(np.median(norms / np.sqrt(_quantiles(0.5, count)))))
 
 
 def limits(noise: float, configurations: int, count: np.ndarray) -> Array:
-    """Return above which norm one of so many configurations with ``count`` equations is an outlier."""
+    """Return the norm above which one of so many configurations with ``count`` equations is an outlier."""
     return noise * np.sqrt(_quantiles(RARE / configurations, count))
 
 
 def outlying(norms: Array, count: np.ndarray) -> Array:
-    """Return above which whitened norm (N,) a row or configuration with ``count`` equations is an outlier.
+    """Return the whitened norms (N,) above which rows or configurations are outliers: s sqrt(chi2_k^-1(1 - 0.01 / N)).
 
-    What one good set of data in a hundred would exceed, s sqrt(chi2_k^-1(1 - 0.01 / N)), with the declared noise s = 1
-    or, where that is larger, median(norm / median of chi_k).
+    One good set of data in a hundred exceeds them; s is the `noise_level`.
     """
     return limits(noise_level(norms, count), len(norms), count)
 
 
 @dataclass(frozen=True)
 class Trusted:
-    """Keeps the equations that a robust loss trusts, weighed as it does: squares that its fit amounts to.
-
-    Configurations above ``noise sqrt(chi2_k^-1(1 - 0.01 / configurations))`` are left out, with k their equations
-    (`outlying`); the others are multiplied by the root of ``factor``. A `Reweigh` for measurements in parts too.
-    """
+    """The equations that a robust loss trusts, times the root of ``factor``; a `Reweigh` for blocks."""
 
     noise: float
     configurations: int
@@ -68,7 +70,7 @@ class Trusted:
         return (norms <= limits(self.noise, self.configurations, count))[which]
 
     def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:
-        """Return the trusted equations; nothing is constant. z is (n,)."""
+        """Return the trusted equations at z (n,), and no constant."""
         return kept_equations(model, self.keeps(model, z), self.factor), 0.0
 
 
@@ -86,24 +88,8 @@ def trusted(
 ) -> Trusted:
     """Return what a robust formulation trusts: its factor is the median of loss'(v) / (2 v) over what it keeps.
 
-    v are the norms of the configurations; of a loss over equations norm / sqrt(count), each equation's share of it, so
-    that it does not matter how the measurements are stored.
-
-    Parameters
-    ----------
-    name
-        The formulation's.
-    slope_at
-        The loss's slopes at numbers v, one each.
-    norms, count
-        (N,) whitened norms of the configurations, and how many equations each has.
-    over
-        ``"equation"`` or ``"configuration"``.
-
-    Raises
-    ------
-    InputError
-        For a loss without a slope, or one that rests on few equations (minimax).
+    v are the norms of the configurations (N,); of a loss over equations norm / sqrt(count), each equation's share, so
+    that storage does not matter. InputError for a loss without a slope, or that rests on few equations (minimax).
     """
     noise = noise_level(norms, count)
     keep = norms <= limits(noise, len(norms), count)
@@ -118,19 +104,99 @@ def trusted(
     slope = slope_at(v)
     if slope is None or len(slope) != len(v):
         raise InputError(found, "a loss without slope", accepted)
-    factor = 0.0
-    if len(v):
-        factor = float(np.median(np.abs(slope) / (2 * v)))
+    factor = float(np.median(np.abs(slope) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
         raise InputError(found, "a loss that rests on a few equations", accepted)
     return Trusted(noise, len(norms), factor)
 
 
 def trusted_rows(source: Source, x: Array, formulation: Formulation) -> Trusted:
-    """Return what a robust formulation trusts of measurements, wherever they stand, at deviations x (n,) [SI]."""
+    """Return what a robust formulation trusts of measurements in memory or blocks, at deviations x (n,) [SI]."""
     norms, count = source.configuration_errors(x)
 
     def slope_at(v: Array) -> Array | None:
         return term(formulation.loss, len(v), f"formulation '{formulation.name}', loss").slope(v)
 
     return trusted(formulation.name, slope_at, norms, count, formulation.loss_over)
+
+
+# --- blocks of rows ---
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Replaces a loss that is a sum over rows by squares, some equations at a time: a `Reweigh` for blocks.
+
+    With r_i the residual of a configuration (or of an equation) at z, v = |r_i|, u = r_i / v and w = loss'(v) / (2 v),
+    the equations of i are multiplied by M and their right-hand side is moved such that ::
+
+        |M (A_i z' - b_i) - shift|^2 + offset    with    M = sqrt(c) u u' + sqrt(w) (1 - u u')
+
+    has the value and the gradient of the loss at z' = z, its curvature across u, and along u a secant of its slopes
+    over the distance of a step: c is w in the first pass (iteratively reweighted least squares; Holland and Welsch
+    1977), which never lies below the loss, and loss''(v) / 2 in the end, with which steps shorten as Newton's do. In
+    between the loss may be above: the outer loop checks that and damps.
+
+    ``over`` is what the loss gets, ``"equation"`` or ``"configuration"``; ``before`` (n,) where the last pass was.
+    """
+
+    loss: Callable[[Any], Any]
+    name: str
+    over: str
+    before: Array | None = None
+
+    def after(self, z: Array) -> Squares:
+        """Return the squares for the pass after one at z (n,)."""
+        return replace(self, before=z)
+
+    def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:
+        """Return the equations of the squares, and the constant that they lack; z is (n,)."""
+        r = model.A @ z - model.b
+        which = np.arange(len(r))
+        if self.over == "configuration":
+            which = model.members[0]
+        norms = np.sqrt(np.bincount(which, r**2))
+        v = np.maximum(norms, SMALL)
+        priced = term(self.loss, len(v), f"formulation '{self.name}', loss")
+        slope = self.slope(priced, v)
+        across = slope / (2 * v)
+        along = np.maximum(self._along(model, z, which, v, priced), LEAST_CURVATURE * across)
+        u = r / v[which]
+        along_u = scipy.sparse.csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
+        projected = along_u @ model.A  # u'A, group by group
+        A = np.sqrt(across)[which, None] * model.A
+        A += ((np.sqrt(along) - np.sqrt(across))[which] * u)[:, None] * projected[which]
+        b = A @ z - (slope / (2 * np.sqrt(along)))[which] * u
+        return replace(model, A=A, b=b), priced(norms) - float(np.sum((A @ z - b) ** 2))
+
+    def _along(self, model: LinearModel, z: Array, which: np.ndarray, v: Array, priced: Term) -> Array:
+        """Return half the curvature along residuals of norms v, by the slopes here and where a step may lead."""
+        change = 2 * v  # where the slope, which is odd, is the negative one: such squares lie nowhere below the loss
+        if self.before is not None:
+            moved = np.sqrt(np.bincount(which, (model.A @ (z - self.before)) ** 2))
+            change = np.clip(SHARE * moved, STEP * v, 2 * v)
+            if self.slope(priced, np.full(len(v), SMALL))[0] > 0.1 * self.slope(priced, np.ones(len(v)))[0]:
+                change = np.where(moved > CROSSING * v, 2 * v, change)
+        there = v - change
+        slope_there = np.sign(there) * self.slope(priced, np.maximum(np.abs(there), SMALL))
+        return (self.slope(priced, v) - slope_there) / (2 * change)
+
+    def slope(self, priced: Term, v: Array) -> Array:
+        """Return the loss's slopes at norms v, one each; InputError where CVXPY knows none."""
+        slope = priced.slope(v)
+        if slope is None:
+            raise InputError(f"formulation '{self.name}'", "a loss without slope", "one with a slope, as robust has")
+        return slope
+
+
+def separable(loss: Callable[[Any], Any], over: str = "configuration") -> bool:
+    """Return whether a loss of several norms is the sum of what it is of each; of residuals, for either sign too."""
+    v = np.geomspace(1e-3, 1e3, 7)
+    try:
+        several, one = term(loss, len(v), "loss"), term(loss, 1, "loss")
+    except (ValueError, InputError):  # one that is made for a certain number of residuals
+        return False
+    whole = several(v)
+    alone = sum(one(np.array([each])) for each in v)
+    mirrored = several(-v) if over == "equation" else whole
+    return max(abs(whole - alone), abs(whole - mirrored)) <= SEPARATE * (1 + abs(whole))

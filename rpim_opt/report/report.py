@@ -23,7 +23,7 @@ from rpim_opt.calibration.remarks import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import turned_frames, weight_lines
-from rpim_opt.convex.atoms import SQUARES
+from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare

@@ -14,9 +14,8 @@ from rpim_opt.basics.files import inside, read_toml
 from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
 from rpim_opt.basics.units import accepted_units, split_unit
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
-from rpim_opt.convex.named import LEARNED
 from rpim_opt.convex.rules.selection import require_weight
-from rpim_opt.convex.select import SELECTORS, Selector
+from rpim_opt.convex.select import LEARNED, SELECTORS, Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement

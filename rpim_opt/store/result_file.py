@@ -22,13 +22,13 @@ from rpim_opt.calibration.diagnosis import Held, Price
 from rpim_opt.calibration.identify import calibrate, mapped_as
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
-from rpim_opt.convex.atoms import LARGEST, NORM1, NORM2, SQUARES, SUM
+from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, lost
-from rpim_opt.convex.posed import Unposed
 from rpim_opt.convex.program import Program, pose
+from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import SELECTORS, Selector
-from rpim_opt.convex.structure import Quadratic
+from rpim_opt.convex.structure import Lost
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
@@ -582,7 +582,7 @@ def _program(file: Stored, formulation: Formulation, model: LinearModel) -> Prog
     """Return the program at the solution; of a script's functions the file knows the quadratics that they were."""
     if file.forms is None:
         return pose(formulation, model)
-    return Program(formulation, model, Unposed(formulation, model, file.forms.loss, file.forms.penalty))
+    return Program(formulation, model, Lost(formulation, model, file.forms.loss, file.forms.penalty))
 
 
 def _kept(file: Stored, program: Program) -> Kept:

@@ -15,9 +15,8 @@ from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_of
-from rpim_opt.convex.named import LEARNED, weight_of
 from rpim_opt.convex.rules.selection import require_weight
-from rpim_opt.convex.select import SELECTORS
+from rpim_opt.convex.select import LEARNED, SELECTORS, weight_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames

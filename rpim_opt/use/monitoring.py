@@ -17,7 +17,7 @@ from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.covariance import scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
-from rpim_opt.convex.structure import Quadratic, identity
+from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.use.recalibration import (

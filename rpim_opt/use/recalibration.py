@@ -19,10 +19,10 @@ from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.atoms import SQUARES
 from rpim_opt.convex.constraints import matching
+from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.structure import Quadratic, identity
+from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Record
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel

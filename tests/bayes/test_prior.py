@@ -11,7 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
 from rpim_opt.bayes.prior_terms import FIXED
-from rpim_opt.convex.structure import quadratic
+from rpim_opt.convex.quadratic import quadratic
 from rpim_opt.convex.tolerances import combination
 
 PROBLEM = ro.load("position").problem

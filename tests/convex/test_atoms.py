@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex import atoms
-from rpim_opt.convex.asked import ask
-from rpim_opt.convex.atoms import ATOMS, SQUARES, named
+from rpim_opt.convex import expressions as atoms
+from rpim_opt.convex.expressions import ATOMS, SQUARES, named
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
-from rpim_opt.convex.posed import declared
-from rpim_opt.convex.structure import quadratic
+from rpim_opt.convex.quadratic import quadratic
+from rpim_opt.convex.structure import answers as ask
+from rpim_opt.convex.structure import declared
 
 DECLARED = {name: each for name, each in FORMULATIONS.items() if declared(each)}
 
@@ -70,16 +70,16 @@ def test_what_is_declared_is_what_the_canonicalization_shows(stated: Formulation
     asked = ask(stated, model.parameters, equations, model.group)
     rng = np.random.default_rng(0)
     r, z = rng.normal(size=equations), rng.normal(size=n)
-    loss = quadratic(asked.loss_term.expression, asked.loss_term.variable)
+    loss = quadratic(asked.loss.expression, asked.loss.variable)
     assert loss is not None
     assert program.loss_form is not None
-    assert program._posed.loss_of(r) == pytest.approx(loss.value(r), rel=1e-12)
-    assert program._posed.loss_slope(r) == pytest.approx(asked.loss_term.slope(r), rel=1e-12)
+    assert program.structure.loss_of(r) == pytest.approx(loss.value(r), rel=1e-12)
+    assert program.structure.loss_slope(r) == pytest.approx(asked.loss.slope(r), rel=1e-12)
     if stated.penalty is None:
         assert program.penalty_form is None
         return
-    penalty = quadratic(asked.penalty_term.expression, asked.penalty_term.variable)
+    penalty = quadratic(asked.penalty.expression, asked.penalty.variable)
     assert penalty is not None
     assert program.penalty_form is not None
     assert program.penalty_form.value(z) == pytest.approx(penalty.value(z), rel=1e-12)
-    assert program._posed.penalty_slope(z) == pytest.approx(asked.penalty_term.slope(z), rel=1e-12)
+    assert program.structure.penalty_slope(z) == pytest.approx(asked.penalty.slope(z), rel=1e-12)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.atoms import SQUARES
-from rpim_opt.convex.majorize import Squares, on_triangles, separable
+from rpim_opt.convex.expressions import SQUARES
+from rpim_opt.convex.structure import in_blocks
+from rpim_opt.convex.trust import Squares, separable
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0).scaled(np.geomspace(0.3, 30.0, 30))
@@ -125,9 +126,9 @@ def test_what_is_a_sum_over_residuals() -> None:
 
 def test_what_triangles_cannot_hold_is_refused() -> None:
     with pytest.raises(ro.InputError, match="found a loss that is no sum, with measurements in parts"):
-        on_triangles(ro.minimax, lambda: 120)
+        in_blocks(ro.minimax, lambda: 120)
     with pytest.raises(ro.InputError, match="found a largest norm, with measurements in parts"):
-        on_triangles(ro.Formulation("limited", largest=3.0), lambda: 120)
+        in_blocks(ro.Formulation("limited", largest=3.0), lambda: 120)
     squares = Squares(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)
     with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without slope"):
@@ -135,7 +136,7 @@ def test_what_triangles_cannot_hold_is_refused() -> None:
 
 
 def test_a_loss_over_triangles_is_a_sum_of_squares_and_its_maker() -> None:
-    solved, squares = on_triangles(ro.robust, lambda: 120)
+    solved, squares = in_blocks(ro.robust, lambda: 120)
     assert (solved.loss, solved.loss_over, solved.penalty) == (SQUARES, "equation", ro.robust.penalty)
     assert squares is not None
     assert (squares.loss, squares.over, squares.before) == (ro.robust.loss, "configuration", None)

@@ -7,8 +7,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of
-from rpim_opt.convex.named import LEARNED, weight_of
-from rpim_opt.convex.select import SELECTORS
+from rpim_opt.convex.select import LEARNED, SELECTORS, weight_of
 
 PROBLEM = ro.load("position").problem
 

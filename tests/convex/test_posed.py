@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.asked import norms
-from rpim_opt.convex.conflict import Stated, _irreducible, _least, conflict, name_of
-from rpim_opt.convex.posed import invariant
+from rpim_opt.convex.expressions import Frozen, Term, listed, norms, scalar, term
+from rpim_opt.convex.infeasible import Stated, _irreducible, _least, conflict, name_of
+from rpim_opt.convex.quadratic import quadratic
 from rpim_opt.convex.rules.scores import Rule, linear_rule
 from rpim_opt.convex.rules.selection import EDGES
-from rpim_opt.convex.structure import quadratic
-from rpim_opt.convex.terms import Frozen, Term, listed, scalar, term
+from rpim_opt.convex.structure import invariant
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 
@@ -26,7 +25,7 @@ L = np.random.default_rng(4).normal(size=(7, N))
 
 
 def posed(**stated: Any) -> Any:
-    return ro.convex.pose(ro.Formulation("mine", **{"penalty": cp.sum_squares, **stated}), MODEL)._posed
+    return ro.convex.pose(ro.Formulation("mine", **{"penalty": cp.sum_squares, **stated}), MODEL).structure
 
 
 def box(lower: Any, upper: Any) -> ro.constraints.Box:
@@ -180,7 +179,7 @@ def test_a_large_quadratic_is_known_where_it_is_diagonal() -> None:
 
 
 def test_how_large_a_quadratic_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rpim_opt.convex.structure.DENSE", 5)
+    monkeypatch.setattr("rpim_opt.convex.quadratic.DENSE", 5)
     for size, known in ((5, True), (6, False)):
         v = cp.Variable(size)
         assert (quadratic(cp.sum_squares(v[1:] - v[:-1]) + cp.sum_squares(v), v) is not None) == known
@@ -244,7 +243,7 @@ def test_answers_are_scalars_and_constraints() -> None:
 def contradiction(*constraints: Any, largest: float = np.inf) -> Any:
     formulation = ro.Formulation("mine", penalty=cp.sum_squares, constraints=constraints, largest=largest)
     program = ro.convex.pose(formulation, MODEL)
-    return conflict(program._posed, MODEL), program._posed
+    return conflict(program.structure, MODEL), program.structure
 
 
 def low(z: Any, p: Any) -> Any:
@@ -292,7 +291,7 @@ def test_a_box_and_a_largest_norm_each_give_way_alone() -> None:
     """Component 0 wants to be 10, to 1; the box ends at 2: one gives way by 7, or the other."""
     model = LinearModel(np.eye(N), 10.0 * np.eye(N)[0], np.repeat(np.arange(4), 3), MODEL.parameters)
     formulation = ro.Formulation("mine", penalty=cp.sum_squares, constraints=(box(-2.0, 2.0),), largest=1.0)
-    found = conflict(ro.convex.pose(formulation, model)._posed, model)
+    found = conflict(ro.convex.pose(formulation, model).structure, model)
     assert found is not None
     name = model.parameters.names[0]
     assert set(found.parameters) == {name}
@@ -307,7 +306,7 @@ def test_a_bound_that_is_nearly_reached_is_named_with_the_little_that_it_lacks()
     smallest = ro.convex.pose(ro.minimax, MODEL.scaled(np.full(30, 100.0))).solve(0.0).loss
     formulation = ro.Formulation("mine", penalty=cp.sum_squares, largest=smallest - 1e-3)
     model = MODEL.scaled(np.full(30, 100.0))
-    found = conflict(ro.convex.pose(formulation, model)._posed, model)
+    found = conflict(ro.convex.pose(formulation, model).structure, model)
     assert found is not None
     assert found.configurations
     assert 1e-4 < sum(found.configurations.values()) < 2e-2

@@ -196,28 +196,6 @@ def test_what_is_trusted_is_told_by_the_norms() -> None:
     assert 0 < trust.factor <= 1
 
 
-@pytest.mark.parametrize("damped", [False, True])
-def test_where_a_minimum_moves_is_what_solving_again_says(damped: bool) -> None:
-    by = np.random.default_rng(6).normal(size=len(MODEL.b))
-    damping = Damping(Z, np.geomspace(0.1, 10.0, N)) if damped else None
-    mixed = ro.Formulation("mixed", loss=cp.sum_squares, penalty=lambda z: cp.sum_squares(DENSE @ z - 1))
-    for formulation in (ro.tikhonov, ro.least_squares, mixed):
-        program = ro.convex.pose(formulation, MODEL)
-        there = program.on(MODEL.with_values(MODEL.b + by))
-        moved = there.solve(2.0, damping=damping).z - program.solve(2.0, damping=damping).z
-        assert program.moved(by, 2.0, damping) == pytest.approx(moved, rel=1e-9, abs=1e-11)
-
-
-def test_where_a_minimum_moves_is_not_said_without_a_formula_or_digits() -> None:
-    by = np.ones(len(MODEL.b))
-    for formulation in (ro.robust, ro.lasso, ro.bounded):
-        assert ro.convex.pose(formulation, MODEL).moved(by, 1.0) is None
-    blind = replace(MODEL, A=MODEL.A * (np.arange(N) != 3))  # no data see the fourth
-    assert ro.convex.pose(ro.least_squares, blind).moved(by, 0.0) is None
-    assert ro.convex.pose(ro.tikhonov, blind).moved(by, 1e-12) is None
-    assert ro.convex.pose(ro.tikhonov, blind).moved(by, 1.0) is not None
-
-
 def test_a_damped_step_of_what_nothing_holds_is_the_shortest() -> None:
     blind = replace(MODEL, A=MODEL.A * (np.arange(N) != 3))
     size = np.where(np.arange(N) == 3, 0.0, 0.1)  # a column without data has no length

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rpim_opt.convex.quadratic import Ridge, ridge, robot_alone
-from rpim_opt.convex.structure import Quadratic, identity
+from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 

@@ -12,8 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics import threads
-from rpim_opt.convex.majorize import Squares
-from rpim_opt.convex.trust import trusted_rows
+from rpim_opt.convex.trust import Squares, trusted_rows
 from rpim_opt.problem import parts as parts_module
 from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster, whole_configurations
 

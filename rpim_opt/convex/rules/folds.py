@@ -316,7 +316,7 @@ def _approximates(program: Program) -> bool:
     """
     if program.loss_form is None or not program.loss_form.diagonal or program.closed_form:
         return False
-    return program.polyhedral or len(np.unique(program.model.group)) > EXACTLY
+    return program.structure.canonical.polyhedral or len(np.unique(program.model.group)) > EXACTLY
 
 
 def _approximately(program: Program) -> Predicted:

@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.quadratic import Ridge, ridge, robot_alone
+from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
@@ -22,7 +22,6 @@ from rpim_opt.convex.rules.selection import (
     weight_grid,
     with_rows,
 )
-from rpim_opt.convex.structure import Quadratic, identity
 from rpim_opt.problem.linear import LinearModel
 
 TOGETHER = 250_000

@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.minimization import least
 from rpim_opt.basics.text import Tabled, counted
+from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel
@@ -187,7 +188,7 @@ def _largest(program: Program) -> float | None:
     Of a positively homogeneous penalty it is the dual norm of the loss's slope g at nominal:
     max { -g'z : penalty(z) <= 1 }.
     """
-    if program.linear_penalty or program.inner or program.loss_form is None:
+    if program.linear_penalty or program.structure.inner or program.loss_form is None:
         return None
     n = program.model.A.shape[1]
     slope = program.gradient(np.zeros(n), 0.0)
@@ -195,8 +196,15 @@ def _largest(program: Program) -> float | None:
     once, twice = program.value(probe)[1], program.value(2 * probe)[1]
     if slope is None or program.value(0 * probe)[1] != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:
         return None
-    found = program.largest_slope(slope)
-    return found if found > 0 else None
+    answers = program.structure.answers
+    problem = cp.Problem(cp.Minimize(slope @ answers.z), [answers.penalty_of_z <= 1])
+    answers.z.save_value(None)
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.SolverError:
+        return None
+    value: Any = problem.value
+    return -float(value) if problem.status == cp.OPTIMAL and value < 0 else None
 
 
 def grid_of(form: Ridge, count: int = 200) -> Array:

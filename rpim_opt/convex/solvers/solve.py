@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.canonical import Canonical
-from rpim_opt.convex.solvers.newton import FEW, Newton, Rows, kink_of
-from rpim_opt.convex.solvers.small import Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.summands import OutsideDomain, Summands
+from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
+from rpim_opt.convex.solvers.separable import FEW, Newton, OutsideDomain, Rows, Summands, kink_of
 
 GENERATIONS = 40
 """Rounds of row generation before all rows are taken."""
@@ -20,34 +18,13 @@ VIOLATED = 1e-8
 """Part of the largest entry by which an inequality of a left-out row may be missed."""
 
 
-@dataclass(frozen=True, eq=False)
 class Loss:
-    """A loss that is no square, as the solver sees it.
+    """A loss that is no square: an expression of residuals (m,) or of configurations' norms (N,), and limits of it."""
 
-    Parameters
-    ----------
-    expression, variable
-        Expression of residuals (m,), or of configurations' norms (N,), and the variable that stands for them.
-    limits
-        Constraints of that variable.
-    over_norms
-        Whether the variable stands for norms.
-    """
-
-    expression: Any
-    variable: Any
-    limits: tuple[Any, ...]
-    over_norms: bool
-
-    def __post_init__(self) -> None:
-        summands = Summands(self.expression, self.variable, self.over_norms)
-        object.__setattr__(self, "summands", summands if summands.separable and not self.limits else None)
-
-    summands: Summands | None = None
-
-    def canonical(self) -> Canonical:
-        """Return the loss in canonical form."""
-        return Canonical(self.expression, self.limits, self.variable)
+    def __init__(self, expression: Any, variable: Any, limits: tuple[Any, ...], over_norms: bool):
+        self.expression, self.variable, self.limits, self.over_norms = expression, variable, limits, over_norms
+        summands = Summands(expression, variable, over_norms)
+        self.summands = summands if summands.separable and not limits else None
 
 
 @dataclass(eq=False)
@@ -71,6 +48,12 @@ class Warm:
         if rows not in self.small:
             self.small[rows] = Small(self.penalty, rows)
         return self.small[rows]
+
+    def form(self, loss: Loss) -> Canonical:
+        """Return the loss in canonical form."""
+        if self.canonical is None:
+            self.canonical = Canonical(loss.expression, loss.limits, loss.variable)
+        return self.canonical
 
     def begun(self, z: Array | None) -> Warm:
         """Return another one that shares what does not change, to begin at z (n,) or anew."""
@@ -97,8 +80,7 @@ def minimum(
     warm: Warm,
     weight: float,
     squares: Squares | None = None,
-    size: Array | None = None,
-    centre: Array | None = None,
+    damping: Damping | None = None,
     accuracy: float = 0.0,
 ) -> Minimum:
     """Return the minimum of a convex program; what solves it is told by the structure of the loss.
@@ -112,59 +94,45 @@ def minimum(
                                else all rows
     ========================== =====================================================
 
-    Parameters
-    ----------
-    loss, rows
-        What the loss is, and its equations; a quadratic one is None, with ``squares``.
-    warm
-        Where the last minimum was; this one is left there.
-    weight
-        Of the penalty.
-    squares
-        The quadratic part of the loss.
-    size, centre
-        (n,) damping |size (z - centre)|^2.
-    accuracy
-        Part of the loss that a sum over rows may be above its minimum.
-
-    Raises
-    ------
-    Unsolved
-        Where there is no minimum, or the solver does not find it.
+    A quadratic loss is None, with ``squares``, which are also what is quadratic beside another loss. ``accuracy`` is
+    the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is found.
     """
     with warm.lock:
         n = rows.A.shape[1]
         if loss is None:
-            point = warm.program(n + 1).solve((squares or rows.squares).damped(size, centre), weight)
+            point = warm.program(n + 1).solve((squares or rows.squares).damped(damping), weight)
         elif loss.summands is None:
-            point = _coupled(loss, rows, warm, weight, squares, size, centre)
+            point = _coupled(loss, rows, warm, weight, squares, damping)
         else:
             try:
-                point = _separable(loss, rows, warm, weight, size, centre, accuracy)
+                point = _separable(loss, loss.summands, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
-                point = _all_rows(loss, rows, warm, weight, None, size, centre)
+                point = _all_rows(loss, rows, warm, weight, None, damping)
         z = point.x[warm.penalty.at]
         warm.z, warm.x = z, point.x
         return Minimum(z, point.x, point.dual, point.iterations, point.slope)
 
 
 def _separable(
-    loss: Loss, rows: Rows, warm: Warm, weight: float, size: Array | None, centre: Array | None, accuracy: float
+    loss: Loss,
+    summands: Summands,
+    rows: Rows,
+    warm: Warm,
+    weight: float,
+    damping: Damping | None,
+    accuracy: float,
 ) -> Point:
-    summands = loss.summands
-    if summands is None:
-        raise OutsideDomain
     if warm.kink < 0:
         warm.kink = kink_of(summands, rows)
     if warm.kink and summands.variable.size <= FEW:
-        return _all_rows(loss, rows, warm, weight, None, size, centre)
+        return _all_rows(loss, rows, warm, weight, None, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
     known = z is not None and x is not None and len(x) == warm.penalty.size
     if z is None or x is None or not known:
-        x = small.solve(rows.squares.damped(size, centre), weight).x
+        x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.penalty.at]
-    search = Newton(summands, rows, warm.penalty, small, weight, size, centre, warm.kink, warm.exact, accuracy)
+    search = Newton(summands, rows, warm.penalty, small, weight, damping, warm.kink, warm.exact, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
@@ -178,63 +146,44 @@ def _separable(
 # --- losses that are no sums over entries ----------------------------------------------------------------------
 
 
-def _canonical(loss: Loss, warm: Warm) -> Canonical:
-    if warm.canonical is None:
-        warm.canonical = loss.canonical()
-    return warm.canonical
-
-
-def _stacked(squares: Squares | None, n: int, size: Array | None, centre: Array | None) -> Squares | None:
+def _beside(squares: Squares | None, n: int, damping: Damping | None) -> Squares | None:
     """Return the quadratic terms beside a loss that is taken as it is; None where there are none."""
-    if squares is None and size is None:
+    if squares is None and damping is None:
         return None
-    return (squares or Squares(np.zeros((n + 1, n)), np.zeros(n + 1), np.zeros(n))).damped(size, centre)
+    return (squares or Squares(np.zeros((n + 1, n)), np.zeros(n + 1), np.zeros(n))).damped(damping)
 
 
 def _all_rows(
-    loss: Loss,
-    rows: Rows,
-    warm: Warm,
-    weight: float,
-    squares: Squares | None,
-    size: Array | None,
-    centre: Array | None,
+    loss: Loss, rows: Rows, warm: Warm, weight: float, squares: Squares | None, damping: Damping | None
 ) -> Point:
     """Return the minimum with all rows of the loss in Clarabel."""
     n = rows.A.shape[1]
-    terms = _stacked(squares, n, size, centre)
+    terms = _beside(squares, n, damping)
     count = 0 if terms is None else n + 1
     if count not in warm.direct:
-        sizes = rows.sizes if loss.over_norms else None
-        warm.direct[count] = Small(warm.penalty, count, _canonical(loss, warm), sizes)
+        warm.direct[count] = Small(warm.penalty, count, warm.form(loss), rows.sizes if loss.over_norms else None)
     return warm.direct[count].solve(terms, weight, rows.A, rows.b)
 
 
 def _coupled(
-    loss: Loss,
-    rows: Rows,
-    warm: Warm,
-    weight: float,
-    squares: Squares | None,
-    size: Array | None,
-    centre: Array | None,
+    loss: Loss, rows: Rows, warm: Warm, weight: float, squares: Squares | None, damping: Damping | None
 ) -> Point:
     """Return the minimum by row generation.
 
     A loss whose entries stand in inequalities alone (a maximum, CVaR, the sum of the largest) is solved for some
     entries, which bounds it from below, and for those that it then violates, until there are none.
     """
-    canonical = _canonical(loss, warm)
+    canonical = warm.form(loss)
     count, n = loss.variable.size, rows.A.shape[1]
     if count <= FEW or not _in_inequalities(canonical):
-        return _all_rows(loss, rows, warm, weight, squares, size, centre)
+        return _all_rows(loss, rows, warm, weight, squares, damping)
     touched = canonical.A[:, canonical.at].tocoo()
     owner = np.full(len(canonical.b), -1)
     owner[touched.row] = touched.col
-    terms = _stacked(squares, n, size, centre)
+    terms = _beside(squares, n, damping)
     entries = rows.entries if loss.over_norms else lambda r: r
     if not len(warm.working):
-        start = warm.program(n + 1).solve(rows.squares.damped(size, centre), weight)
+        start = warm.program(n + 1).solve(rows.squares.damped(damping), weight)
         v = entries(rows.A @ start.x[warm.penalty.at] - rows.b)
         warm.working = np.sort(np.argsort(-np.abs(v))[: 4 * n])
         warm.z = start.x[warm.penalty.at]
@@ -259,7 +208,7 @@ def _coupled(
         if not len(more):
             return replace(point, slope=slope)
         warm.working = np.union1d(warm.working, more[: max(4 * n, len(warm.working))])
-    return _all_rows(loss, rows, warm, weight, squares, size, centre)
+    return _all_rows(loss, rows, warm, weight, squares, damping)
 
 
 def _in_inequalities(canonical: Canonical) -> bool:

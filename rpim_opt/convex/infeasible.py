@@ -11,11 +11,9 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import Conflict
-from rpim_opt.convex.asked import norms
-from rpim_opt.convex.atoms import cp
 from rpim_opt.convex.constraints import Box, Parsed, spoken
-from rpim_opt.convex.posed import Posed
-from rpim_opt.convex.terms import substituted
+from rpim_opt.convex.expressions import cp, norms, substituted
+from rpim_opt.convex.structure import Structure
 from rpim_opt.problem.linear import LinearModel
 
 FAR = 1e6
@@ -24,40 +22,45 @@ FAR = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """One thing that is demanded, by a name that its user knows, as CVXPY constraints of z."""
+    """CVXPY constraints of z, by a name that their user knows."""
 
     name: str
     demands: tuple[Any, ...]
 
 
-def conflict(posed: Posed, model: LinearModel) -> Conflict | None:
+def conflict(structure: Structure, model: LinearModel) -> Conflict | None:
     """Return what contradicts what; None where the constraints can be met after all.
 
     ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
     Dravnieks 1991, ORSA Journal on Computing 3:157).
     """
-    z = cp.Variable(posed.n)
-    units = _units(posed, model, z)
+    z = cp.Variable(structure.n)
+    units = _units(structure, model, z)
     everything = [stated for unit in units for stated in unit]
     if _possible(everything):
         return None
     kept = _irreducible(units)
     single = _irreducible([[stated] for unit in kept for stated in unit])
     names = tuple(stated.name for unit in single for stated in unit)
-    return Conflict(*_loosening(posed, model), names, _of_drawings(posed))
+    return Conflict(*_loosening(structure, model), names, _of_statements(structure))
+
+
+def _solved(objective: Any, demands: Sequence[Any]) -> cp.Problem | None:
+    """Return a problem after Clarabel, which may be inaccurate; None where it fails."""
+    problem = cp.Problem(cp.Minimize(objective), list(demands))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return None
+    return problem
 
 
 def _possible(demands: Sequence[Stated]) -> bool:
     """Whether all can be met at once."""
-    every = [constraint for stated in demands for constraint in stated.demands]
-    problem = cp.Problem(cp.Minimize(0), every)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
-        try:
-            problem.solve(solver=cp.CLARABEL)
-        except cp.SolverError:
-            return True
-    return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+    problem = _solved(0, [constraint for stated in demands for constraint in stated.demands])
+    return problem is None or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
 def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
@@ -70,23 +73,23 @@ def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
     return kept
 
 
-def _units(posed: Posed, model: LinearModel, z: cp.Variable) -> list[list[Stated]]:
+def _units(structure: Structure, model: LinearModel, z: cp.Variable) -> list[list[Stated]]:
     """Return what every constraint function demands, bound by bound, and ``largest`` by configuration."""
     units: list[list[Stated]] = []
-    for k, function in enumerate(posed.formulation.constraints):
+    for k, function in enumerate(structure.formulation.constraints):
         if isinstance(function, Box):
-            units.append(_bounds(function, posed, z))
+            units.append(_bounds(function, structure, z))
             continue
-        demands = [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+        demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
         if isinstance(function, Parsed):
             units.append([Stated(function.name, tuple(demands))])
             continue
         name = name_of(function, k)
         several = len(demands) > 1
         units.append([Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)])
-    if posed.limited:
+    if structure.limited:
         size = norms(model.A @ z - model.b, model.group)
-        largest = posed.formulation.largest
+        largest = structure.formulation.largest
         numbers = np.unique(model.group)
         name = "configuration {} within {:g} sigmas"
         units.append([Stated(name.format(g, largest), (size[i] <= largest,)) for i, g in enumerate(numbers)])
@@ -105,9 +108,9 @@ def name_of(function: Any, k: int) -> str:
     return name
 
 
-def _bounds(box: Box, posed: Posed, z: cp.Variable) -> list[Stated]:
+def _bounds(box: Box, structure: Structure, z: cp.Variable) -> list[Stated]:
     """Return every finite bound of a box, in the parameter's unit."""
-    parameters = posed.parameters
+    parameters = structure.parameters
     found: list[Stated] = []
     for sign, side in zip("><", box.bounds(parameters), strict=True):
         for i in np.flatnonzero(np.isfinite(side)):
@@ -118,75 +121,69 @@ def _bounds(box: Box, posed: Posed, z: cp.Variable) -> list[Stated]:
     return found
 
 
-def _loosening(posed: Posed, model: LinearModel) -> tuple[dict[str, float], dict[int, float]]:
+def _loosening(structure: Structure, model: LinearModel) -> tuple[dict[str, float], dict[int, float]]:
     """Return the least loosening of the boxes [SI], and apart from it of the configurations' bound [sigma]."""
     parameters, groups = model.parameters, np.unique(model.group)
-    by_bound = _least(posed, model, True) * parameters.scale
-    by_row = _least(posed, model, False)
+    by_bound = _least(structure, model, True) * parameters.scale
+    by_row = _least(structure, model, False)
     bounds = {parameters.names[i]: float(by_bound[i]) for i in np.flatnonzero(by_bound > 1e-6 * parameters.scale)}
     rows = {int(groups[i]): float(by_row[i]) for i in np.flatnonzero(by_row > 1e-6)}
     return bounds, rows
 
 
-def _least(posed: Posed, model: LinearModel, loosen_boxes: bool) -> Array:
+def _least(structure: Structure, model: LinearModel, loosen_boxes: bool) -> Array:
     """Return the slacks of least sum that make the constraints possible; zeros where none do."""
-    n, count = posed.n, len(np.unique(model.group))
+    n, count = structure.n, len(np.unique(model.group))
     z = cp.Variable(n)
     slack = cp.Variable(n if loosen_boxes else count, nonneg=True)
     hard: list[Any] = []
-    for k, function in enumerate(posed.formulation.constraints):
+    for k, function in enumerate(structure.formulation.constraints):
         if not isinstance(function, Box):
-            hard += [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+            hard += [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
             continue
-        lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(posed.parameters))
+        lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(structure.parameters))
         room = slack if loosen_boxes else 0.0
         hard += [z <= upper + room, z >= lower - room]
-    if posed.limited:
+    if structure.limited:
         extra = 0.0 if loosen_boxes else slack
-        hard.append(norms(model.A @ z - model.b, model.group) <= posed.formulation.largest + extra)
+        hard.append(norms(model.A @ z - model.b, model.group) <= structure.formulation.largest + extra)
     return _least_sum(slack, hard)
 
 
-def _of_drawings(posed: Posed) -> dict[str, float]:
+def _of_statements(structure: Structure) -> dict[str, float]:
     """Return by how much [SI] statements would have to give way, in sum of scales the least; empty where that fails."""
-    z = cp.Variable(posed.n)
-    drawn = [function for function in posed.formulation.constraints if isinstance(function, Parsed)]
+    z = cp.Variable(structure.n)
+    drawn = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
     if not drawn:
         return {}
     slack = cp.Variable(len(drawn), nonneg=True)
-    units = [function.scale(posed.parameters) for function in drawn]
+    units = [function.scale(structure.parameters) for function in drawn]
     demands: list[Any] = []
-    for k, function in enumerate(posed.formulation.constraints):
+    for k, function in enumerate(structure.formulation.constraints):
         if isinstance(function, Parsed):
             place = drawn.index(function)
-            demands += function.loosened(z, posed.parameters, units[place] * slack[place])
+            demands += function.loosened(z, structure.parameters, units[place] * slack[place])
         else:
-            demands += [substituted(constraint, {id(posed.asked.z): z}) for constraint in posed.constraints[k]]
+            demands += [
+                substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]
+            ]
     least = _least_sum(slack, demands)
     return {function.name: float(unit * s) for function, unit, s in zip(drawn, units, least, strict=True) if s > 1e-6}
 
 
 def _least_sum(slack: cp.Variable, demands: list[Any]) -> Array:
     """Return the slacks of least sum that make demands possible; zeros where none do."""
-    problem = cp.Problem(cp.Minimize(cp.sum(slack)), demands)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a diagnosis may be inaccurate
-        try:
-            problem.solve(solver=cp.CLARABEL)
-        except cp.SolverError:
-            return np.zeros(slack.size)
-    if slack.value is None:
-        return np.zeros(slack.size)
-    return np.asarray(slack.value)
+    _solved(cp.sum(slack), demands)
+    return np.zeros(slack.size) if slack.value is None else np.asarray(slack.value)
 
 
-def advice(posed: Posed, status: str, found: Conflict | None) -> str:
+def advice(structure: Structure, status: str, found: Conflict | None) -> str:
     """Return the sentence that says why a program was not solved, and what may help."""
     if found is not None:
         return ""
     if status.startswith("unbounded"):
         return "loss and penalty seem to fall without end: give it a larger weight, or a start nearer to the data"
-    if posed.constrained and status.startswith(("infeasible", "optimal")):
+    if structure.constrained and status.startswith(("infeasible", "optimal")):
         return (
             "its constraints can be met, but not to the solver's accuracy: check their units, or loosen them a little"
         )

@@ -1,21 +1,75 @@
-"""Convex functions as CVXPY states them: asked once, checked, cut off from what may change, evaluated at numbers."""
+"""CVXPY's expressions: its functions by name, checks of what users' functions return, copies, values and slopes."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.convex.atoms import cp
+
+if TYPE_CHECKING:
+    import cvxpy as cp
+else:
+
+    class _Late(ModuleType):  # CVXPY, imported when something of it is first used
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("__"):  # what doctest and inspect ask of every module is no use of it
+                raise AttributeError(name)
+            return getattr(import_module(self.__name__), name)
+
+    cp = _Late("cvxpy")
+
+OPTIMAL, INFEASIBLE, UNBOUNDED = "optimal", "infeasible", "unbounded"
+INFEASIBLE_INACCURATE = "infeasible_inaccurate"
+
+
+@dataclass(frozen=True)
+class Atom:
+    """A function of CVXPY by its name, ``cp.sum_squares``: stated before CVXPY is imported."""
+
+    name: str
+
+    def __call__(self, v: Any) -> Any:
+        """Return CVXPY's expression."""
+        return getattr(cp, self.name)(v)
+
+    def __repr__(self) -> str:
+        return f"cp.{self.name}"
+
+    @property
+    def __name__(self) -> str:
+        return self.name
+
+
+SQUARES, SUM, LARGEST, NORM1, NORM2 = (Atom(name) for name in ("sum_squares", "sum", "max", "norm1", "norm2"))
+ATOMS = (SQUARES, SUM, LARGEST, NORM1, NORM2)
+
+
+def named(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
+    """Return the `Atom` that a function of CVXPY is; any other function as it is."""
+    module = sys.modules.get("cvxpy")
+    if module is None:  # then nobody can have taken a function of it
+        return function
+    for atom in ATOMS:
+        if function is getattr(module, atom.name, None):
+            return atom
+    return function
+
+
+# --- what users' functions return ---
 
 
 def scalar(value: Any, where: str) -> Any:
-    """Return what a loss or penalty answered as a convex scalar expression, or say what it is instead."""
+    """Return what a loss or penalty returned as a convex scalar expression; InputError for anything else."""
     accepted = "a convex scalar expression of CVXPY"
     if value is None:
         raise InputError(where, "None", f"{accepted}; is a 'return' missing?")
@@ -36,10 +90,8 @@ def scalar(value: Any, where: str) -> Any:
 
 
 def listed(value: Any, where: str) -> list[Any]:
-    """Return what a constraint function answered as a list of CVXPY constraints."""
-    made = [value]
-    if isinstance(value, list | tuple):
-        made = list(value)
+    """Return what a constraint function returned as a list of CVXPY constraints."""
+    made = list(value) if isinstance(value, list | tuple) else [value]
     for constraint in made:
         if isinstance(constraint, bool | np.bool_):
             raise InputError(where, f"{constraint}", "a CVXPY constraint: something that depends on z")
@@ -75,19 +127,14 @@ def reason(stated: Any) -> str:
 
 def _short(expression: Any) -> str:
     text = " ".join(str(expression).split())
-    if len(text) <= 80:
-        return text
-    return text[:77] + "..."
+    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
-    """Return a copy of an expression or constraint with other leaves, by the ``id`` of those that they replace.
-
-    Of three kinds CVXPY's own ``tree_copy`` leaves out or mixes up what they are made of.
-    """
+    """Return a copy of an expression or constraint with other leaves, by the ``id`` of those that they replace."""
     if id(stated) in instead:
         return instead[id(stated)]
-    kind = type(stated)
+    kind = type(stated)  # of three kinds CVXPY's ``tree_copy`` loses arguments
     if kind.__name__ == "indicator":
         return kind([substituted(limit, instead) for limit in stated.args], stated.err_tol)
     if kind.__name__ == "perspective":
@@ -100,10 +147,7 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
 
 
 def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
-    """Return whether two expressions or constraints say the same of variables that stand for each other.
-
-    ``pairs`` gets which stand for each other, by their ``id``, in both directions.
-    """
+    """Return whether two expressions or constraints are the same but for paired variables, by ``id`` both ways."""
     if isinstance(one, cp.Expression | cp.Constraint):
         return type(one) is type(other) and _same_nodes(one, other, pairs)
     if isinstance(one, list | tuple):
@@ -139,10 +183,7 @@ def _numbers(constant: Any) -> list[Array]:
 
 
 class Frozen:
-    """Copies of expressions with the values that the user's parameters have now, and variables of their own.
-
-    What the user changes afterwards, or another thread solves meanwhile, does not reach the copies.
-    """
+    """Copies of expressions with the present values of parameters, which later changes do not reach."""
 
     def __init__(self, shared: Sequence[cp.Variable], where: str):
         self.own: list[cp.Variable] = []
@@ -179,18 +220,17 @@ def _domain(expression: Any) -> list[Any]:
 
 
 def fulfilled(limit: Any) -> bool:
-    """Whether a constraint is met at the values of its variables, with nothing missed."""
+    """Whether a constraint is met exactly at the values of its variables."""
     return not np.any(limit.violation() > 0)
 
 
-def asked(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
-    """Return what a user's function answers; what CVXPY itself refuses in it is said in a sentence."""
+def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
+    """Return what a user's function returns."""
     try:
         return function(*arguments)
-    except cp.SolverError as error:  # atoms that ask a solver when they are made
-        raise InputError(
-            where, f"an error of CVXPY: {error}".rstrip("."), "atoms that the installed solvers know"
-        ) from None
+    except cp.SolverError as error:  # atoms that call a solver when they are made
+        found = f"an error of CVXPY: {error}".rstrip(".")
+        raise InputError(where, found, "atoms that the installed solvers know") from None
 
 
 class Term:
@@ -226,14 +266,20 @@ class Term:
         return np.asarray(found.todense()).ravel()
 
 
-def apart(expression: Any, variable: cp.Variable) -> Term:
-    """Return an expression as a term of a variable that nothing else sets."""
-    own = cp.Variable(variable.size)
-    return Term(substituted(expression, {id(variable): own}), own)
-
-
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:
     """Return a function of a vector of so many numbers as a term, with the parameters' values of now."""
     variable = cp.Variable(size)
     expression = Frozen([variable], where)(scalar(function(variable), where))
     return Term(expression, variable)
+
+
+def norms(r: Any, group: np.ndarray) -> Any:
+    """Return the norms of a residual (m,) by group in CVXPY, in the order of the groups' numbers."""
+    _, which, count = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(which, kind="stable")
+    place = np.empty(len(group), dtype=int)
+    place[order] = np.arange(len(group)) - np.repeat(np.cumsum(count) - count, count)
+    shape = (len(count), int(count.max()))  # shorter groups are filled with zeros
+    at = (which * shape[1] + place, np.arange(len(group)))
+    pick = scipy.sparse.csr_array((np.ones(len(group)), at), (shape[0] * shape[1], len(group)))
+    return cp.norm(cp.reshape(pick @ r, shape, order="C"), 2, axis=1)

@@ -1,18 +1,32 @@
-"""The small program: squares of n + 1 rows, a penalty and constraints; by an active set, or by Clarabel."""
+"""Cone programs: CVXPY's canonical form, and programs of n + 1 rows with it, by an active set or by Clarabel."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.canonical import ATTEMPTS, SOLVED, Canonical, clarabel_settings
+from rpim_opt.convex.quadratic import Quadratic
 
+SOUGHT, ACCEPTED = 1e-10, 1e-8
+"""Clarabel's tolerances: what it goes on to while it makes progress, and what is good enough."""
+SOLVED = ("Solved", "AlmostSolved")
+ATTEMPTS: tuple[dict[str, Any], ...] = (
+    {},
+    {"static_regularization_constant": 1e-10},
+    {"equilibrate_enable": True},
+    {"static_regularization_constant": 1e-7},
+)
+"""Settings that are tried in turn: where one factorization stalls, another does not."""
+CURVED = 1e-14
+"""Eigenvalues of P below this part of the largest are rounding."""
 RANK = 1e-9
 """Singular values of a face below this part of the largest count as zero."""
 DENSE = 4e5
@@ -23,19 +37,245 @@ FACES = 8
 """Faces that are tried before Clarabel is asked for one."""
 
 
+class Canonical:
+    """minimize 1/2 x'P x + q'x + offset subject to b - A x in K, where ``x[at]`` is the variable of the functions.
+
+    Rows of a cone and columns that CVXPY added are scaled to unit size: a solver's tolerances are absolute, and
+    constraints may be stated in metres.
+    """
+
+    order: np.ndarray  # of a box: the stated places of its rows, equations first
+
+    def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
+        import cvxpy as cp
+        from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
+        from scipy import sparse
+
+        every = [objective, *constraints]
+        stated = {v.id: v for e in every for v in e.variables()}
+        for v in stated.values():  # atoms ask for the value of what they are made of, and may get a stale one
+            v.save_value(None)
+        anchor = [] if variable.id in stated else [variable == cp.Variable(variable.shape)]
+        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor])
+        self._chain: Any
+        data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
+        self.size = len(data["c"])
+        self.at = data["param_prob"].var_id_to_col[variable.id] + np.arange(variable.size)
+        dims = data["dims"]
+        self.cones = dims_to_solver_cones(dims)
+        self.zero = int(dims.zero)
+        self.linear = int(dims.zero + dims.nonneg)
+        self.offset = float(self._inverse[-1].get("offset", 0.0)) if isinstance(self._inverse[-1], dict) else 0.0
+        A = sparse.coo_array(data["A"])
+        self.cone_sizes = _cone_sizes(dims, len(data["b"]))
+        self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
+        self.A: Any = sparse.csr_array(
+            (A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape
+        )
+        self.b = data["b"] * self.row_scale
+        free = np.isposinf(self.b)  # a bound that is none
+        if free.any():
+            self.A = sparse.csr_array(sparse.diags_array(np.where(free, 0.0, 1.0)) @ self.A)
+            self.b = np.where(free, 1.0, self.b)
+        self.q = data["c"] * self.column_scale
+        P = data.get("P")
+        P = sparse.coo_array((self.size, self.size)) if P is None else sparse.coo_array(P)
+        values = P.data * self.column_scale[P.row] * self.column_scale[P.col]
+        self.P: Any = sparse.csc_array((values, (P.row, P.col)), P.shape)
+
+    @classmethod
+    def box(cls, n: int, penalty: Quadratic | None, bounds: Sequence[tuple[Array, Array]]) -> Canonical:
+        """Return a quadratic penalty |L z - c|^2 + constant and boxes lower <= z <= upper, each (n,)."""
+        made = cls.__new__(cls)
+        made.size, made.at = n, np.arange(n)
+        eye = np.eye(n)
+        rows: list[Array] = []
+        limits: list[Array] = []
+        equations: list[np.ndarray] = []
+        for low, high in bounds:
+            fixed, below, above = box_sides(low, high)
+            rows += [eye[fixed], -eye[below], eye[above]]
+            limits += [low[fixed], -low[below], high[above]]
+            equations.append(np.arange(len(rows[-1]) + len(rows[-2]) + len(rows[-3])) < len(rows[-3]))
+        first = np.concatenate([np.zeros(0, dtype=bool), *equations])
+        made.order = np.argsort(~first, kind="stable")
+        made.A = np.vstack([np.zeros((0, n)), *rows])[made.order]
+        made.b = np.concatenate([np.zeros(0), *limits])[made.order]
+        made.zero, made.linear = int(first.sum()), len(made.b)
+        made.row_scale, made.column_scale = np.ones(len(made.b)), np.ones(n)
+        made.P, made.q, made.offset = np.zeros((n, n)), np.zeros(n), 0.0
+        if penalty is not None:
+            L = penalty.matrix
+            made.P = 2 * L.T @ L
+            made.q = -2 * L.T @ penalty.c
+            made.offset = float(penalty.c @ penalty.c) + penalty.constant
+            made.root = np.sqrt(2) * L
+        made.cones = None
+        made.cone_sizes = []
+        return made
+
+    @property
+    def polyhedral(self) -> bool:
+        """Whether all constraints are equations and inequalities."""
+        return self.linear == len(self.b)
+
+    @cached_property
+    def dense(self) -> tuple[Array, Array]:
+        """A and P as dense matrices."""
+        if isinstance(self.A, np.ndarray):
+            return self.A, self.P
+        return self.A.toarray(), self.P.toarray()
+
+    @cached_property
+    def root(self) -> Array:
+        """A matrix (p, N) with root'root = P."""
+        values, vectors = np.linalg.eigh(self.dense[1])
+        curved = values > CURVED * max(values[-1], 0.0)
+        if not values[-1] > 0:
+            return np.zeros((0, self.size))
+        return (np.sqrt(np.where(curved, values, 0.0)) * vectors).T[curved]
+
+    @cached_property
+    def linear_cones(self) -> list[Any]:
+        """The cones as Clarabel has them."""
+        clarabel = import_module("clarabel")
+        if self.cones is not None:
+            return list(self.cones)
+        cones: list[Any] = []
+        if self.zero:
+            cones.append(clarabel.ZeroConeT(self.zero))
+        if self.linear > self.zero:
+            cones.append(clarabel.NonnegativeConeT(self.linear - self.zero))
+        return cones
+
+    def value(self, x: Array) -> float:
+        """Return the objective at x (N,)."""
+        return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
+
+    def at_best(self, fixed: Array) -> float:
+        """Return the least objective at a fixed variable; infinite where there is none."""
+        from scipy import sparse
+
+        rest = np.setdiff1d(np.arange(self.size), self.at)
+        x = np.zeros(self.size)
+        x[self.at] = fixed
+        if len(rest):
+            P = sparse.triu(sparse.csc_array(self.P)[rest][:, rest])
+            q = self.q[rest] + (sparse.csr_array(self.P) @ x)[rest]
+            A = sparse.csc_array(self.A)[:, rest]
+            found = _clarabel(P, q, A, self.b - self.A @ x, self.linear_cones)
+            if found is None:
+                return float("inf")
+            x[rest] = found
+        return self.value(x)
+
+    def duals(self, x: Array, z: Array) -> dict[int, Array]:
+        """Return the multipliers of the stated constraints by their id, from those of all rows (m,)."""
+        raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0)
+        raw.x, raw.z = x * self.column_scale, z * self.row_scale
+        return self._chain.invert(raw, self._inverse).dual_vars
+
+    def part(self, kept: np.ndarray, owner: np.ndarray) -> Canonical:
+        """Return the form of some entries of the variable; ``owner`` (m,) is the entry of every inequality, or -1."""
+        made = object.__new__(Canonical)
+        rows = np.flatnonzero((owner < 0) | np.isin(owner, kept))
+        out = np.setdiff1d(np.arange(len(self.at)), kept)
+        columns = np.setdiff1d(np.arange(self.size), self.at[out])
+        made.A, made.b, made.q = self.A[rows][:, columns], self.b[rows], self.q[columns]
+        made.P, made.offset, made.zero, made.size = self.P[columns][:, columns], self.offset, self.zero, len(columns)
+        inequalities = int(((rows >= self.zero) & (rows < self.linear)).sum())
+        made.linear = self.zero + inequalities
+        clarabel = import_module("clarabel")
+        made.cones = [clarabel.NonnegativeConeT(inequalities) if "Nonneg" in str(cone) else cone for cone in self.cones]
+        made.at = np.searchsorted(columns, self.at[kept])
+        return made
+
+
+def _cone_sizes(dims: Any, m: int) -> list[int]:
+    """Return the numbers of rows of the cones behind equations and inequalities."""
+    sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
+    rest = m - int(dims.zero + dims.nonneg) - sum(sizes)
+    if rest % 3 == 0:  # exponential and power cones
+        return sizes + [3] * (rest // 3)
+    return [*sizes, rest]
+
+
+def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int]) -> tuple[Array, Array]:
+    """Return factors of the rows (m,), one a cone, and of the columns (n,), one for those of the variable."""
+    own = np.isin(A.col, at)
+    size = np.zeros(m)
+    np.maximum.at(size, A.row[own], np.abs(A.data[own]))
+    ratio = size[A.row] / np.abs(np.where(A.data == 0, 1.0, A.data))
+    column = np.zeros(n)
+    np.maximum.at(column, A.col, np.where(A.data == 0, 0.0, ratio))
+    column[at] = 1.0
+    column[column == 0] = 1.0
+    size = np.zeros(m)
+    np.maximum.at(size, A.row, np.abs(A.data) * column[A.col])
+    sizes = [1] * linear + cones
+    begin = np.cumsum([0, *sizes])[:-1]
+    largest = np.maximum.reduceat(size, begin) if m else size
+    size = np.repeat(largest, sizes) if m else size
+    return np.divide(1.0, size, out=np.ones(m), where=size > 0), column
+
+
+def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which components (n,) of a box are fixed, and which of the others have a lower and an upper bound."""
+    fixed = lower == upper
+    return fixed, np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
+
+
+def _clarabel(P: Any, q: Array, A: Any, b: Array, cones: list[Any]) -> Array | None:
+    """Return Clarabel's minimum of 1/2 x'P x + q'x subject to b - A x in cones; None where it finds none."""
+    from scipy import sparse
+
+    clarabel = import_module("clarabel")
+    for attempt in ATTEMPTS:
+        settings = clarabel_settings(attempt)
+        found = clarabel.DefaultSolver(sparse.csc_matrix(P), q, sparse.csc_matrix(A), b, cones, settings).solve()
+        if str(found.status) in SOLVED:
+            return np.array(found.x)
+    return None
+
+
+def clarabel_settings(other: dict[str, Any]) -> Any:
+    """Return Clarabel's settings, some of them other ones."""
+    settings = import_module("clarabel").DefaultSettings()
+    settings.verbose, settings.max_threads = False, 1
+    settings.presolve_enable = settings.chordal_decomposition_enable = False
+    settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
+    settings.input_sparse_dropzeros = False
+    tolerance = ACCEPTED if other else SOUGHT
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
+    for name, value in other.items():
+        setattr(settings, name, value)
+    return settings
+
+
 class Unsolved(RuntimeError):
     """A program that the solver does not solve; its argument is the solver's word."""
 
 
+class Damping(NamedTuple):
+    """|size (z - centre)|^2, added to the objective: the term of Levenberg and Marquardt. Both (n,)."""
+
+    centre: Array
+    size: Array
+
+    def value(self, z: Array) -> float:
+        """Return the term at z (n,)."""
+        return float(np.sum((self.size * (z - self.centre)) ** 2))
+
+    def along(self, z: Array, d: Array) -> tuple[float, float]:
+        """Return first and second derivative of the term at z (n,) along a step d (n,)."""
+        slope = self.size**2 * d
+        return float(2 * slope @ (z - self.centre)), float(2 * slope @ d)
+
+
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """The quadratic function |R z - y|^2 + g'z; H = 2 R'R is never formed, whose condition is that of R squared.
-
-    Parameters
-    ----------
-    R, y, g
-        (n + 1, n), (n + 1,) and (n,).
-    """
+    """|R z - y|^2 + g'z with R (n + 1, n), y (n + 1,), g (n,); R'R is never formed, whose condition is squared."""
 
     R: Array
     y: Array
@@ -49,24 +289,17 @@ class Squares:
         T = np.vstack([T, np.zeros((n + 1 - len(T), n + 1))])
         return cls(T[:, :n], T[:, n], np.zeros(n) if g is None else g)
 
-    def damped(self, size: Array | None, centre: Array | None) -> Squares:
-        """Return the squares with |size (z - centre)|^2 added, both (n,)."""
-        if size is None or centre is None:
+    def damped(self, damping: Damping | None) -> Squares:
+        """Return the squares with damping added."""
+        if damping is None:
             return self
-        return Squares.of_rows(np.vstack([self.R, np.diag(size)]), np.concatenate([self.y, size * centre]), self.g)
-
-    def value(self, z: Array) -> float:
-        """Return the function at z (n,)."""
-        r = self.R @ z - self.y
-        return float(r @ r + self.g @ z)
+        R = np.vstack([self.R, np.diag(damping.size)])
+        return Squares.of_rows(R, np.concatenate([self.y, damping.size * damping.centre]), self.g)
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A minimum: x (N,) of the penalty's form, the multipliers of its rows (m,), and the solver's iterations.
-
-    ``rest`` are the unknowns of the exact loss, ``slope`` the multipliers of its link with the residuals.
-    """
+    """A minimum x (N,) of the penalty's form, multipliers of its rows (m,), unknowns and slopes of the exact loss."""
 
     x: Array
     dual: Array
@@ -78,16 +311,8 @@ class Point:
 class Small:
     """minimize |R z - y|^2 + g'z + loss(A z - b) + weight * penalty(z) subject to constraints(z).
 
-    Parameters
-    ----------
-    penalty
-        Penalty and constraints.
-    rows
-        Number of rows of R; 0 for none.
-    loss
-        Rows of a loss that are taken as they are, or None.
-    sizes
-        (N,) numbers of equations whose norms the loss gets; None where it gets equations.
+    R has ``rows`` rows; ``loss`` is the form of rows that are taken as they are; ``sizes`` (N,) counts the equations
+    of norms that it gets.
     """
 
     def __init__(self, penalty: Canonical, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None):
@@ -97,32 +322,23 @@ class Small:
         self._solver: Any = None
 
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
-        """Return the minimum; A (k, n) and b (k,) are the rows of the loss.
-
-        Raises
-        ------
-        Unsolved
-            Where there is none, or Clarabel does not find it.
-        """
+        """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        faces = self.loss is None and p.polyhedral and p.entries <= DENSE
-        if faces and squares is not None:
-            found = self._on_faces(squares, weight, self.face, self.near)
-            if found is not None:
-                return found
+        if squares is None or self.loss is not None or not p.polyhedral or len(p.b) * p.size > DENSE:
+            return self._by_cones(squares, weight, A, b)[0]
+        found = self._on_faces(squares, weight, self.face, self.near)
+        if found is not None:
+            return found
         point, slack = self._by_cones(squares, weight, A, b)
-        if faces and squares is not None:
-            tight = np.arange(p.zero, p.linear)
-            face = tight[(point.dual > slack)[tight]]
-            found = self._on_faces(squares, weight, face, point.x)
-            if found is not None:
-                return replace(found, iterations=point.iterations)
-        return point
+        active = np.arange(p.zero, p.linear)
+        face = active[(point.dual > slack)[active]]
+        found = self._on_faces(squares, weight, face, point.x)
+        return point if found is None else replace(found, iterations=point.iterations)
 
     # --- active set --------------------------------------------------------------------------------------------------
 
     def _on_faces(self, squares: Squares, weight: float, face: np.ndarray, near: Array) -> Point | None:
-        """Return the minimum by a primal-dual active set: faces, until multipliers and slacks have the right signs."""
+        """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
         p = self.penalty
         A = p.dense[0]
         inequalities = np.arange(p.zero, p.linear)
@@ -293,28 +509,21 @@ def nearest(p: Canonical, z: Array) -> Array | None:
     """Return the point (n,) of a form's constraints that is nearest to z (n,); None where Clarabel finds none."""
     from scipy import sparse
 
-    clarabel = import_module("clarabel")
     n, N = len(z), p.size
     link = sparse.coo_array((-np.ones(n + 1), (np.arange(n + 1), np.append(N, p.at))), (n + 1, N + 1))
     A = sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
-    q = np.append(np.zeros(N), 1.0)
-    cones = [*p.linear_cones, clarabel.SecondOrderConeT(n + 1)]
-    for settings in ATTEMPTS:
-        P = sparse.csc_matrix((N + 1, N + 1))
-        found = clarabel.DefaultSolver(P, q, sparse.csc_matrix(A), bound, cones, clarabel_settings(settings)).solve()
-        if str(found.status) in SOLVED:
-            return np.array(found.x)[p.at]
-    return None
+    cone = import_module("clarabel").SecondOrderConeT(n + 1)
+    found = _clarabel(sparse.csc_array((N + 1, N + 1)), np.append(np.zeros(N), 1.0), A, bound, [*p.linear_cones, cone])
+    return None if found is None else found[p.at]
 
 
 def on_face(
     squares: Squares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
-    """Return the minimum (N,) where some rows are equations A x = b, and their multipliers; None where there is none.
+    """Return the minimum (N,) next to ``near`` where some rows are equations A x = b, and their multipliers, or None.
 
-    Of several minima the nearest to ``near`` (N,). By the null space of the active rows, in corrected seminormal
-    equations where that is all of the space.
+    By the null space of the active rows; without any, by corrected seminormal equations.
     """
     A, b = p.dense[0][active], p.b[active]
     P, root = p.dense[1], p.root

@@ -1,22 +1,23 @@
-"""Proximal Newton for a separable convex loss: a sequence of squares, with the penalty and the constraints as they are.
+"""Proximal Newton for a convex loss that is a sum over residuals or norms: a sequence of squares.
 
-Around a point the loss has a quadratic model (value, slope, curvature of residuals or of configurations' norms); its
-minimum with the penalty and the constraints is a small program, and a line search on the true loss ends the step. A
-non-smooth loss is first smoothed by convolution with a box, or by sqrt(v^2 + h^2) of norms, with a falling width h;
-then the rows near a kink are taken as they are (Lee, Sun and Saunders 2014, SIAM J. Optim. 24:1420).
+Around a point the loss has a quadratic model; its minimum with the penalty and the constraints is a small program, and
+a line search on the true loss ends the step. A non-smooth loss is smoothed by convolution with a box, or by
+sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a kink are taken as they are (Lee, Sun and Saunders
+2014, SIAM J. Optim. 24:1420).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.canonical import Canonical
-from rpim_opt.convex.solvers.small import Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.summands import Summands
+from rpim_opt.convex.expressions import cp
+from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
 
 DECREASE = 1e-12
 """Newton ends where its model promises less, relative to the objective."""
@@ -48,20 +49,17 @@ ROUND = 32
 """Rows that are taken as they are come in multiples of this: a program of so many is made once."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
+JUMP = 1e-3
+"""Part of the slope's total variation above which a jump counts as a kink."""
+PROBES = 64
+"""Entries at which kinks are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Equations A z ~ b of one linear model, those of a configuration next to each other.
+    """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b].
 
-    Parameters
-    ----------
-    A, b
-        (m, n) and (m,).
-    sizes
-        (N,) equations a configuration; None where the loss gets equations.
-    triangle
-        (n + 1, n + 1) QR factor of [A b].
+    ``sizes`` (N,) counts the equations of configurations, which stand together; None where the loss gets equations.
     """
 
     A: Array
@@ -119,22 +117,11 @@ class Rows:
 
 @dataclass(eq=False)
 class Newton:
-    """One search for the minimum of loss(A z - b) + |size (z - centre)|^2 + weight penalty(z) subject to constraints.
+    """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
-    Parameters
-    ----------
-    loss, rows, penalty, small
-        The summands, the equations, the canonical penalty with constraints, and its small program without exact rows.
-    weight
-        Of the penalty.
-    size, centre
-        (n,) each: damping; None for none.
-    kink
-        Largest jump of the loss's slope; 0 where it is smooth.
-    exact
-        Small programs with so many rows as they are, where one serves any rows.
-    accuracy
-        Part of the loss that the search may leave undone.
+    ``small`` is the program of squares, penalty and constraints, ``exact`` those with so many rows as they are;
+    ``kink`` the largest jump of the loss's slope, 0 where it is smooth; ``accuracy`` the part of the loss that may be
+    left.
     """
 
     loss: Summands
@@ -142,8 +129,7 @@ class Newton:
     penalty: Canonical
     small: Small
     weight: float
-    size: Array | None
-    centre: Array | None
+    damping: Damping | None
     kink: float
     exact: dict[int, Small]
     accuracy: float = 0.0
@@ -202,9 +188,7 @@ class Newton:
         return self._total(self._residual(z)) + self.weight * self.penalty.value(x) + self._damping(z)
 
     def _damping(self, z: Array) -> float:
-        if self.size is None or self.centre is None:
-            return 0.0
-        return float(np.sum((self.size * (z - self.centre)) ** 2))
+        return 0.0 if self.damping is None else self.damping.value(z)
 
     def _solved(self, z: Array, gradient: Array, H: Array, small: Small | None = None, *exact: Array) -> Point:
         """Return the minimum of the quadratic model around z (n,), with the penalty and the constraints."""
@@ -213,7 +197,7 @@ class Newton:
         ridge = PROXIMAL * np.trace(H) + np.finfo(float).tiny
         L = np.linalg.cholesky(H + ridge * np.eye(len(H)))
         R = np.vstack([np.sqrt(0.5) * L.T @ T, np.zeros((n + 1 - len(T), n))])
-        squares = Squares(R, R @ z, T.T @ gradient).damped(self.size, self.centre)
+        squares = Squares(R, R @ z, T.T @ gradient).damped(self.damping)
         self.steps += 1
         return (small or self.small).solve(squares, self.weight, *exact)
 
@@ -237,7 +221,7 @@ class Newton:
             d = ahead[at] - z
             chord = weight * (self.penalty.value(ahead) - self.penalty.value(self.x))
             u = T @ d
-            pull, bend = self._damping_along(z, d)
+            pull, bend = (0.0, 0.0) if self.damping is None else self.damping.along(z, d)
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
             if self.point.iterations:  # Clarabel's accuracy
                 tolerance = max(tolerance, INTERIOR)
@@ -261,13 +245,6 @@ class Newton:
         """Return the Hessian by u = T z of squares with the loss's slopes at r and -r: they lie nowhere below it."""
         U, v = self.rows.whitened[0], np.where(np.abs(r) > TINY, r, TINY)
         return gram(U, np.maximum((self._slope(v, h) - self._slope(-v, h)) / (2 * v), 0.0))
-
-    def _damping_along(self, z: Array, d: Array) -> tuple[float, float]:
-        """Return first and second derivative of the damping along a step."""
-        if self.size is None or self.centre is None:
-            return 0.0, 0.0
-        along = self.size**2 * d
-        return float(2 * along @ (z - self.centre)), float(2 * along @ d)
 
     def _search(self, r: Array, Ad: Array, chord: float, bend: float, h: float, before: float) -> tuple[float, float]:
         """Return t in (0, 1] where the derivative along the step is small, and how small: no value of it is needed."""
@@ -424,3 +401,237 @@ def kink_of(loss: Summands, rows: Rows) -> float:
     if at_zero > 1e-3 * far:  # f(|r|) has a kink where f rises at once
         return max(kink, at_zero)
     return kink
+
+
+# --- sums over entries, read from CVXPY's expression tree ---
+
+
+class OutsideDomain(Exception):
+    """Raised where the loss has no derivative."""
+
+
+class Summands:
+    """f(v) = sum_i f_i(v_i) of v (M,): residuals, or where ``positive`` norms of configurations."""
+
+    def __init__(self, expression: Any, variable: Any, positive: bool):
+        self.variable, self.positive = variable, positive
+        self.entries: Any = None
+        if {v.id for v in expression.variables()} == {variable.id}:
+            self.entries = _summands(expression, variable)
+
+    @property
+    def separable(self) -> bool:
+        """Whether the loss is a sum over entries."""
+        return self.entries is not None
+
+    @cached_property
+    def uniform(self) -> bool:
+        """Whether all entries have the same function."""
+        return all(constant.size == 1 for constant in self.entries.constants())
+
+    @cached_property
+    def _evaluated(self) -> Evaluation:
+        return evaluation(self.entries, self.variable)
+
+    def values(self, v: Array) -> Array:
+        """Return f_i(v_i) (M,), up to a constant."""
+        return self._evaluated(v)[0] * np.ones(len(v))
+
+    def slope(self, v: Array) -> Array:
+        """Return f_i'(v_i) (M,)."""
+        return self._evaluated(v)[1] * np.ones(len(v))
+
+    def smooth(self, v: Array, width: float) -> tuple[Array, Array]:
+        """Return slope and curvature (M,): of f, or of its mean over [v - width, v + width] (convolution smoothing)."""
+        if width:
+            (above, high), (below, low) = self._evaluated(v + width), self._evaluated(v - width)
+            slope = np.where(high == low, high, (above - below) / (2 * width))  # no cancellation away from kinks
+            return slope, np.maximum((high - low) / (2 * width), 0.0) * np.ones(len(v))
+        apart = 1e-5 * v if self.positive else 1e-6 * (1 + np.abs(v))
+        high, low = self.slope(v + apart), self.slope(v - apart)
+        return self.slope(v), np.maximum((high - low) / (2 * apart), 0.0)
+
+    def some(self, which: np.ndarray) -> tuple[Any, Any]:
+        """Return the sum of some entries, and the variable (k,) of their own that it is an expression of."""
+        entries, own = self._alone(which)
+        return cp.sum(entries), own
+
+    def _alone(self, which: np.ndarray) -> tuple[Any, Any]:
+        """Return some of the entries (k,) as an expression of a variable of their own, and that variable."""
+        own = cp.Variable(len(which))
+        return _restricted(self.entries, self.variable, own, which), own
+
+    def jump(self, size: float) -> float:
+        """Return the largest jump of the slope within 5 ``size`` of zero, 0 where f is smooth; by bisection."""
+        which = np.unique(np.linspace(0, self.variable.size - 1, PROBES).astype(int))
+        evaluated = evaluation(*self._alone(which))
+
+        def slope(v: Array) -> Array:
+            return evaluated(v)[1] * np.ones(len(v))
+
+        low = np.full(len(which), 1e-9 * size if self.positive else -5.03 * size)
+        high = np.full(len(which), 5.0 * size)
+        slope_low, slope_high = slope(low), slope(high)
+        total = slope_high - slope_low
+        for _ in range(45):
+            middle = (low + high) / 2
+            at = slope(middle)
+            left = at - slope_low > slope_high - at
+            high, slope_high = np.where(left, middle, high), np.where(left, at, slope_high)
+            low, slope_low = np.where(left, low, middle), np.where(left, slope_low, at)
+        jump = slope_high - slope_low
+        if (jump > JUMP * total).any():
+            return float(jump.max())
+        return 0.0
+
+
+# --- the expression tree -----------------------------------------------------------------------------------------
+
+
+def _summands(e: Any, v: Any) -> Any:
+    """Return the entrywise expression (M,) whose sum a scalar expression is, up to a constant; None for another one."""
+    name = type(e).__name__
+    if e.size != 1 or v.id not in {each.id for each in e.variables()}:
+        return None
+    if name in ("Sum", "norm1", "quad_over_lin"):
+        entries = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}[name](e.args[0])
+        if name == "quad_over_lin" and e.args[1].is_constant():
+            entries = entries / e.args[1]
+        return _checked(entries, v)
+    parts = [a if a.is_constant() else _summands(a, v) for a in e.args]
+    if name == "MulExpression" and parts[0] is e.args[0] and v.shape == e.args[1].shape:  # weights @ entries
+        return _checked(cp.multiply(cp.reshape(e.args[0], v.shape, order="C"), e.args[1]), v)
+    if any(part is None for part in parts):
+        return None
+    if name == "AddExpression":
+        return sum(part for part, a in zip(parts, e.args, strict=True) if part is not a)
+    if name in ("multiply", "MulExpression"):
+        return cp.multiply(*parts)
+    if name in ("NegExpression", "DivExpression"):
+        return e.copy(parts)
+    if name == "reshape":
+        return parts[0]
+    return None
+
+
+def _checked(entries: Any, v: Any) -> Any:
+    return entries if entries.shape == v.shape and entrywise(entries, v) else None
+
+
+def entrywise(e: Any, v: Any) -> bool:
+    """Return whether entry i of an expression depends on v_i alone."""
+    from cvxpy.atoms.elementwise.elementwise import Elementwise
+
+    if e is v or not e.variables():
+        return True
+    if e.shape != v.shape:
+        return False
+    if _is_norm(e):
+        return all(a.shape == v.shape and entrywise(a, v) for a in e.args[0].args)
+    known = isinstance(e, Elementwise) or type(e).__name__ in AFFINE
+    return known and all((a.shape == v.shape or a.size == 1) and entrywise(a, v) for a in e.args)
+
+
+def _is_norm(e: Any) -> bool:
+    """Whether an expression is the 2-norm, entry by entry, of several vectors (pseudo-Huber: of v and a constant)."""
+    named = type(e).__name__.startswith("Pnorm") and type(e.args[0]).__name__ == "Vstack"
+    return named and float(e.p) == 2 and e.axis == 0
+
+
+def _restricted(e: Any, v: Any, own: Any, which: np.ndarray) -> Any:
+    """Return the entries (k,) of an entrywise expression, as an expression of their own variable (k,)."""
+    if e is v:
+        return own
+    if not e.variables():
+        if e.size == v.size and e.size > 1:
+            return cp.Constant(np.ravel(e.value)[which])
+        return cp.Constant(np.squeeze(e.value) if e.size == 1 else e.value)
+    if type(e).__name__ in ("Promote", "reshape"):
+        return _restricted(e.args[0], v, own, which)
+    if _is_norm(e):
+        rows = [_restricted(a, v, own, which) + np.zeros(own.size) for a in e.args[0].args]
+        return cp.norm(cp.vstack(rows), 2, axis=0)
+    return e.copy([_restricted(a, v, own, which) for a in e.args])
+
+
+# --- values and slopes -------------------------------------------------------------------------------------------
+
+Evaluation = Callable[[Array], tuple[Any, Any]]
+"""Value and derivative of every entry at numbers v (M,)."""
+
+
+def evaluation(e: Any, v: Any) -> Evaluation:
+    """Return how an expression e that is `entrywise` in v is evaluated, by forward differentiation."""
+    if e is v:
+        return lambda x: (x, 1.0)
+    if not e.variables():
+        number = np.ravel(e.value) if e.size > 1 else np.squeeze(e.value)
+        return lambda x: (number, 0.0)
+    norm = _is_norm(e)
+    inner = [evaluation(a, v) for a in (e.args[0].args if norm else e.args)]
+    name = "norm" if norm else type(e).__name__
+    affine, atom = AFFINE.get(name), ATOMS.get(name)
+
+    def evaluated(x: Array) -> tuple[Any, Any]:
+        values, slopes = zip(*(part(x) for part in inner), strict=True)
+        if affine is not None:
+            return affine(values, slopes)
+        with np.errstate(all="ignore"):
+            value, parts = atom(e, values) if atom else _by_cvxpy(e, values)
+        return value, sum(part * slope for part, slope in zip(parts, slopes, strict=True) if np.any(slope))
+
+    return evaluated
+
+
+def _by_cvxpy(e: Any, values: Sequence[Any]) -> tuple[Any, list[Any]]:
+    """Return value and partial derivatives of an atom, by CVXPY's sparse Jacobians."""
+    shape = np.broadcast_shapes(*(np.shape(value) for value in values))
+    full = [np.broadcast_to(np.asarray(value, dtype=float), shape) for value in values]
+    value, parts = e.numeric(full), e._grad(full)
+    if any(part is None for part in parts):
+        raise OutsideDomain
+    return value, [part.diagonal() for part in parts]
+
+
+def _product(values: Sequence[Any], slopes: Sequence[Any]) -> tuple[Any, Any]:
+    return values[0] * values[1], slopes[0] * values[1] + slopes[1] * values[0]
+
+
+AFFINE: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
+    "AddExpression": lambda values, slopes: (sum(values), sum(slopes)),
+    "NegExpression": lambda values, slopes: (-values[0], -slopes[0]),
+    "Promote": lambda values, slopes: (values[0], slopes[0]),
+    "reshape": lambda values, slopes: (values[0], slopes[0]),
+    "DivExpression": lambda values, slopes: (values[0] / values[1], slopes[0] / values[1]),
+    "multiply": _product,
+    "MulExpression": _product,
+}
+"""Affine expressions: value and derivative, from those of what they are made of."""
+
+
+def _huber(e: Any, v: Sequence[Array]) -> tuple[Array, list[Array]]:
+    bound = float(e.M.value)
+    cut = np.clip(v[0], -bound, bound)
+    return cut * (2 * v[0] - cut), [2 * cut]
+
+
+def _maximum(_: Any, v: Sequence[Any]) -> tuple[Array, list[Array]]:
+    v = np.broadcast_arrays(*v)
+    first = np.argmax(v, axis=0)
+    return np.maximum.reduce(v), [(first == i).astype(float) for i in range(len(v))]
+
+
+def _norm(_: Any, v: Sequence[Any]) -> tuple[Any, list[Any]]:
+    length = np.sqrt(sum(np.square(each) for each in v))
+    return length, [each / np.maximum(length, 1e-300) for each in v]
+
+
+ATOMS: dict[str, Callable[[Any, Any], tuple[Any, list[Any]]]] = {
+    "huber": _huber,
+    "abs": lambda _, v: (np.abs(v[0]), [np.sign(v[0])]),
+    "maximum": _maximum,
+    "logistic": lambda _, v: (np.logaddexp(0.0, v[0]), [1.0 / (1.0 + np.exp(-v[0]))]),
+    "exp": lambda _, v: (np.exp(v[0]), [np.exp(v[0])]),
+    "norm": _norm,
+}
+"""Atoms that losses are mostly made of: value and partial derivatives. CVXPY evaluates any other."""
