@@ -17,6 +17,7 @@ from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
+from rpim_opt.convex.structure import in_blocks
 from rpim_opt.convex.trust import Squares, trusted_rows
 from rpim_opt.problem.identified import around
 from rpim_opt.problem.linear import LinearModel

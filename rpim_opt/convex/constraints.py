@@ -47,7 +47,7 @@ Limits = Callable[[Parameters], tuple[Array, Array]]
 
 
 class Ready:
-    """What the package itself makes: equal in content is equal in meaning, so that a program may be kept, or a file."""
+    """A function that the package makes: equal in content is equal in meaning, in a cache or in a file."""
 
     maker = ""
 
@@ -77,15 +77,8 @@ def spoken(deviation: float, dimension: str) -> str:
 class Box:
     """A constraint lower <= z <= upper; with squared loss and penalty an active set solves it to rounding.
 
-    Parameters
-    ----------
-    name
-        What reports call it.
-    limits
-        From the identified `Parameters` to lower and upper bounds (n,) of z, infinite where there is none.
+    ``limits`` returns lower and upper bounds (n,) of the identified `Parameters`, infinite where there is none.
 
-    Examples
-    --------
     >>> import cvxpy as cp
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -128,14 +121,8 @@ class Box:
         fixed = np.flatnonzero(lower == upper)
         low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
         high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
-        made = []
-        if len(fixed):
-            made.append(z[fixed] == lower[fixed])
-        if len(low):
-            made.append(z[low] >= lower[low])
-        if len(high):
-            made.append(z[high] <= upper[high])
-        return made
+        made = [z[fixed] == lower[fixed], z[low] >= lower[low], z[high] <= upper[high]]
+        return [each for each, places in zip(made, (fixed, low, high), strict=True) if len(places)]
 
 
 def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
@@ -194,17 +181,8 @@ class _Signed(Ready):
 
 
 def signed(sign: int, *patterns: str) -> Box:
-    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0.
+    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0, with sign +1 or -1.
 
-    Parameters
-    ----------
-    sign
-        +1 or -1.
-    patterns
-        Names of identified parameters, with ``*``, ``?`` and ``[...]``.
-
-    Examples
-    --------
     >>> import cvxpy as cp
     >>> import rpim_opt as ro
     >>> positive = ro.constraints.signed(+1, "a?")
@@ -266,17 +244,8 @@ class _InBall(Ready):
 
 
 def in_ball(radius: float, *patterns: str) -> Constraint:
-    """Keep the deviations that match one of the patterns in a ball: |z| <= radius.
+    """Keep the deviations that match one of the patterns in a ball: |z| <= radius, in units of the scales.
 
-    Parameters
-    ----------
-    radius
-        In units of the scales.
-    patterns
-        Names of identified parameters, with ``*``, ``?`` and ``[...]``.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),)))
@@ -296,8 +265,9 @@ def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.n
     for pattern in patterns:
         hits = np.array([fits(name, pattern) for name in parameters.names])
         if not hits.any():
-            known = "identified parameters: " + choices(pattern, parameters.names)
-            raise InputError(what, f"pattern '{pattern}'", known)
+            raise InputError(
+                what, f"pattern '{pattern}'", "identified parameters: " + choices(pattern, parameters.names)
+            )
         chosen |= hits
     return chosen
 
@@ -413,9 +383,7 @@ class Parsed:
     def unit(self) -> tuple[str, float]:
         """The unit in which it was written, and its size [SI]."""
         name = self.demanded.unit
-        if not name:
-            return "SI", 1.0
-        return name, UNITS[name].si
+        return (name, UNITS[name].si) if name else ("SI", 1.0)
 
     @property
     def step(self) -> float:
@@ -577,22 +545,10 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
     Parameters that are not identified are nominal. A movement is that of the robot's own parameters, not of frames,
     at 64 configurations of a box or of all joint ranges (``workspace``); to first order about the solution.
 
-    Parameters
-    ----------
-    text
-        The statement: it is parsed, and never evaluated.
-    where
-        Places by name: joint values (dof,) or (N, dof) [rad or m], or a box ``{"x": (low, high), "y": ..., "z": ...}``
-        [m] in the robot's base frame.
+    ``where`` has places by name: joint values (dof,) or (N, dof) [rad or m], or a box ``{"x": (low, high), "y": ...,
+    "z": ...}`` [m] in the robot's base frame. InputError for anything else, units that do not fit, demands that are not
+    convex; when it is posed, for names that the problem has not. The text is parsed, and never evaluated.
 
-    Raises
-    ------
-    InputError
-        For anything else, units that do not fit, demands that are not convex; when it is posed, for names that the
-        problem has not.
-
-    Examples
-    --------
     >>> import cvxpy as cp
     >>> import numpy as np
     >>> import rpim_opt as ro

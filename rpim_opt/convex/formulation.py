@@ -115,12 +115,10 @@ class Formulation(Brief):
 
 
 def _called(function: Any) -> str:
-    """Return what a person calls a function."""
     return str(getattr(function, "maker", "") or getattr(function, "__name__", type(function).__name__))
 
 
 def _functions(constraints: Any) -> tuple[Constraint, ...]:
-    """Return constraint functions that stand alone or in a list as a tuple of them."""
     if callable(constraints):
         return (constraints,)
     try:
@@ -147,7 +145,7 @@ class _Huber(Ready):
 
 
 def lost(name: str) -> Callable[..., Any]:
-    """Return what stands for the functions of a formulation that a file could not hold: it raises InputError."""
+    """Return a function in the place of those that a file could not hold: it raises InputError."""
 
     def function(*_: Any) -> Any:
         accepted = "the script that holds them, to calibrate again"
@@ -263,19 +261,7 @@ FORMULATIONS = {
 
 
 def formulation_of(stated: Formulation | str) -> Formulation:
-    """Return a formulation, or the ready one of that name.
-
-    Raises
-    ------
-    InputError
-        For a name that no ready formulation has, and for what is no formulation.
-
-    Examples
-    --------
-    >>> from rpim_opt.convex.formulation import formulation_of
-    >>> formulation_of("robust").name
-    'Huber'
-    """
+    """Return a formulation, or the ready one of that name; InputError for anything else."""
     if isinstance(stated, str):
         return pick(FORMULATIONS, stated, "formulation")
     if not isinstance(stated, Formulation):

@@ -37,15 +37,6 @@ def index_of(names: Sequence[str], key: Any, where: str) -> Any:
 class Deviations:
     """x = S z, deviations [SI] by name: ``x["a2"]`` in metres, ``x["alpha?"]`` in radians, ``x["*"]`` all of them.
 
-    Parameters
-    ----------
-    z
-        (n,) in units of the scales.
-    parameters
-        The n identified parameters.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> def shorter(z, p):
     ...     return p.x["a2"] <= -0.1e-3  # [m]
@@ -72,19 +63,10 @@ class Deviations:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Given(Identified):
-    """The identified parameters as a constraint function gets them: with z, and what follows it.
+    """The identified parameters as a constraint function gets them: with the unknowns z (n,), and what follows them.
 
-    Other arguments as for `Parameters`.
+    Other arguments as for `Parameters`; ``asked`` notes that positions were used, which are linear about some point.
 
-    Parameters
-    ----------
-    z
-        (n,) the unknowns, a CVXPY variable.
-    asked
-        Notes that positions were asked for, which are linear about some point.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> home = np.zeros((1, 6))  # joint values [rad]
@@ -101,39 +83,21 @@ class Given(Identified):
 
     @property
     def x(self) -> Deviations:
-        """Deviations [SI] by name, as expressions of z.
-
-        >>> import rpim_opt as ro
-        >>> equal = lambda z, p: p.x["a3"] == p.x["a4"]
-        >>> stated = ro.Formulation("as long", penalty=ro.tikhonov.penalty, constraints=(equal,))
-        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
-        >>> (1e3 * result.x[[9, 14]]).round(2)  # [mm]
-        array([-1.38, -1.38])
-        """
+        """Deviations [SI] by name, as expressions of z."""
         return Deviations(self.z, self)
 
     def positions(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
         """Return predicted positions (N, 3) [m] in the instrument's frame, affine in z.
 
-        To first order about the solution: a calibration is repeated about what it found until that is so.
+        To first order about the solution: a calibration is repeated about what it found until that is so. q (N, dof)
+        are joint values of the controller [rad or m]; ``marker`` is the reflector, the only one or the first by
+        default; ``torque`` (N, dof) joint torques [Nm], where compliance is identified from measured ones.
 
-        Parameters
-        ----------
-        q
-            (N, dof) joint values of the controller [rad or m].
-        marker
-            The reflector; the only one, or the first, by default.
-        torque
-            (N, dof) joint torques [Nm], where the compliance of joints is identified from measured ones.
-
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("paper_arm").problem
         >>> parameters = problem.linearize(np.zeros(len(problem.parameters.free))).parameters
-        >>> z = ro.convex.Unknown(parameters.names)
-        >>> there = ro.convex.given(z, parameters).positions(np.zeros((2, 6)))
+        >>> there = ro.convex.given(ro.convex.Unknown(parameters.names), parameters).positions(np.zeros((2, 6)))
         >>> there.shape, there.is_affine()
         ((2, 3), True)
         """
@@ -161,9 +125,7 @@ class Given(Identified):
 
 def whole(p: Given) -> Parameters:
     """Return all parameters of the machine; of a table alone those that it has."""
-    if p.machine is None:
-        return p
-    return p.machine.parameters
+    return p if p.machine is None else p.machine.parameters
 
 
 def machine_of(p: Given) -> Machine:
@@ -190,17 +152,8 @@ def _expression(found: Predicted, p: Given) -> cp.Expression:
 
 
 def given(z: Any, parameters: Parameters) -> Given:
-    """Return what constraint functions get: parameters that know z.
+    """Return what constraint functions get: parameters, those of a linear model with the machine, that know z (n,).
 
-    Parameters
-    ----------
-    z
-        (n,) a CVXPY expression.
-    parameters
-        Of z; those of a linear model know the machine.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> parameters = ro.load("paper_arm").problem.parameters.free
     >>> len(ro.convex.given(ro.convex.Unknown(parameters.names), parameters).x)
@@ -209,7 +162,5 @@ def given(z: Any, parameters: Parameters) -> Given:
     if isinstance(parameters, Given):
         return replace(parameters, z=z)
     table = {each.name: getattr(parameters, each.name) for each in fields(Parameters)}
-    machine = None
-    if isinstance(parameters, Identified):
-        machine = parameters.machine
+    machine = parameters.machine if isinstance(parameters, Identified) else None
     return Given(**table, machine=machine, z=z)

@@ -18,6 +18,8 @@ from rpim_opt.problem.linear import LinearModel
 
 FAR = 1e6
 """Bounds beyond so many scales are none."""
+LEAST = 1e-6
+"""Slacks below this are the solver's accuracy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,16 @@ def conflict(structure: Structure, model: LinearModel) -> Conflict | None:
     kept = _irreducible(units)
     single = _irreducible([[stated] for unit in kept for stated in unit])
     names = tuple(stated.name for unit in single for stated in unit)
-    return Conflict(*_loosening(structure, model), names, _of_statements(structure))
+    parameters, groups = structure.parameters, np.unique(model.group)
+    slack = _least(structure, model, "boxes")
+    bounds = {parameters.names[i]: float(slack[i] * parameters.scale[i]) for i in np.flatnonzero(slack > LEAST)}
+    slack = _least(structure, model, "configurations")
+    rows = {int(groups[i]): float(slack[i]) for i in np.flatnonzero(slack > LEAST)}
+    parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
+    slack = _least(structure, model, "statements") if parsed else np.zeros(0)
+    pairs = zip(parsed, slack, strict=True)
+    statements = {each.name: float(each.scale(parameters) * by) for each, by in pairs if by > LEAST}
+    return Conflict(bounds, rows, names, statements)
 
 
 def _solved(objective: Any, demands: Sequence[Any]) -> cp.Problem | None:
@@ -121,58 +132,29 @@ def _bounds(box: Box, structure: Structure, z: cp.Variable) -> list[Stated]:
     return found
 
 
-def _loosening(structure: Structure, model: LinearModel) -> tuple[dict[str, float], dict[int, float]]:
-    """Return the least loosening of the boxes [SI], and apart from it of the configurations' bound [sigma]."""
-    parameters, groups = model.parameters, np.unique(model.group)
-    by_bound = _least(structure, model, True) * parameters.scale
-    by_row = _least(structure, model, False)
-    bounds = {parameters.names[i]: float(by_bound[i]) for i in np.flatnonzero(by_bound > 1e-6 * parameters.scale)}
-    rows = {int(groups[i]): float(by_row[i]) for i in np.flatnonzero(by_row > 1e-6)}
-    return bounds, rows
+def _least(structure: Structure, model: LinearModel, loosened: str) -> Array:
+    """Return the slacks of least sum of boxes [scales], configurations [sigma] or statements [scales of each].
 
-
-def _least(structure: Structure, model: LinearModel, loosen_boxes: bool) -> Array:
-    """Return the slacks of least sum that make the constraints possible; zeros where none do."""
-    n, count = structure.n, len(np.unique(model.group))
-    z = cp.Variable(n)
-    slack = cp.Variable(n if loosen_boxes else count, nonneg=True)
-    hard: list[Any] = []
-    for k, function in enumerate(structure.formulation.constraints):
-        if not isinstance(function, Box):
-            hard += [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
-            continue
-        lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(structure.parameters))
-        room = slack if loosen_boxes else 0.0
-        hard += [z <= upper + room, z >= lower - room]
-    if structure.limited:
-        extra = 0.0 if loosen_boxes else slack
-        hard.append(norms(model.A @ z - model.b, model.group) <= structure.formulation.largest + extra)
-    return _least_sum(slack, hard)
-
-
-def _of_statements(structure: Structure) -> dict[str, float]:
-    """Return by how much [SI] statements would have to give way, in sum of scales the least; empty where that fails."""
+    The others stay as they are; zeros where that does not make the constraints possible.
+    """
+    parameters = structure.parameters
     z = cp.Variable(structure.n)
-    drawn = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
-    if not drawn:
-        return {}
-    slack = cp.Variable(len(drawn), nonneg=True)
-    units = [function.scale(structure.parameters) for function in drawn]
+    parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
+    count = {"boxes": structure.n, "configurations": len(np.unique(model.group)), "statements": len(parsed)}[loosened]
+    slack = cp.Variable(count, nonneg=True)
     demands: list[Any] = []
     for k, function in enumerate(structure.formulation.constraints):
-        if isinstance(function, Parsed):
-            place = drawn.index(function)
-            demands += function.loosened(z, structure.parameters, units[place] * slack[place])
+        if isinstance(function, Box):
+            lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(parameters))
+            more = slack if loosened == "boxes" else 0.0
+            demands += [z <= upper + more, z >= lower - more]
+        elif isinstance(function, Parsed) and loosened == "statements":
+            demands += function.loosened(z, parameters, function.scale(parameters) * slack[parsed.index(function)])
         else:
-            demands += [
-                substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]
-            ]
-    least = _least_sum(slack, demands)
-    return {function.name: float(unit * s) for function, unit, s in zip(drawn, units, least, strict=True) if s > 1e-6}
-
-
-def _least_sum(slack: cp.Variable, demands: list[Any]) -> Array:
-    """Return the slacks of least sum that make demands possible; zeros where none do."""
+            demands += [substituted(each, {id(structure.answers.z): z}) for each in structure.constraints[k]]
+    if structure.limited:
+        more = slack if loosened == "configurations" else 0.0
+        demands.append(norms(model.A @ z - model.b, model.group) <= structure.formulation.largest + more)
     _solved(cp.sum(slack), demands)
     return np.zeros(slack.size) if slack.value is None else np.asarray(slack.value)
 

@@ -52,22 +52,10 @@ def feasibility_tolerance(z: Array) -> float:
 class Estimate(Brief):
     """One solution: z (n,) at a weight, with the two values that the L-curve plots.
 
-    Parameters
-    ----------
-    z
-        (n,) in units of the scales.
-    weight, loss, penalty
-        The weight, loss(A z - b) and penalty(z).
-    duals
-        Multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the objective would
-        fall if the constraint were loosened by one unit of the scales.
-    status
-        CVXPY's word.
-    iterations, seconds
-        What the solver needed; zero iterations: a formula, or an active set.
+    ``duals`` are multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the
+    objective would fall if the constraint were loosened by one unit of the scales. ``status`` is CVXPY's word;
+    zero ``iterations``: a formula, or an active set.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem
@@ -94,22 +82,13 @@ class Estimate(Brief):
     @property
     def objective(self) -> float:
         """Loss and weighted penalty together."""
-        if self.weight == 0:
-            return self.loss
-        return self.loss + self.weight * self.penalty
+        return self.loss if self.weight == 0 else self.loss + self.weight * self.penalty
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Program(Brief):
-    """A formulation applied to a linear model, ready to be solved at any weight.
+    """A formulation applied to a linear model A z ~ b, ready to be solved at any weight.
 
-    Parameters
-    ----------
-    formulation, model
-        What is stated, and the equations A z ~ b.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -241,11 +220,6 @@ class Program(Brief):
     def squared_rows(self) -> bool:
         """Whether the loss is the sum of the equations' squares."""
         return self.loss_form is not None and self.squared is self.model
-
-    @property
-    def on_triangles(self) -> bool:
-        """Whether QR factors of some of the equations, instead of these, give this program of them."""
-        return self.structure.equations == self.model.A.shape[1] + 1 and self.squared_rows
 
     @cached_property
     def ridge(self) -> Ridge:
@@ -412,13 +386,8 @@ class Program(Brief):
         """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
 
         ``A``, ``b`` and ``weight`` are parameters of those names (`cp.Problem.param_dict`), and so are the parameters
-        of the formulation's own functions. It obeys CVXPY's rules for parametrized programs (DPP): solved again with
-        other values, it is not canonicalized again.
-
-        Raises
-        ------
-        InputError
-            For a weight that is negative or not finite.
+        of the formulation's own functions; it obeys CVXPY's rules for parametrized programs (DPP). InputError for a
+        weight that is negative or not finite.
         """
         A, b = self.rows
         data = (
@@ -755,22 +724,11 @@ def _require_installed(solver: Any) -> None:
 
 
 def pose(formulation: Formulation | str, model: LinearModel) -> Program:
-    """Return the program of a formulation on a linear model; the formulation's functions are asked now, once.
+    """Return the program of a formulation, or of the ready one of that name, on a linear model A z ~ b.
 
-    Parameters
-    ----------
-    formulation
-        What is stated, or the name of a ready formulation.
-    model
-        Equations A z ~ b.
+    The formulation's functions are called now, once. InputError where they do not return convex expressions and
+    constraints of CVXPY.
 
-    Raises
-    ------
-    InputError
-        For functions that do not answer convex expressions and constraints of CVXPY.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem

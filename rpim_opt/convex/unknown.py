@@ -13,13 +13,6 @@ from rpim_opt.convex.given import index_of
 class Unknown(cp.Variable):
     """z (n,), deviations in units of their scales, whose entries have names: ``z["a2"]``, ``z["a?"]``.
 
-    Parameters
-    ----------
-    names
-        Of the n identified parameters.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> z = ro.convex.Unknown(("a1", "a2", "d1"))
     >>> z["a2"].shape, z["a?"].shape, z[1].shape

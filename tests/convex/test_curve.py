@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -59,7 +61,7 @@ class Peak:
 @pytest.mark.parametrize("top", [-6.9, -3.0, 0.1, 2.5, 4.9])
 def test_golden_sections_end_at_the_top_with_one_new_point_a_step(top: float) -> None:
     curve = Peak(top)
-    found = _by_golden_sections(curve, -7.0, 5.0, 0.01)  # type: ignore[arg-type]
+    found = _by_golden_sections(curve.curvature, -7.0, 5.0, 0.01)
     assert found == pytest.approx(top, abs=0.01)
     steps = np.log(12.0 / 0.01) / np.log((1 + np.sqrt(5)) / 2)
     assert len(curve.asked) <= steps + 5
@@ -70,11 +72,11 @@ def test_golden_sections_end_at_the_top_with_one_new_point_a_step(top: float) ->
 
 @pytest.mark.parametrize("top", [-6.0, -4.5])
 def test_the_flat_end_is_cut_off(top: float) -> None:
-    assert _by_golden_sections(Peak(top, flat=-4.0), -7.0, 50.0, 0.01) == pytest.approx(top, abs=0.01)  # type: ignore[arg-type]
+    assert _by_golden_sections(Peak(top, flat=-4.0).curvature, -7.0, 50.0, 0.01) == pytest.approx(top, abs=0.01)
 
 
 def test_a_curve_that_bends_the_other_way_everywhere_ends() -> None:
-    found = _by_golden_sections(Peak(0.0, flat=-np.inf), 1.0, 5.0, 0.01)  # type: ignore[arg-type]
+    found = _by_golden_sections(Peak(0.0, flat=-np.inf).curvature, 1.0, 5.0, 0.01)
     assert 1.0 < found < 5.0
 
 
@@ -82,10 +84,9 @@ def test_a_curve_that_bends_the_other_way_everywhere_ends() -> None:
 def test_a_corner_by_sections_at_an_edge_is_none(
     inside: float, interior: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def at_edge(curve: select_curve._Curve, low: float, high: float, tolerance: float) -> float:
+    def at_edge(curvature: Callable[..., float], low: float, high: float, tolerance: float) -> float:
         best = {True: low, False: high}[inside > 0] + inside
-        for t in (best - 0.01, best, best + 0.01):
-            curve.point(t)
+        curvature(best - 0.01, best, best + 0.01)
         return best
 
     monkeypatch.setattr(select_curve, "_by_golden_sections", at_edge)

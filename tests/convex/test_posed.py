@@ -273,7 +273,7 @@ def test_a_conflict_says_the_least_loosening_of_boxes() -> None:
     loosening = [found.parameters[name] / free.scale[i] for i, name in enumerate(free.names[:3])]
     assert loosening == pytest.approx([0.75] * 3, rel=1e-4)  # each box by half
     assert found.configurations == {}
-    assert _least(stated, MODEL, False) == pytest.approx(np.zeros(10), abs=1e-6)
+    assert _least(stated, MODEL, "configurations") == pytest.approx(np.zeros(10), abs=1e-6)
 
 
 def test_a_conflict_says_which_configurations_do_not_reach_their_bound() -> None:

@@ -14,7 +14,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.rules import scores as select_scores
 from rpim_opt.convex.rules.curve import menger
-from rpim_opt.convex.rules.folds import AHEAD, _end_of_fall, _held_out, held_out_error
+from rpim_opt.convex.rules.folds import AHEAD, _end_of_fall, _error_of_folds, _least, held_out_error
 from rpim_opt.convex.rules.scores import _lowest
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import SELECTORS, disagreement
@@ -251,7 +251,8 @@ def test_a_search_by_holding_out_says_its_edges(values: str, edge: str) -> None:
     b = NOISY.A @ np.ones(12)
     if values == "noise":
         b = np.random.default_rng(1).normal(size=60)
-    chosen = _held_out(ro.convex.pose(ro.tikhonov, NOISY.with_values(b)), "mine", None)
+    program = ro.convex.pose(ro.tikhonov, NOISY.with_values(b))
+    chosen = _least(program, "mine", _error_of_folds(program, None))
     if edge == "lower":
         assert (chosen.weight, chosen.interior) == (chosen.weights[0], False)
         assert "smallest weight of the grid is best" in chosen.note
@@ -327,12 +328,11 @@ def test_two_steps_say_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("best", [0, 1, 198, 199])
-def test_holding_out_says_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def error(program: Any, weights: np.ndarray, parts: Any = None) -> np.ndarray:
+def test_holding_out_says_an_edge(best: int) -> None:
+    def error(weights: np.ndarray) -> np.ndarray:
         return np.abs(np.arange(len(weights)) - best) + 1.0
 
-    monkeypatch.setattr("rpim_opt.convex.rules.folds.held_out_error", error)
-    chosen = _held_out(PROGRAM, "mine", None)
+    chosen = _least(PROGRAM, "mine", error)
     assert chosen.weight == chosen.weights[best]
     assert chosen.interior == (0 < best < 199)
     said = {0: "smallest weight of the grid", 199: "largest weight of the grid"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
@@ -46,41 +48,27 @@ def l_curve(program: Program) -> Selection:
     if not score[best] > 0:
         best = 0
     if not 0 < best < len(weights) - 1:
-        return _no_corner(weights, score, best)
+        note = (
+            f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge of "
+            f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
+        )
+        return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
     weight = float(weights[best])
     if program.closed_form:
-        weight = _refined(program, weights, score, best)
+        refined, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
+        if -opposite > score[best]:  # the search sees one maximum of several
+            weight = refined
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
 
 
 def _first_corner(score: Array) -> int:
     """Return the corner at the smallest weight of those that are about as sharp as the sharpest.
 
-    Where the last parameters or groups vanish, a path with kinks bends like at a corner, far above the noise.
+    Where the last parameters or groups vanish, a path bends like at a corner, far above the noise.
     """
     peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
     sharp = peaks[score[peaks] >= SHARP * np.max(score)]
-    if len(sharp):
-        return int(sharp[0])
-    return int(np.argmax(score))
-
-
-def _no_corner(weights: Array, score: Array, best: int) -> Selection:
-    side = "lower" if best == 0 else "upper"
-    note = (
-        f"the L-curve has no corner: the weight is the {side} edge of {weights[0]:.1e} to {weights[-1]:.1e}; "
-        "another selector, or a weight of your own, may serve better"
-    )
-    return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
-
-
-def _refined(program: Program, weights: Array, score: Array, best: int) -> float:
-    """Return the weight of the largest curvature between the neighbours of the best on the grid."""
-    weight, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
-    # the search sees one maximum of several: the grid's own stays unless it is beaten
-    if -opposite > score[best]:
-        return weight
-    return float(weights[best])
+    return int(sharp[0]) if len(sharp) else int(np.argmax(score))
 
 
 def _points(estimates: list[Estimate]) -> Array:
@@ -137,30 +125,25 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     Cultrera and Callegaro 2020 (IOP SciNotes 1:025004): of four points on the curve the inner one with the larger
     curvature stays, and the interval shrinks to its neighbours; one new solution a step.
 
-    Parameters
-    ----------
-    program
-        The formulation on a linear model.
-    tolerance
-        Length of the interval of ln weight at which the search ends.
+    It ends at a length ``tolerance`` of the interval of ln weight. InputError for a formulation without penalty.
 
-    Raises
-    ------
-    InputError
-        For a formulation without penalty.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
     >>> f"{result.weight:.1g}", result.selection.note
     ('0.7', 'corner of the L-curve by golden sections')
     """
     low, high = np.log(weight_grid(program, 2))
-    curve = _Curve(program)
-    best = _by_golden_sections(curve, low, high, tolerance)
-    order = sorted(curve.seen)
-    points = np.array([curve.seen[t] for t in order])
+    seen: dict[float, Array] = {}
+
+    def curvature(*places: float) -> float:
+        for t in places:
+            if t not in seen:
+                seen[t] = _points(program.path([np.exp(t)]))[0]
+        return float(menger(np.array([seen[t] for t in places]))[1])
+
+    best = _by_golden_sections(curvature, low, high, tolerance)
+    order = sorted(seen)
+    points = np.array([seen[t] for t in order])
     interior = bool(low + 0.1 < best < high - 0.1)
     note = "corner of the L-curve by golden sections"
     if not interior:
@@ -168,36 +151,20 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
 
 
-class _Curve:
-    """The L-curve over t = ln weight, solved where it is asked for and kept."""
-
-    def __init__(self, program: Program) -> None:
-        self.program = program
-        self.seen: dict[float, Array] = {}
-
-    def point(self, t: float) -> Array:
-        if t not in self.seen:
-            self.seen[t] = _points(self.program.path([np.exp(t)]))[0]
-        return self.seen[t]
-
-    def curvature(self, a: float, b: float, c: float) -> float:
-        return float(menger(np.array([self.point(a), self.point(b), self.point(c)]))[1])
-
-
-def _by_golden_sections(curve: _Curve, low: float, high: float, tolerance: float) -> float:
+def _by_golden_sections(curvature: Callable[..., float], low: float, high: float, tolerance: float) -> float:
     """Return ln weight of the corner: of the two inner points the one with the larger curvature, until they meet."""
     left = (high + GOLDEN * low) / (1 + GOLDEN)
     right = low + high - left
     best = left
     while high - low > tolerance:
-        on_the_right = curve.curvature(left, right, high)
+        on_the_right = curvature(left, right, high)
         while on_the_right < 0 and high - low > tolerance:
             # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
             high = right
             right = left
             left = (high + GOLDEN * low) / (1 + GOLDEN)
-            on_the_right = curve.curvature(left, right, high)
-        if curve.curvature(low, left, right) > on_the_right:
+            on_the_right = curvature(left, right, high)
+        if curvature(low, left, right) > on_the_right:
             best = left
             high = right
             right = left

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.curve import l_curve
 from rpim_opt.convex.rules.scores import Rule, Squared, influence, linear_rule, penalty_of
 from rpim_opt.convex.rules.selection import Score, Selection, edge, on_squares, searched, weight_grid, with_rows
-from rpim_opt.problem.linear import from_triangle, reduced_rows
 
 SOME = 6
 """Configurations that are left out by solving, to see how exact the approximation is."""
@@ -48,20 +47,8 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     is. With cones and few configurations all are solved; of a loss that is no sum over rows (minimax), those that have
     an influence.
 
-    Parameters
-    ----------
-    program
-        The formulation on a linear model.
-    exact
-        Whether all are solved anyway.
+    ``exact``: all are solved anyway. InputError for a single configuration, or a formulation without penalty.
 
-    Raises
-    ------
-    InputError
-        For a single configuration, or a formulation without penalty.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.leave_one_out)
     >>> f"{result.weight:.2g}", result.selection.interior
@@ -73,40 +60,23 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     if program.closed_form and not mixed:
         note = "smallest error of configurations left out one by one"
         return linear_rule(program, Rule("leave_one_out", _of_squares, note))
-    if exact or not _approximates(program):
-        return _held_out(program, "leave_one_out", None, exact)
-    predicted = _approximately(program)
-    weights, score, best = searched(lambda some: _error(program, predicted(some)), weight_grid(program, COARSE))
-    interior = 0 < best < len(weights) - 1
-    note = f"smallest error of configurations left out one by one, {_how_exact(program, weights[best])}"
-    if not interior:
-        note = edge(best)
-    return Selection(float(weights[best]), "leave_one_out", weights, score, interior, note)
+    if exact:
+        return _least(program, "leave_one_out", _error_of_folds(program, None))
+    chosen = _least(program, "leave_one_out", _left_out_error(program))
+    if not chosen.interior or not _approximates(program):
+        return chosen
+    note = f"smallest error of configurations left out one by one, {_how_exact(program, chosen.weight)}"
+    return replace(chosen, note=note)
 
 
 @on_squares
 def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
 
-    Parameters
-    ----------
-    program
-        The formulation on a linear model.
-    folds
-        In how many parts the configurations are divided.
-    seed
-        Of the division.
-    parts
-        Instead of that, the numbers (k,) of the configurations that are left out together, each in one part:
-        `Dataset.by_session` has those of every session.
+    ``folds`` parts are drawn with ``seed``; or ``parts`` are the numbers (k,) of the configurations that are left out
+    together, each in one part: `Dataset.by_session` has those of every session. InputError for fewer configurations
+    than folds, parts that are no division of them, or a formulation without penalty.
 
-    Raises
-    ------
-    InputError
-        For fewer configurations than folds, parts that are no division of them, or a formulation without penalty.
-
-    Examples
-    --------
     >>> from functools import partial
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=partial(ro.k_fold, folds=5))
@@ -115,11 +85,11 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
     """
     groups = np.unique(with_rows(program, "k_fold").group)
     if parts is not None:
-        return _held_out(program, "k_fold", _division(groups, parts))
+        return _least(program, "k_fold", _error_of_folds(program, _division(groups, parts)))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
-    return _held_out(program, "k_fold", parts)
+    return _least(program, "k_fold", _error_of_folds(program, parts))
 
 
 @on_squares
@@ -155,10 +125,7 @@ def two_step(program: Program) -> Selection:
 
 
 def _end_of_fall(program: Program, weights: Array) -> float:
-    """Return the first weight (K,), falling, from which the residual norm falls no more; the first if it always does.
-
-    What has no formula is solved no farther than that.
-    """
+    """Return the first of falling weights (K,) where the residual norm falls no more; the first if it always does."""
     some = len(weights) if program.closed_form else AHEAD
     residual = np.empty(0)
     while len(residual) < len(weights):
@@ -180,19 +147,16 @@ def _division(groups: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarra
     return present
 
 
-def _held_out(program: Program, name: str, parts: Sequence[np.ndarray] | None, exact: bool = False) -> Selection:
+def _least(program: Program, name: str, error: Score) -> Selection:
+    """Return the choice of the least error of configurations held out."""
     if program.closed_form:
         weights = weight_grid(program)
-        score = held_out_error(program, weights, parts)
+        score = error(weights)
         best = int(np.argmin(score))
     else:
-        grid = weight_grid(program, COARSE)
-        error = _left_out_error(program) if parts is None and not exact else _error_of_folds(program, parts)
-        weights, score, best = searched(error, grid)
+        weights, score, best = searched(error, weight_grid(program, COARSE))
     interior = 0 < best < len(weights) - 1
-    note = "smallest error of configurations held out"
-    if not interior:
-        note = edge(best)
+    note = "smallest error of configurations held out" if interior else edge(best)
     return Selection(float(weights[best]), name, weights, score, interior, note)
 
 
@@ -200,10 +164,9 @@ def _held_out(program: Program, name: str, parts: Sequence[np.ndarray] | None, e
 
 
 def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray] | None = None) -> Array:
-    """Root mean square of the whitened residual of held-out configurations, predicted from all the others.
+    """Return the RMS (K,) of the whitened residual of held-out configurations, predicted from all the others.
 
-    ``parts`` are the configurations that are held out together; each one alone by default. A loss that is no square
-    judges the median of the configurations' norms instead: an outlier held out is not an error of the prediction.
+    A loss that is no square judges the median of their norms: an outlier held out is no error of the prediction.
     """
     return _error_of_folds(program, parts)(weights)
 
@@ -237,30 +200,20 @@ def _error(program: Program, norms: Array) -> Array:
     return np.sqrt(np.sum(norms**2, axis=1) / len(program.model.b))
 
 
-class Rows(NamedTuple):
-    """Rows of configurations with the same number of equations, (G, k): places in the residual."""
-
-    places: np.ndarray
-    configurations: np.ndarray
-
-
-def by_size(group: np.ndarray) -> list[Rows]:
-    """Return the rows of configurations, those of a size together; ``group`` (m,) numbers the configurations."""
+def by_size(group: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return places of rows (G, k) and configurations (G,), those of k equations together; ``group`` is (m,)."""
     which, count = np.unique(group, return_inverse=True, return_counts=True)[1:]
     order = np.argsort(which, kind="stable")
     first = np.cumsum(count) - count
     found = []
     for size in np.unique(count):
         configurations = np.flatnonzero(count == size)
-        found.append(Rows(order[first[configurations][:, None] + np.arange(size)], configurations))
+        found.append((order[first[configurations][:, None] + np.arange(size)], configurations))
     return found
 
 
 def _solved(M: Array, v: Array) -> Array:
-    """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...), without pivoting.
-
-    What a vanishing pivot would decide is zero, as in a pseudo-inverse.
-    """
+    """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...); zero where a pivot vanishes."""
     k = len(M)
     M, v = M.copy(), v.copy()
     for i in range(k):
@@ -287,9 +240,9 @@ def _of_squares(squared: Squared) -> Score:
     Q, s2, target = influence(squared)
     projected = Q.T @ target
     parts = []
-    for rows in by_size(squared.model.group):
-        each, k = Q[rows.places], rows.places.shape[1]
-        parts.append((rows.places, {(i, j): each[:, i] * each[:, j] for i in range(k) for j in range(i, k)}))
+    for places, _ in by_size(squared.model.group):
+        each, k = Q[places], places.shape[1]
+        parts.append((places, {(i, j): each[:, i] * each[:, j] for i in range(k) for j in range(i, k)}))
 
     def some(weights: Array) -> Array:
         filters = (s2 / (s2 + weights[:, None])).T
@@ -310,24 +263,21 @@ def _of_squares(squared: Squared) -> Score:
 
 
 def _approximates(program: Program) -> bool:
-    """Whether the derivative of the solution tells what leaving a configuration out changes.
-
-    Cones bend the solution's path: with few configurations, all of them are solved without.
-    """
+    """Whether the derivative of the solution serves: cones bend its path, and few configurations are all solved."""
     if program.loss_form is None or not program.loss_form.diagonal or program.closed_form:
         return False
     return program.structure.canonical.polyhedral or len(np.unique(program.model.group)) > EXACTLY
 
 
 def _approximately(program: Program) -> Predicted:
-    """Return what predicts every configuration by the derivative of the solution."""
+    """Return the predictor of every configuration by the derivative of the solution."""
     model = program.squared
     rows = by_size(model.group)
 
     def norms(estimate: Estimate) -> Array:
         D, U = program.derivative(estimate)
         r = model.A @ estimate.z - model.b
-        found = np.zeros(sum(len(each.configurations) for each in rows))
+        found = np.zeros(sum(len(configurations) for _, configurations in rows))
         for places, configurations in rows:
             A = model.A[places]
             hat = np.einsum("gin,nr,gjr->ijg", A, D, U[places], optimize=True)
@@ -339,7 +289,7 @@ def _approximately(program: Program) -> Predicted:
 
 
 def _how_exact(program: Program, weight: float) -> str:
-    """Say how exact the approximation is, from some configurations that are solved without."""
+    """Return how exact the approximation is for some configurations that are solved without."""
     configurations = np.unique(program.model.group)
     norms = _approximately(program)(np.array([weight]))[0]
     order = np.argsort(norms)  # from the best predicted to the worst
@@ -370,74 +320,34 @@ def _of_influential(program: Program, weights: Array) -> Array:
 
 
 class Folds:
-    """A program without each of some parts of its configurations, solved again at weights that are asked for.
-
-    Parameters
-    ----------
-    program
-        The whole.
-    parts
-        Numbers of the configurations that are left out together.
-    """
+    """A program without each of some parts of its configurations, solved again."""
 
     def __init__(self, program: Program, parts: Sequence[np.ndarray]):
-        self._whole, self._rows = program, _rows(program.model.group, parts)
+        self._whole = program
+        group = program.model.group
+        part_of = np.full(int(group.max()) + 1, -1)
+        for k, part in enumerate(parts):
+            part_of[part] = k
+        self._rows = [np.flatnonzero(part_of[group] == k) for k in range(len(parts))]
         self._kept: list[Program] = []
-        if program.on_triangles or len(parts) * program.model.A.nbytes <= MEMORY:
-            self._kept = list(_folds(program, self._rows))
+        if len(parts) * program.model.A.nbytes <= MEMORY:
+            self._kept = [self._without(rows) for rows in self._rows]
+
+    def _without(self, rows: np.ndarray) -> Program:
+        out = np.zeros(len(self._whole.model.group), dtype=bool)
+        out[rows] = True
+        return self._whole.without(out)
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
-        return np.hstack([self._norms(k, weights) for k in range(len(self._rows))])
-
-    def _norms(self, k: int, weights: Array) -> Array:
-        model, out = self._whole.model, self._rows[k]
-        program = self._kept[k] if self._kept else _without(self._whole, out)
-        Z = np.array([estimate.z for estimate in program.path(weights)])
-        squares = (Z @ model.A[out].T - model.b[out]) ** 2
-        _, which = np.unique(model.group[out], return_inverse=True)
-        sums = np.zeros((len(weights), which.max() + 1))
-        np.add.at(sums.T, which, squares.T)
-        return np.sqrt(sums)
-
-
-def _rows(group: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the rows of each of some parts, which have different configurations; ``group`` (m,) is every row's."""
-    place = np.full(int(group.max()) + 1, -1)
-    for k, part in enumerate(parts):
-        place[part] = k
-    of_part = place[group]
-    order = np.argsort(of_part, kind="stable")
-    return np.split(order, np.searchsorted(of_part[order], np.arange(len(parts) + 1)))[1:-1]
-
-
-def _without(program: Program, rows: np.ndarray) -> Program:
-    out = np.zeros(len(program.model.group), dtype=bool)
-    out[rows] = True
-    return program.without(out)
-
-
-def _folds(program: Program, parts: Sequence[np.ndarray]) -> Iterator[Program]:
-    """Return the program without the rows of each of the parts, one after the other.
-
-    The rows of a squared loss are reduced part by part, once: what is left without a part is the triangles of the parts
-    before it over those after it. Rows are added to triangles only, never taken from them, so that nothing is lost to
-    cancellation where what is left sees less than the whole.
-    """
-    model = program.model
-    n = model.A.shape[1]
-    if not program.on_triangles or len(parts) < 2:
-        for part in parts:
-            yield _without(program, part)
-        return
-    rows = np.column_stack([model.A, model.b])
-    each = [reduced_rows(rows[part]) for part in parts]
-    rest = reduced_rows(np.delete(rows, np.concatenate(parts), axis=0))
-    after = [np.zeros((n + 1, n + 1))]
-    for triangle in reversed(each[1:]):
-        after.append(reduced_rows(triangle, after[-1]))
-    before = rest
-    for k, triangle in enumerate(each):
-        left = reduced_rows(before, after[-1 - k])
-        yield program.apart(from_triangle(model, left, model.equations - len(parts[k])))
-        before = reduced_rows(triangle, before)
+        model = self._whole.model
+        found = []
+        for k, out in enumerate(self._rows):
+            program = self._kept[k] if self._kept else self._without(out)
+            Z = np.array([estimate.z for estimate in program.path(weights)])
+            squares = (Z @ model.A[out].T - model.b[out]) ** 2
+            _, which = np.unique(model.group[out], return_inverse=True)
+            sums = np.zeros((which.max() + 1, len(weights)))
+            np.add.at(sums, which, squares.T)
+            found.append(np.sqrt(sums.T))
+        return np.hstack(found)

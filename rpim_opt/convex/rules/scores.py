@@ -30,7 +30,7 @@ TOGETHER = 250_000
 
 @dataclass(frozen=True, eq=False)
 class Squared:
-    """What a linear rule sees: equations, penalty, and their closed form."""
+    """Equations, penalty, and their closed form."""
 
     model: LinearModel
     penalty: Quadratic
@@ -49,7 +49,7 @@ def penalty_of(program: Program) -> Quadratic:
 
 @dataclass(frozen=True)
 class Rule:
-    """A score of the weight that is least at the choice; with ``local`` an interior minimum goes before an edge."""
+    """A score of the weight, least at the choice; with ``local`` an interior minimum goes before an edge."""
 
     name: str
     score: Callable[[Squared], Score]
@@ -58,7 +58,7 @@ class Rule:
 
 
 def linear_rule(program: Program, rule: Rule) -> Selection:
-    """Minimize a score of the linear estimator over a grid from the singular values, refined between its points."""
+    """Minimize a score of the linear estimator over a grid, refined between its points."""
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
         accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
@@ -66,11 +66,6 @@ def linear_rule(program: Program, rule: Rule) -> Selection:
     if program.loss_form is None:
         program.trusted(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
     squared = Squared(program.squared, penalty_of(program), program.ridge)
-    return _least(rule, squared)
-
-
-def _least(rule: Rule, squared: Squared) -> Selection:
-    """Return the choice of a rule for given squares."""
     weights = grid_of(squared.form)
     score_at = rule.score(squared)
     score = score_at(weights)
@@ -118,13 +113,8 @@ def reml(program: Program) -> Selection:
     weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
     at the lower edge means that the data want no penalty. Constraints are left out of the likelihood.
 
-    Raises
-    ------
-    InputError
-        For another penalty than a quadratic.
+    InputError for another penalty than a quadratic.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> print(result.weight_sentence())
@@ -179,21 +169,9 @@ def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
 
     Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233).
 
-    Parameters
-    ----------
-    program
-        The formulation on a linear model.
-    gamma
-        The price of a degree of freedom, 1 in `gcv`.
+    ``gamma`` is the price of a degree of freedom, 1 in `gcv`. InputError for another penalty than a quadratic, and with
+    less than three equations for each direction, where it guards too much.
 
-    Raises
-    ------
-    InputError
-        For another penalty than a quadratic; with less than three equations for each direction, where it guards
-        too much.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.robust_gcv)
     >>> f"{result.weight:.2g}", result.selection.interior

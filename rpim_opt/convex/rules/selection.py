@@ -98,10 +98,7 @@ Selector = Callable[[Program], Selection]
 
 
 def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
-    """Make a rule see a robust loss as the linear estimator that its fit amounts to (`Program.trusted`).
-
-    What a robust loss trusts depends on the weight: the rule is asked again until its answer stays.
-    """
+    """Make a rule see a robust loss as the linear estimator that its fit amounts to, until its choice stays."""
 
     @wraps(rule)
     def chosen(program: Program, *given: Any, **options: Any) -> Selection:
@@ -142,9 +139,7 @@ EDGES = {
 
 def edge(best: int) -> str:
     """Return the note on a choice at the first or the last weight."""
-    if best == 0:
-        return EDGES["lower"]
-    return EDGES["upper"]
+    return EDGES["lower" if best == 0 else "upper"]
 
 
 def with_rows(program: Program, name: str) -> LinearModel:
@@ -166,9 +161,8 @@ def require_weight(weight: float, where: str, file: object = None) -> float:
 def weight_grid(program: Program, count: int = 200) -> Array:
     """Return the weights between which the estimate changes, at equal ratios.
 
-    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, where s are the singular values of A (zero ones aside): below,
-    the penalty changes nothing that the data see; above, it leaves nothing to identify. A penalty with kinks (lasso)
-    leaves nothing to identify from its own largest weight on, which ends the grid.
+    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a penalty with
+    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
@@ -185,8 +179,7 @@ def weight_grid(program: Program, count: int = 200) -> Array:
 def _largest(program: Program) -> float | None:
     """Return the weight from which a penalty leaves nothing to identify; None where there is none.
 
-    Of a positively homogeneous penalty it is the dual norm of the loss's slope g at nominal:
-    max { -g'z : penalty(z) <= 1 }.
+    Of a positively homogeneous penalty it is max { -g'z : penalty(z) <= 1 }, g the loss's slope at nominal.
     """
     if program.linear_penalty or program.structure.inner or program.loss_form is None:
         return None
@@ -223,16 +216,9 @@ def least_between(score: Score, weights: Array, best: int) -> tuple[float, float
 
 
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
-    """Return weights (K,), their scores and the place of the least, from a coarse grid refined about its best.
+    """Return weights (K,), their scores and the place of the least, from a coarse grid halved about its best.
 
-    Between the best and its neighbours the score is asked for halfway, again and again, until the neighbours' scores
-    do not differ from the best's, or their weights hardly from its own.
-
-    >>> import numpy as np
-    >>> from rpim_opt.convex.rules.selection import searched
-    >>> weights, score, best = searched(lambda w: 1 + np.log(w / 3) ** 2, np.geomspace(1e-3, 1e3, 7))
-    >>> bool(abs(np.log(weights[best] / 3)) < 0.05), len(weights)
-    (True, 19)
+    It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own.
     """
     weights, found = np.array(grid), score(grid)
     while True:
