@@ -24,30 +24,25 @@ if TYPE_CHECKING:
 
 def show(text: object, document: dict[str, Any], as_json: bool) -> None:
     """Print the text, or the document as JSON."""
-    if as_json:
-        from rpim_opt.basics.files import json_text
-
-        text = json_text(document).rstrip("\n")
-    _print(str(text), sys.stdout)
+    _print(document if as_json else str(text), sys.stdout)
 
 
 def fail(text: str, code: int) -> None:
     """Print an error on stderr, as JSON with ``--json``, and end with an exit code."""
-    if "--json" in sys.argv:
-        from rpim_opt.basics.files import json_text
-
-        text = json_text({"error": text}).rstrip("\n")
     try:
-        _print(text, sys.stderr)
+        _print({"error": text} if "--json" in sys.argv else text, sys.stderr)
     except OSError:  # nobody reads it
         _close(sys.stderr)
     sys.exit(code)
 
 
-def _print(text: str, stream: TextIO) -> None:
-    """Print a text without control characters, flushed so that a closed pipe is noticed."""
+def _print(text: str | dict[str, Any], stream: TextIO) -> None:
+    """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
+    from rpim_opt.basics.files import json_text
     from rpim_opt.basics.text import visible
 
+    if not isinstance(text, str):
+        text = json_text(text).rstrip("\n")
     encoding = getattr(stream, "encoding", None) or "utf-8"
     print(visible(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
@@ -204,13 +199,11 @@ def listed_words(text: str) -> list[str]:
 
 def listed_numbers(text: str) -> list[str | int | float]:
     """Return the words of ``learned,1.0``, those that are numbers as numbers."""
-    return [_number_or_word(word) for word in listed_words(text)]
-
-
-def _number_or_word(word: str) -> str | int | float:
-    for kind in (int, float):
-        try:
-            return kind(word)
-        except ValueError:
-            continue
-    return word
+    values: list[str | int | float] = []
+    for word in listed_words(text):
+        value: str | int | float = word
+        for kind in (float, int):
+            with suppress(ValueError):
+                value = kind(word)
+        values.append(value)
+    return values

@@ -153,8 +153,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
     record = result.record
     if content.accepted is not None:
         yield "heading", "Acceptance"
-        yield "facts", _acceptance(result, content.accepted)
-        yield "notes", content.accepted.reasons
+        yield "bullets", _acceptance(result, content.accepted)
     yield "heading", "Accuracy"
     used = "Identification rows were used to identify the parameters"
     if record.validation is not None:
@@ -188,27 +187,16 @@ def _accuracy(content: Content) -> Iterator[Block]:
         yield from _uncertainty(content.map, result)
 
 
-def _acceptance(result: Calibration, found: Acceptance) -> list[tuple[str, str]]:
-    requirement = found.requirement
-    facts = [
-        ("Limit", f"{1e3 * requirement.limit:g} mm, with {percent(requirement.confidence)}"),
-        ("Region", requirement.where),
-    ]
-    if found.bound is not None and found.typical is not None and np.isfinite(found.bound):
-        worst = ""
-        if found.worst is not None:
-            units = joint_columns(result.problem.robot.joint_dimensions)
-            values = [f"{value / si:.1f}" for value, si in zip(found.worst, units.values(), strict=True)]
-            worst = f", at joints {', '.join(values)} {' and '.join(sorted({n.rpartition('_')[2] for n in units}))}"
-        facts += [
-            ("Maximum U", f"{1e3 * found.bound:.3f} mm{worst}"),
-            ("Median U", f"{1e3 * found.typical:.3f} mm, of {found.count} configurations"),
-        ]
+def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
+    lines = found.sentences()[1:]
+    if found.worst is not None:
+        units = joint_columns(result.problem.robot.joint_dimensions)
+        values = [f"{value / si:.1f}" for value, si in zip(found.worst, units.values(), strict=True)]
+        named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
+        lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
     if found.scatter is not None:
-        facts.append(("Repeatability", f"{1e3 * found.scatter:.3f} mm of the maximum U, with all parameters known"))
-    if found.checked is not None:
-        facts.append(("Validation", found.checked.sentence()))
-    return facts
+        lines.append(f"Repeatability alone, with all parameters known: {1e3 * found.scatter:.3f} mm of the maximum U.")
+    return lines
 
 
 def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure]:
@@ -385,10 +373,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
     yield "text", [text]
     yield "bullets", redundant
     indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())
-    yield (
-        "text",
-        [f"Condition number {found.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."],
-    )
+    condition = f"Condition number {found.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."
+    yield "text", [condition]
 
 
 def _flagged(result: Calibration) -> Block:

@@ -68,14 +68,13 @@ def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
     """Return the same of orientations and of known angles [mrad]; empty where none were measured."""
     rows: list[dict[str, Any]] = []
     for name, data in sets(result).items():
-        every = np.arange(len(data))
-        rows += _both_models(result, name, data, "angle", every, "mrad")
-        rows += _both_models(result, f"{name}, known angle", data, "stated angle", every, "mrad")
+        rows += _both_models(result, name, data, "angle", unit="mrad")
+        rows += _both_models(result, f"{name}, known angle", data, "stated angle", unit="mrad")
     return [row for row in rows if row["count"]]
 
 
 def _both_models(
-    result: Calibration, what: str, data: Dataset, dimension: str, rows: np.ndarray, unit: Unit = "mm"
+    result: Calibration, what: str, data: Dataset, dimension: str, rows: Any = slice(None), unit: Unit = "mm"
 ) -> list[dict[str, Any]]:
     models = {"nominal": result.nominal_errors, "identified": result.errors}
     return [_figures(f"{what}, {model}", errors(data, dimension)[rows], unit) for model, errors in models.items()]
@@ -113,7 +112,7 @@ class Workspace(NamedTuple):
     requirement: Requirement
 
     def sentence(self) -> str:
-        """Say how large it is."""
+        """Return its maximum and median in a sentence."""
         return (
             f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
             f"{mm(1e3 * self.expanded.max())} mm, median {mm(1e3 * float(np.median(self.expanded)))} mm, over "
@@ -159,7 +158,7 @@ def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
 
 
 def headline(result: Calibration) -> str:
-    """Say by how much the errors fall, on data that were not used for identification where there are some."""
+    """Return by how much the errors fall, on data that were not used for identification where there are some."""
     name, nominal, identified = headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     n = after["count"]
@@ -194,13 +193,13 @@ def headline(result: Calibration) -> str:
 
 
 def identifiability(result: Calibration) -> str:
-    """Say how many combinations of the parameters the data identify."""
+    """Return how many combinations of the parameters the data identify."""
     model = result.program.model
     return f"{model.rank} of {len(result.x)} parameter combinations are identifiable from {model.equations} equations."
 
 
 def warnings(result: Calibration) -> list[str]:
-    """Say what a reader must know besides the figures, the worst first."""
+    """Return what a reader must know besides the figures, the worst first."""
     lines = [line for line in result.remarks() if line != result.message]
     validation = result.record.validation
     if validation is not None:
@@ -219,7 +218,7 @@ def warnings(result: Calibration) -> list[str]:
 
 
 def nominal_note(result: Calibration) -> str:
-    """Say what the nominal errors are of."""
+    """Return what the nominal errors are of."""
     fitted = result.problem.parameters.placed & result.problem.parameters.identified
     if fitted.any():
         return "Nominal: the nominal robot, with its base, tool and other frames fitted to the identification data."
@@ -232,12 +231,7 @@ def nominal_note(result: Calibration) -> str:
 def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """Return parameters, errors, weight, verdict and sentences of a calibration as a document.
 
-    Parameters
-    ----------
-    result
-        The calibration, with title, source and validation data in its record.
-    published
-        Mean errors [mm] that the source prints, by set and method.
+    ``published`` are mean errors [mm] that the source prints, by set and method.
     """
     record = result.record
     errors = error_rows(result)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,10 +96,10 @@ def simulated_arm(
     there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (VALIDATION_COUNT, robot.dof))
     q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
 
-    motion = _Motion(robot, physics, np.random.default_rng([seed, 5]))
+    moved = _moved(robot, physics, np.random.default_rng([seed, 5]))
 
     def measured(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ flange(robot, motion.joints(joints), errors)
+        T = base @ flange(robot, moved(joints), errors)
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
         draws = np.random.default_rng([seed, stream]).standard_normal(points.shape)
         return Dataset.of(joints, points + level * draws, noise)
@@ -127,36 +128,34 @@ def _frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
     return frames
 
 
-class _Motion:
-    """Joint values of encoder values: sag under gravity, and eccentric encoders."""
+def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Array], Array]:
+    """Return the function from encoder to joint values (N, dof) [rad]: sag under gravity, and eccentric encoders."""
+    mass = np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1]
+    phase = rng.uniform(0, 2 * np.pi, robot.dof)
+    compliance = rng.uniform(0.3, 1.0, robot.dof)
+    largest = np.abs(_torque(robot, mass, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
 
-    def __init__(self, robot: Robot, size: float, rng: np.random.Generator) -> None:
-        self.robot = robot
-        self.size = size
-        self.mass = np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1]
-        self.phase = rng.uniform(0, 2 * np.pi, robot.dof)
-        self.compliance = rng.uniform(0.3, 1.0, robot.dof)
-        self.largest = np.abs(self._torque(rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
-
-    def joints(self, q: Array) -> Array:
-        """Return joint values (N, dof) [rad] of encoder values."""
-        if not self.size:
+    def joints(q: Array) -> Array:
+        if not size:
             return q
-        sag = self.compliance * self._torque(q) / np.maximum(self.largest, 1e-9 * self.largest.max())
-        off = self.size * (sag + np.cos(q @ self.robot.joint_map.T + self.phase) / 3)
-        return q + off @ np.linalg.inv(self.robot.joint_map).T
+        sag = compliance * _torque(robot, mass, q) / np.maximum(largest, 1e-9 * largest.max())
+        off = size * (sag + np.cos(q @ robot.joint_map.T + phase) / 3)
+        return q + off @ np.linalg.inv(robot.joint_map).T
 
-    def _torque(self, q: Array) -> Array:
-        """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
-        frames = _frames(self.robot, q, np.zeros((self.robot.dof, 6)))
-        places = [frame[:, :3, 3] for frame in frames]
-        centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
-        down = np.array([0.0, 0.0, -1.0])
-        torque = np.zeros(q.shape)
-        for i, frame in enumerate(frames):
-            for mass, centre in zip(self.mass[i:], centres[i:], strict=True):
-                torque[:, i] += mass * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
-        return torque
+    return joints
+
+
+def _torque(robot: Robot, mass: Array, q: Array) -> Array:
+    """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
+    frames = _frames(robot, q, np.zeros((robot.dof, 6)))
+    places = [frame[:, :3, 3] for frame in frames]
+    centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
+    down = np.array([0.0, 0.0, -1.0])
+    torque = np.zeros(q.shape)
+    for i, frame in enumerate(frames):
+        for each, centre in zip(mass[i:], centres[i:], strict=True):
+            torque[:, i] += each * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
+    return torque
 
 
 def _errors(dof: int, rng: np.random.Generator) -> Array:

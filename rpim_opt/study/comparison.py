@@ -289,7 +289,7 @@ class Comparison:
         InputError
             For an unknown metric or method, or where nothing has figures.
         """
-        return summarize(self.rows, self._metric(metric), self.reference(metric, against), self.drawn)
+        return summarize(self.rows, metric or self.metric, self.reference(metric, against), self.drawn)
 
     def plot(self, metric: str | None = None, against: str | None = None) -> Any:
         """Return a matplotlib figure: every method's errors over the reference's, in pairs, and performance profiles.
@@ -318,7 +318,9 @@ class Comparison:
 
     def reference(self, metric: str | None = None, against: str | None = None) -> str:
         """Return the label of the method that others are compared with; arguments as for `summary`."""
-        of = figures(self.rows, self._metric(metric))
+        if metric is not None and metric not in self.metrics:
+            raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
+        of = figures(self.rows, metric or self.metric)
         known = [method for method, values in of.items() if values]
         if against is None and not known:
             first = self.rows[0]
@@ -330,13 +332,6 @@ class Comparison:
         if against not in known:
             raise InputError("against", f"'{against}', which has no figures", "a method that has some")
         return against
-
-    def _metric(self, metric: str | None) -> str:
-        if metric is None:
-            return self.metric
-        if metric not in self.metrics:
-            raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
-        return metric
 
     def __repr__(self) -> str:
         """Return one line."""

@@ -344,7 +344,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     )
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
-    assert "Maximum U" in words
+    assert "The maximum U is at joints" in words
     levels = [str(each["class"]) for each in read.all("rect") if str(each.get("class", "")).startswith("box level")]
     assert len(levels) > 100
     assert any("over" in level for level in levels) == (not verdict.startswith("Accepted"))
