@@ -17,6 +17,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from cvxpy.error import SolverError
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown, three_digits
@@ -151,7 +152,7 @@ def least(work: Callable[[], Any], runs: int, count: int) -> tuple[float, Any]:
         try:
             with GRID.limited(PATIENCE[count]):
                 done = work()
-        except (ro.basics.RpimError, cp.error.SolverError, TimeoutError) as error:
+        except (ro.basics.RpimError, SolverError, TimeoutError) as error:
             return time.process_time() - begun, error
         seconds.append(time.process_time() - begun)
     return min(seconds), done
@@ -175,7 +176,8 @@ def plain(mine: ro.Formulation, model: Any, weights: Any) -> list[float]:
     values = []
     for each in weights:
         weight.value = each
-        values.append(float(program.solve(solver=cp.CLARABEL)))
+        value: Any = program.solve(solver=cp.CLARABEL)
+        values.append(float(value))
     return values
 
 

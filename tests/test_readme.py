@@ -169,6 +169,17 @@ def complete(errors: dict[str, Array]) -> set[str]:
     return {method for method in errors if not method.startswith(("pybotics", "rpim_opt"))}
 
 
+def test_the_accuracy_table_of_the_readme_is_the_studys() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    methods = {"least squares (SciPy)": "scipy, lm", "`rpim-opt calibrate`": OURS}
+    situations = ("clean10", "clean25", "clean52", "blunders52", "physics52")
+    errors = [errors_of_peers(situation) for situation in situations]
+    assert f"{len(errors[0][OURS])} simulated arms" in text
+    for name, method in methods.items():
+        figures = " | ".join(f"{np.exp(np.mean(np.log(each[method]))):.3f}" for each in errors)
+        assert f"| {name} | {figures} |" in text
+
+
 def test_where_others_do_as_well_is_the_studys() -> None:
     said = (
         "From 15 configurations on, where nothing is wrong with data or arm, every complete model fitted by coordinates"

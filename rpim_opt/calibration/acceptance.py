@@ -157,8 +157,8 @@ class Acceptance:
         lines.append(f"Region: {self.requirement.where}.")
         if self.bound is not None and self.typical is not None and np.isfinite(self.bound):
             lines.append(
-                f"The position reached is within {1e3 * self.bound:.3f} mm of the predicted one even at the worst of "
-                f"{self.count} configurations and a search from there; {1e3 * self.typical:.3f} mm in the middle."
+                f"Expanded uncertainty of the position reached: U = {1e3 * self.bound:.3f} mm at most (worst of "
+                f"{self.count} configurations and a search from there), median {1e3 * self.typical:.3f} mm."
             )
         if self.checked is not None:
             lines.append(self.checked.sentence())

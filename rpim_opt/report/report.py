@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
@@ -132,17 +133,26 @@ def _headline(content: Content) -> Iterator[Block]:
     if not after["count"]:
         raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
     cards = [
-        ("Mean error, nominal", "before", mm(before["mean_mm"])),
-        ("Mean error, identified", "after", mm(after["mean_mm"])),
-        ("Maximum error, identified", "after", mm(after["max_mm"])),
+        ("Mean error, nominal", "before", mm(before["mean_mm"]), _mean_interval(nominal)),
+        ("Mean error, identified", "after", mm(after["mean_mm"]), _mean_interval(identified)),
+        ("Maximum error, identified", "after", mm(after["max_mm"]), f"of {after['count']} rows"),
     ]
     if content.map is not None:
         largest = content.map.expanded.max()
         if found is not None and found.bound is not None:
             largest = found.bound  # its search goes on between the configurations of the map
         sure = percent(content.map.requirement.confidence)
-        cards.append((f"Expanded uncertainty U ({sure}), maximum", "after", mm(1e3 * largest)))
+        cards.append(("Expanded uncertainty U", "after", mm(1e3 * largest), f"{sure}, maximum over the region"))
     yield "cards", cards
+
+
+def _mean_interval(errors: Array) -> str:
+    """Return the 95 % confidence interval of the mean of errors (N,) [m], of independent rows."""
+    known = 1e3 * errors[np.isfinite(errors)]
+    if len(known) < 2:
+        return ""
+    half = stdtrit(len(known) - 1, 0.975) * known.std(ddof=1) / np.sqrt(len(known))
+    return f"95 % CI {mm(max(known.mean() - half, 0.0))} to {mm(known.mean() + half)}"
 
 
 # --- accuracy and uncertainty ------------------------------------------------------------------------------
@@ -194,7 +204,7 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
         values = [f"{value / si:.1f}" for value, si in zip(found.worst, units.values(), strict=True)]
         named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
         lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
-    if found.scatter is not None:
+    if found.scatter is not None and not found.reasons:
         lines.append(f"Repeatability alone, with all parameters known: {1e3 * found.scatter:.3f} mm of the maximum U.")
     return lines
 
@@ -387,7 +397,7 @@ def _flagged(result: Calibration) -> Block:
     if not rows:
         return "text", ["No row is flagged (one good data set in a hundred has one), and none is excluded."]
     head = ["row", "standardized residual", "error [mm]", "status"]
-    return "table", Table("Flagged and excluded rows", head, rows, prose=True)
+    return "table", Table("The worst first", head, rows, prose=True)
 
 
 def _convergence(result: Calibration) -> Iterator[Block]:

@@ -39,8 +39,8 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     seen = Checked(3, 8e-5, (), 4, (), 0.9)
     whole = Acceptance(LIMIT, "accepted", (), 500, 9e-5, 5e-5, 2e-5, checked=seen)
     assert whole.sentences()[2:] == [
-        "The position reached is within 0.090 mm of the predicted one even at the worst of 500 configurations and a "
-        "search from there; 0.050 mm in the middle.",
+        "Expanded uncertainty of the position reached: U = 0.090 mm at most (worst of 500 configurations and a search "
+        "from there), median 0.050 mm.",
         "Held out: 4 rows, 3 of them in the region, the largest error there 0.080 mm as the instrument reads it; "
         "90 % of the coordinates lie in their 95 % intervals.",
     ]
