@@ -13,7 +13,6 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.report.chart import Axis, Boxes, Chart, Dots, Line, Mark, segments
 
@@ -275,38 +274,6 @@ def l_curve_chart(residual: Array, solution: Array, chosen: Mapping[str, tuple[f
     )
     up = Axis("deviation norm [prior scales]", (solution[drawn].min(), solution.max()), log=True)
     return Chart("L-curve: residual norm against norm of the deviations", across, up, marks, height=330)
-
-
-def score_chart(selection: Selection) -> Chart:
-    """Return a selector's score over the weights, and its choice, dashed where it is at an edge."""
-    finite = np.isfinite(selection.score)
-    weights = selection.weights[finite]
-    score = selection.score[finite]
-    every = [*weights, selection.weight]
-    y = Axis(f"score of {selection.name}", (float(score.min()), float(score.max())))
-    at = [selection.weight] * 2
-    marks = [
-        Line(weights, score, "ink"),
-        Line(at, list(y.limits), "mark", f"weight {selection.weight:.3g}", not selection.interior),
-    ]
-    x = Axis("weight", (min(every), max(every)), log=True)
-    return Chart(f"Score of {selection.name} over the weight", x, y, marks)
-
-
-def choices_chart(chosen: Mapping[str, Selection]) -> Chart:
-    """Return the weights that selectors choose, the largest on top; hollow: at an edge."""
-    ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
-    weight = np.array([each.weight for _, each in ordered])
-    interior = np.array([each.interior for _, each in ordered])
-    marks: list[Mark] = []
-    for which, hollow, label in ((interior, False, ""), (~interior, True, "at an edge")):
-        at = np.flatnonzero(which)
-        hints = [f"{ordered[k][0]}: weight {weight[k]:.3g}" for k in at]
-        if len(at):
-            marks.append(Dots(weight[at], at + 1.0, "after", label, hints, hollow=hollow))
-    names = [name for name, _ in ordered]
-    x = Axis("weight", (weight.min(), weight.max()), log=True)
-    return Chart("Weights that selectors choose", x, Axis("", names=names), marks, height=60 + 17 * len(names))
 
 
 def picard_chart(program: Program, weight: float) -> Chart:

@@ -93,19 +93,11 @@ def _digest(text: str) -> str:
 
 
 def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
-    """Write checks over time as one HTML page that works offline: the verdict, two charts, every check.
+    """Write checks over time, as `use.monitor` returns them, as one HTML page that works offline.
 
-    Parameters
-    ----------
-    found
-        As `use.monitor` returns it.
-    path
-        The file; whole or not written at all.
-    title
-        Name of the robot or cell.
+    The page has the verdict, two charts and every check; ``title`` names the robot or cell. The file is written whole
+    or not at all.
 
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")

@@ -149,7 +149,15 @@ def selection(selection: Selection, ax: Axes = None) -> Axes:
     >>> ro.plot.selection(result.selection).get_ylabel()
     'score of reml'
     """
-    return draw(charts.score_chart(selection), ax)
+    finite = np.isfinite(selection.score)
+    weights = selection.weights[finite]
+    score = selection.score[finite]
+    every = [*weights, selection.weight]
+    x = Axis("weight", (min(every), max(every)), log=True)
+    y = Axis(f"score of {selection.name}", (float(score.min()), float(score.max())))
+    label = f"weight {selection.weight:.3g}"
+    choice = Line([selection.weight] * 2, list(y.limits), "mark", label, dashed=not selection.interior)
+    return draw(Chart("", x, y, [Line(weights, score, "ink"), choice]), ax)
 
 
 def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
@@ -161,7 +169,17 @@ def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | N
     >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
     ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
     """
-    return draw(charts.choices_chart(compare(_program(of)) if selections is None else selections), ax)
+    chosen = compare(_program(of)) if selections is None else selections
+    ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
+    weight = np.array([each.weight for _, each in ordered])
+    interior = np.array([each.interior for _, each in ordered])
+    marks: list[Mark] = []
+    for which, label in ((interior, ""), (~interior, "at an edge")):
+        at = np.flatnonzero(which)
+        if len(at):
+            marks.append(Dots(weight[at], at + 1.0, "after", label, ["choice"] * len(at), hollow=bool(label)))
+    y = Axis("", names=[name for name, _ in ordered])
+    return draw(Chart("", Axis("weight", (weight.min(), weight.max()), log=True), y, marks), ax)
 
 
 def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:

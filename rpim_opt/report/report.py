@@ -48,24 +48,11 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     In the order in which somebody signs it: verdict and headline; accuracy, with expanded uncertainty over the
     workspace; identified parameters with their expanded uncertainties; diagnostics (residuals, identifiability,
     flagged rows, convergence); provenance; and in an appendix the evidence for the regularization weight. Every text
-    of a user's file is shown as text.
+    of a user's file is shown as text. The file is written whole or not at all.
 
-    Parameters
-    ----------
-    calibration
-        As `calibrate` or `load_result` return it.
-    path
-        The file; whole or not written at all.
-    validation
-        Measurements that were not used for identification; those of the calibration's record by default.
+    ``validation`` are measurements that were not used for identification, by default those of the calibration's record.
+    InputError where they do not belong to the problem, or no measurement is of a length.
 
-    Raises
-    ------
-    InputError
-        For validation data that do not belong to the problem, or measurements without a length.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")

@@ -130,7 +130,7 @@ def _frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
 
 def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Array], Array]:
     """Return the function from encoder to joint values (N, dof) [rad]: sag under gravity, and eccentric encoders."""
-    mass = np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1]
+    mass = np.asarray(np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1], dtype=float)
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     compliance = rng.uniform(0.3, 1.0, robot.dof)
     largest = np.abs(_torque(robot, mass, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)

@@ -277,17 +277,8 @@ class Comparison:
     def summary(self, metric: str | None = None, against: str | None = None) -> Summary:
         """Return the methods in their order, each against a reference on the same replicates.
 
-        Parameters
-        ----------
-        metric
-            A column that is above zero and the less the better; the first metric by default.
-        against
-            The reference's label; by default the first method that was asked and has figures.
-
-        Raises
-        ------
-        InputError
-            For an unknown metric or method, or where nothing has figures.
+        The metric is a column of which less is better, by default the first; the reference a method's label, by default
+        the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
         """
         return summarize(self.rows, metric or self.metric, self.reference(metric, against), self.drawn)
 
@@ -304,12 +295,7 @@ class Comparison:
     def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
         """Write a page ``index.html`` that needs no network, with ``replicates.csv`` and the figure; return its path.
 
-        Parameters
-        ----------
-        folder
-            Where; it is made.
-        metric, against
-            As for `summary`.
+        The folder is made; other arguments as for `summary`.
         """
         require_package("matplotlib", "report")
         from rpim_opt.study.figures import write_page

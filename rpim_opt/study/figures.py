@@ -43,15 +43,8 @@ def picture(figure: Any, name: str, kind: str) -> bytes:
 def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     """Return a figure with one line of dots a name, logarithmic, its median marked; names from top to bottom.
 
-    Parameters
-    ----------
-    values
-        Positive figures by name.
-    label
-        What they are, with their unit.
+    ``values`` are positive figures by name; ``label`` says what they are, with their unit.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> figure = ro.study.distributions({"reml": [0.1, 0.2, 0.4], "l_curve": [0.2, 0.3, 0.9]}, "mean error [mm]")
     >>> len(figure.axes)

@@ -179,15 +179,8 @@ def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
 
 
 def geometric_mean(ratios: Sequence[float] | Array) -> float:
-    """Return the mean of ratios that treats twice and half alike.
+    """Return the mean of positive ratios (N,) that treats twice and half alike.
 
-    Parameters
-    ----------
-    ratios
-        Positive numbers (N,).
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> round(ro.study.geometric_mean([0.5, 2.0]), 12)
     1.0
