@@ -27,8 +27,8 @@ import rpim_opt as ro
 from rpim_opt.basics.text import markdown
 from rpim_opt.basics.threads import clock, cores, on_all_cores, one_blas_thread
 from rpim_opt.convex.formulation import FORMULATIONS
+from rpim_opt.problem.blocks import ROWS, PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.parts import ROWS, PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.study import Metric, Report
 from rpim_opt.study.studies import find_study, load_study

@@ -18,7 +18,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.baselines import gauss_newton, levenberg_marquardt
-from rpim_opt.problem.observability import combination
+from rpim_opt.problem.design import combination
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.simulation import write_simulation
 from rpim_opt.study import Metric, Report

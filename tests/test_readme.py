@@ -15,7 +15,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem import parts
+from rpim_opt.problem import blocks as parts
 from rpim_opt.robot import evaluation
 from rpim_opt.study import studies
 from studies.gallery import pages

@@ -14,9 +14,9 @@ from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, suspects, unexplained
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.bayes.transmission import admitted, possible
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
-from rpim_opt.problem.source import Source
 
 ROUNDS = 6
 """Linearizations at which hyperparameters are estimated."""

@@ -12,7 +12,7 @@ import scipy
 from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.scatter import Scatter, Stack
+from rpim_opt.problem.noise import Scatter, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
 """Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""

@@ -25,9 +25,9 @@ from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.noise import Scatter, Stack
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.scatter import Scatter, Stack
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.terms import Curve
 
 MOST = 1000

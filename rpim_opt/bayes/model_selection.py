@@ -15,8 +15,8 @@ from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, Trial, sampled, sides
 from rpim_opt.bayes.outliers import clustered
 from rpim_opt.bayes.prior import Prior, family_of
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.extensions import families, family_scales
 from rpim_opt.robot.parameter_names import EXPANSION, frame_of, of_session, own_name, session_prefix
 

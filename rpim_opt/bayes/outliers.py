@@ -10,9 +10,9 @@ from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.trust import RARE
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
-from rpim_opt.problem.source import Source
 
 BEYOND, LOOK = 6.0, 3.0
 """Medians of the errors beyond which a position is suspected; and from which on anyone looks."""

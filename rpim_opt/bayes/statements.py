@@ -14,8 +14,8 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display, split_unit
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.program import Program
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameters import Parameters
 
 FAR = 100.0

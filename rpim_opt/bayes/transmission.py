@@ -18,8 +18,8 @@ from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as FAMILY_GAIN
 from rpim_opt.bayes.model_selection import SECOND, Candidate, compare_models, extended, identifiable, questions
 from rpim_opt.bayes.prior_terms import FIXED
+from rpim_opt.problem.noise import Scatter, Stack
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.scatter import Scatter, Stack
 from rpim_opt.robot.terms import Curve
 
 TRANSMISSION = "transmission error"

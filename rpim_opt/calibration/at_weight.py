@@ -11,7 +11,7 @@ from rpim_opt.calibration.loop import ROUNDS, Ended, Options, State, minimize
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.select import Selector
-from rpim_opt.problem.source import Source
+from rpim_opt.problem.blocks import Source
 
 LEVEL = 1e-9
 """Relative fall of the objective over five iterations below which it hardly changes."""

@@ -12,10 +12,10 @@ from scipy.special import chdtrc, stdtrit
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.multi_robot import unknown_sessions
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.several import unknown_sessions
-from rpim_opt.problem.source import Source
 
 Interval = Literal["mean", "reached", "reading"]
 UNDECIDED = 1e-9

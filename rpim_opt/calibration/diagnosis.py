@@ -14,7 +14,7 @@ from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.trust import RARE, outlying
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.source import Source
+from rpim_opt.problem.blocks import Source
 
 SLACK = 0.1
 """Share of a measured joint range by which values may exceed it: its extremes are themselves drawn by chance."""

@@ -11,7 +11,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.leverage import influence
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.problem.identified import Machine, require_robot
+from rpim_opt.problem.linear import Machine, require_robot
 from rpim_opt.problem.workspace import moved, predicted, within_ranges
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameter_names import of_joint, own_name

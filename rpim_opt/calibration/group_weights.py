@@ -19,9 +19,9 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import pose
 from rpim_opt.convex.rules.selection import Selection
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.registration.frames import relocated
-from rpim_opt.problem.source import Source
 
 SAME, NEARLY = 1e-3, 1e-2
 """Weights have settled when their logarithms change by no more than the first; a note is given above the second."""

@@ -20,9 +20,9 @@ from rpim_opt.calibration.loop import Iteration, Options, nearby, require_finite
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.select import Selector, weight_of
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
-from rpim_opt.problem.source import Source
 
 LOGGER = getLogger("rpim_opt")
 NOISE = {

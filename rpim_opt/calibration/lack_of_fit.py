@@ -21,9 +21,9 @@ from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.select import reml
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import measured_torques, repeatable
-from rpim_opt.problem.source import Source
 
 QUICK = 60
 """Configurations that are looked at before calibrating."""

@@ -17,8 +17,8 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.expressions import term
 from rpim_opt.convex.trust import SMALL
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_equations
-from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.blocks import in_parts
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 
 TINY = 1e-300
@@ -150,7 +150,7 @@ def influence(result: Outcome) -> Influence:
     blocks = list(_weighted(result))
     R = None
     for block in blocks:
-        R = reduced_equations(block.model.A, block.model.b, R)
+        R = reduced_rows(np.column_stack([block.model.A, block.model.b]), R)
     if R is None:
         raise InputError("data", "no row", "at least one")
     A, b = R[:, :n], R[:, n]

@@ -19,11 +19,9 @@ from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
 from rpim_opt.convex.structure import in_blocks
 from rpim_opt.convex.trust import Squares, trusted_rows
-from rpim_opt.problem.identified import around
-from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.parts import in_parts
+from rpim_opt.problem.blocks import Source, in_parts
+from rpim_opt.problem.linear import LinearModel, around
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.source import Source
 
 GAIN_GOOD, GAIN_POOR = 0.75, 0.25
 """Gain ratios (actual over promised decrease) above which damping shrinks, and below which it grows."""

@@ -40,13 +40,12 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
+from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.parts import in_parts
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.row_functions import bearing, transform
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameter_names import own_name
 

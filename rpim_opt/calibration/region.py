@@ -15,7 +15,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.data.record import Requirement
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.identified import Machine, identified_of, require_robot
+from rpim_opt.problem.linear import Machine, identified_of, require_robot
 from rpim_opt.problem.workspace import in_base, markers
 
 DRAWN, ROUNDS = 4096, 16

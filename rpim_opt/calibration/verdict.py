@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.problem.source import Source
+from rpim_opt.problem.blocks import Source
 from rpim_opt.robot.parameter_names import own_name
 
 NOISY = 3.0

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.convex.expressions import cp
-from rpim_opt.problem.identified import Identified, Machine
+from rpim_opt.problem.linear import Identified, Machine
 from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
 

@@ -14,8 +14,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.expressions import Term, term
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.source import Source
 
 RARE = 0.01
 """What part of good sets of data have any configuration that counts as an outlier."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc
@@ -17,17 +17,13 @@ from rpim_opt.basics.text import Tabled, counted, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import KNOWN
-from rpim_opt.data.measurements.position import position
-from rpim_opt.problem.identified import near_parallel
+from rpim_opt.problem.design import Observability, combination, observe
 from rpim_opt.problem.misreadings import better_reading, lever_arms, misfit, placed
-from rpim_opt.problem.observability import Observability, combination, observe
-from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import Fit, Points, points_of
+from rpim_opt.problem.registration.points import Fit, points_of
 from rpim_opt.problem.row_functions import repeatable
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
-from rpim_opt.robot.mdh import Robot
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
 """A joint that moves less [rad, m] is hardly seen."""
@@ -35,6 +31,32 @@ SPREAD = {"length": ("mm", 1e-3), "pixel": ("px", 1.0)}
 """Units of typical deviations, where they are not milliradians."""
 STANDS_OUT = 5.0
 """Rows further than this many robust standard deviations above the median residual are listed."""
+FAR = 5.0
+"""A row is in question from so many medians of the errors on."""
+FITS = 0.2
+"""What a row is mistaken for leaves less than this part of its error."""
+ALIKE = (0.4, 2.5)
+"""Rounding explains errors that are between these multiples of what it makes."""
+MOVED = 0.5
+"""An instrument has moved if that leaves less than this part of the sum of squares."""
+FAR_MOVED = 0.005
+"""Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
+RARE = 1e-6
+"""Probability with which chance may explain what is reported."""
+FEWEST = 6
+"""Rows on either side of a change, or of which copies are told."""
+MOST_PLACES = 40
+"""Places of a change that are tried."""
+COPIES = 0.2
+"""Part of the rows that may repeat others."""
+TOGETHER = 4
+"""Excluded rows that follow each other, from which on something moved."""
+MOST_EQUATIONS = 3000
+"""Equations up to which a change is looked for."""
+STATED = frozenset(kind.name for kind in KNOWN)
+"""Measurements that are statements of a drawing."""
+CLOSE = 0.05
+"""Places that are nearer [m] say little of the scale."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,17 +116,42 @@ class Inspection(Tabled):
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the joints and how far they move."""
-        return self._joint_rows()
+        robot = self.problem.robot
+        rows = []
+        for i, (q, dimension) in enumerate(zip(_all_q(self.problem.data).T, robot.joint_dimensions, strict=True)):
+            unit, si = display(dimension)
+            limited = np.isfinite(robot.limits[i]).all()
+            limits = (robot.limits[i] / si).tolist() if limited else None
+            share = float(np.ptp(q) / np.ptp(robot.limits[i])) if limited else None
+            rows.append({"joint": f"q{i + 1}", "unit": unit, "from": q.min() / si, "to": q.max() / si,
+                         "limits": limits, "share": share})  # fmt: skip
+        return rows
 
     def _notes(self) -> list[str]:
         return [*(f"Warning: {text}" for text in self.warnings), *(f"Proposal: {text}" for text in self.proposals)]
 
     def __str__(self) -> str:
         """Return everything as a person reads it."""
-        parts = [self._joints(), self._measured(), self._rows(), self._identifiable()]
-        parts += ["\n".join(self.contact)]
-        parts += ["\n".join(f"Warning: {text}" for text in self.warnings)]
-        parts += ["\n".join(f"Proposal: {text}" for text in self.proposals)]
+        joints = []
+        for r in self._frame_rows():
+            limits = f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}" if r["limits"] else "-"
+            share = f"{100 * r['share']:.0f} %" if r["limits"] else "-"
+            figures = [f"{value:.2f}" for value in (r["from"], r["to"], r["to"] - r["from"])]
+            joints.append([r["joint"], r["unit"], *figures, limits, share])
+        measured = []
+        for r in self._measured():
+            figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
+            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
+            measured.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
+        parts = [
+            table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
+            table(["measured", "unit", "from", "to", "typical sigma"], measured),
+            self._rows(),
+            self._identifiable(),
+            "\n".join(self.contact),
+            "\n".join(self._notes()[: len(self.warnings)]),
+            "\n".join(self._notes()[len(self.warnings) :]),
+        ]
         return "\n\n".join(part for part in parts if part)
 
     def content(self) -> dict[str, Any]:
@@ -112,8 +159,8 @@ class Inspection(Tabled):
         o, mm = self.observability, (1e3 * self.residual).tolist()
         error = dict(zip(self.problem.data.label, mm, strict=True))
         return {
-            "joints": self._joint_rows(),
-            "measured": self._measured_rows(),
+            "joints": self._frame_rows(),
+            "measured": self._measured(),
             "rows": len(mm),
             "configurations": len(np.unique(self.problem.data.configuration)),
             "nominal": statistics(self.residual),
@@ -130,45 +177,24 @@ class Inspection(Tabled):
             "proposals": self.proposals,
         }  # fmt: skip
 
-    def _joint_rows(self) -> list[dict[str, Any]]:
-        robot, rows = self.problem.robot, []
-        for i, (q, dimension) in enumerate(zip(_all_q(self.problem.data).T, robot.joint_dimensions, strict=True)):
-            unit, si = display(dimension)
-            limited = np.isfinite(robot.limits[i]).all()
-            limits = (robot.limits[i] / si).tolist() if limited else None
-            share = float(np.ptp(q) / np.ptp(robot.limits[i])) if limited else None
-            rows.append({"joint": f"q{i + 1}", "unit": unit, "from": q.min() / si, "to": q.max() / si,
-                         "limits": limits, "share": share})  # fmt: skip
-        return rows
-
-    def _joints(self) -> str:
-        rows = []
-        for r in self._joint_rows():
-            limits = f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}" if r["limits"] else "-"
-            share = f"{100 * r['share']:.0f} %" if r["limits"] else "-"
-            figures = [f"{r['from']:.2f}", f"{r['to']:.2f}", f"{r['to'] - r['from']:.2f}", limits, share]
-            rows.append([r["joint"], r["unit"], *figures])
-        return table(["joint", "unit", "from", "to", "span", "limits", "of them"], rows)
-
-    def _measured_rows(self) -> list[dict[str, Any]]:
-        rows = []
-        for (name, reflector), values in _by_kind(self.problem.data).items():
-            for column, (dimension, cells, sigma) in values.items():
+    def _measured(self) -> list[dict[str, Any]]:
+        """Return the range and typical deviation of every measured column by kind, reflector and fixture."""
+        rows: dict[str, dict[str, Any]] = {}
+        for block in self.problem.data.blocks:
+            kind = block.measurement
+            sigma = np.sqrt(np.median(np.einsum("nii->ni", block.covariance), axis=0))
+            of = dict(zip(kind.components, sigma, strict=True))
+            where = ", ".join(part for part in (" to ".join(m for m in block.markers if m), block.fixture) if part)
+            for i, (column, dimension) in enumerate((kind.columns or kind.components).items()):
                 unit, si = display(dimension) if dimension else ("", 1.0)
-                low, high = (cells.min() / si, cells.max() / si) if len(cells) else (None, None)
-                of, size = SPREAD.get(dimension, ("mrad", 1e-3))
-                spread = {f"sigma_{of}": None if sigma is None else sigma / size}
-                what = f"{name}{f' of {reflector}' if reflector else ''}: {column}"
-                rows.append({"measured": what, "unit": unit, "from": low, "to": high, **spread})
-        return rows
-
-    def _measured(self) -> str:
-        rows = []
-        for r in self._measured_rows():
-            figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
-            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
-            rows.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
-        return table(["measured", "unit", "from", "to", "typical sigma"], rows)
+                low, high = None, None
+                if kind.columns:
+                    low, high = block.y[:, i].min() / si, block.y[:, i].max() / si
+                each, size = SPREAD.get(dimension, ("mrad", 1e-3))
+                what = f"{kind.name}{f' of {where}' if where else ''}: {column}"
+                typical = float(of[column]) / size if column in of else None
+                rows[what] = {"measured": what, "unit": unit, "from": low, "to": high, f"sigma_{each}": typical}
+        return list(rows.values())
 
     def _rows(self) -> str:
         data, mm = self.problem.data, 1e3 * self.residual
@@ -188,8 +214,7 @@ class Inspection(Tabled):
 
     def _identifiable(self) -> str:
         o = self.observability
-        s = o.singular_values[: o.rank]
-        weak = int(np.count_nonzero(s < 1))
+        weak = int(np.count_nonzero(o.singular_values[: o.rank] < 1))
         lines = [
             f"{len(o.names)} parameters to identify, {o.rank} directions that the data see; {weak} of them weaker "
             "than the prior.",
@@ -210,7 +235,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
 
     Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
     left-handed frames, another robot, an instrument that moved: another reading of the data that leaves less than a
-    fifth of the position error is named, with what to write (`readings`, `suspects`).
+    fifth of the position error is named, with what to write.
 
     Parameters
     ----------
@@ -244,65 +269,63 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     if needed:
         pairs = ", ".join(f"{name[4:]} and {int(name[4:]) + 1}" for name in needed)
         proposals.append(f"the axes {pairs} are near parallel: add {', '.join(needed)} to `identify`.")
+    # all are identified again, with frames where they were fitted
+    names = problem.parameters.free.names
+    own = dict(zip(fitted.parameters.free.names, x, strict=True))
+    whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
+    checks: list[Iterator[str]] = [
+        _ranges(problem), _same_values(data), copied_rows(data), shared_rows(data, validation),
+        _mistakes(problem, whole, np.array([own.get(name, 0.0) for name in names])),
+    ]  # fmt: skip
     return Inspection(
         problem=problem,
         residual=residual,
         standing_out=tuple(far),
         repeated=repeated,
         repeatability=repeatability,
-        warnings=(
-            *_ranges(problem),
-            *_copies(data),
-            *copied_rows(data),
-            *shared_rows(data, validation),
-            *_mistakes(problem, fitted, x),
-        ),
+        warnings=tuple(text for check in checks for text in check),
         proposals=tuple(proposals),
         observability=observe(problem),
         contact=tuple(contact_sentences(problem)),
     )
 
 
+def _mistakes(problem: CalibrationProblem, fitted: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Say what the data were mistaken for: another reading of all of them, or of some rows."""
+    yield from rows_without_values(problem)
+    better = better_reading(problem)
+    if better is not None:
+        yield better.sentence
+        return
+    yield from exchanged_rows(problem)
+    yield from list(moved_far(problem)) or moved(fitted, x)
+
+
+# What is said of a table
+
+
 def _all_q(data: Dataset) -> Array:
     return np.concatenate([block.q.reshape(-1, block.q.shape[2]) for block in data.blocks])
 
 
-def _by_kind(data: Dataset) -> dict[tuple[str, str], dict[str, tuple[str, Array, float | None]]]:
-    kinds: dict[tuple[str, str], dict[str, tuple[str, Array, float | None]]] = {}
-    for block in data.blocks:
-        sigma = np.sqrt(np.median(np.einsum("nii->ni", block.covariance), axis=0))
-        of = dict(zip(block.measurement.components, sigma, strict=True))
-        marker = " to ".join(m for m in block.markers if m)
-        where = ", ".join(part for part in (marker, block.fixture) if part)
-        columns = block.measurement.columns or block.measurement.components
-        kinds[block.measurement.name, where] = {
-            name: (
-                dimension,
-                block.y[:, i] if block.measurement.columns else np.empty(0),
-                float(of[name]) if name in of else None,
-            )
-            for i, (name, dimension) in enumerate(columns.items())
-        }
-    return kinds
-
-
 def _repeated(data: Dataset) -> tuple[tuple[tuple[str, ...], ...], float | None]:
+    """Return the labels of rows of one configuration, and the standard deviation of their lengths about their means."""
     groups: list[tuple[str, ...]] = []
     squares, freedom = 0.0, 0
     for block in data.blocks:
-        same = repeatable(block).round(7)
-        _, which, count = np.unique(same, axis=0, return_inverse=True, return_counts=True)
+        lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
+        _, which, count = np.unique(repeatable(block).round(7), axis=0, return_inverse=True, return_counts=True)
         for k in np.flatnonzero(count > 1):
             rows = np.flatnonzero(which == k)
             groups.append(tuple(data.label[i] for i in block.row[rows]))
-            lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
             y = block.y[rows][:, lengths]
             squares += float(np.sum((y - y.mean(axis=0)) ** 2))
             freedom += (len(rows) - 1) * len(lengths)
     return tuple(groups), float(np.sqrt(squares / freedom)) if freedom else None
 
 
-def _copies(data: Dataset) -> Iterable[str]:
+def _same_values(data: Dataset) -> Iterator[str]:
+    """Say which rows have the measured values of another configuration."""
     for block in data.blocks:
         if block.y.shape[1] < 3:
             continue
@@ -313,39 +336,25 @@ def _copies(data: Dataset) -> Iterable[str]:
                 yield f"rows {pair} have the same measured values in different configurations: copied?"
 
 
-def _ranges(problem: CalibrationProblem) -> Iterable[str]:
+def _ranges(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which joints leave their limits or hardly move, and which units may have been exchanged."""
+    robot = problem.robot
     q = _all_q(problem.data)
-    for i in range(problem.robot.dof):
-        yield from _range(problem.robot, i, q[:, i])
-    yield from _angle_units(problem.robot, q)
-    yield from _length_units(problem)
-
-
-def _range(robot: Robot, i: int, q: Array) -> Iterable[str]:
-    """Say whether a joint leaves its limits, or hardly moves."""
-    unit, si = display(robot.joint_dimensions[i])
-    low, high = robot.limits[i]
-    if q.min() < low - 1e-9 or q.max() > high + 1e-9:
-        yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
-    if np.ptp(q) < LEAST_TRAVEL[robot.joint_types[i]]:
-        yield f"joint {i + 1} moves only {np.ptp(q) / si:.2f} {unit}: its parameters are hardly seen."
-
-
-def _angle_units(robot: Robot, q: Array) -> Iterable[str]:
-    """Say whether degrees and radians may have been exchanged."""
+    for i, dimension in enumerate(robot.joint_dimensions):
+        unit, si = display(dimension)
+        low, high = robot.limits[i]
+        if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
+            yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
+        if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[i]]:
+            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are hardly seen."
     turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
-    if not turning:
-        return
-    largest = np.abs(q[:, turning]).max()
-    if largest > 4 * np.pi:
-        yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
-    if largest < np.radians(2 * np.pi):
-        yield "no joint leaves 6.3 deg: radians given as degrees?"
-
-
-def _length_units(problem: CalibrationProblem) -> Iterable[str]:
-    """Say whether millimetres and metres may have been exchanged."""
-    reach = float(np.sum(np.abs(problem.robot.mdh[:, [1, 3]])))
+    if turning:
+        largest = np.abs(q[:, turning]).max()
+        if largest > 4 * np.pi:
+            yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
+        if largest < np.radians(2 * np.pi):
+            yield "no joint leaves 6.3 deg: radians given as degrees?"
+    reach = float(np.sum(np.abs(robot.mdh[:, [1, 3]])))
     for block in problem.data.blocks:
         lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
         if not lengths or len(block.row) < 2:
@@ -356,52 +365,6 @@ def _length_units(problem: CalibrationProblem) -> Iterable[str]:
             yield f"{sizes}: millimetres given as metres?"
         elif size < reach / 200:
             yield f"{sizes}: metres given as millimetres?"
-
-
-def _mistakes(problem: CalibrationProblem, fitted: Source, x: Array) -> Iterable[str]:
-    """Say what the data were mistaken for: another reading of all of them, or of some rows."""
-    yield from rows_without_values(problem)
-    better = better_reading(problem)
-    if better is not None:
-        yield better.sentence
-        return
-    yield from exchanged_rows(problem)
-    far = list(moved_far(problem))
-    yield from far
-    if not far:
-        whole, deviations = _whole(problem, fitted, x)
-        yield from moved(whole, deviations)
-
-
-def _whole(problem: CalibrationProblem, fitted: Source, x: Array) -> tuple[CalibrationProblem, Array]:
-    """Return the problem that identifies all again, with its frames where they were fitted."""
-    whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
-    names = whole.parameters.free.names
-    deviations = np.zeros(len(names))
-    for name, value in zip(fitted.parameters.free.names, x, strict=True):
-        if name in names:
-            deviations[names.index(name)] = value
-    return whole, deviations
-
-
-FAR = 5.0
-"""A row is in question from so many medians of the errors on."""
-FITS = 0.2
-"""What a row is mistaken for leaves less than this part of its error."""
-ALIKE = (0.4, 2.5)
-"""Rounding explains errors that are between these multiples of what it makes."""
-MOVED = 0.5
-"""An instrument has moved if that leaves less than this part of the sum of squares."""
-FAR_MOVED = 0.005
-"""Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
-RARE = 1e-6
-FEWEST = 6
-MOST_PLACES = 40
-COPIES = 0.2
-"""Part of the rows that may repeat others."""
-TOGETHER = 4
-"""Excluded rows that follow each other, from which on something moved."""
-MOST_EQUATIONS = 3000
 
 
 def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
@@ -427,110 +390,25 @@ def _rows(labels: list[str], of_one: str, of_several: str) -> str:
 
 def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
     """Say which rows of the validation set are copies of identification rows."""
+
+    def rows(of: Dataset) -> list[tuple[bytes, str]]:
+        return [
+            (block.q[i].tobytes() + block.y[i].tobytes(), of.label[row])
+            for block in of.blocks
+            if block.measurement.columns
+            for i, row in enumerate(block.row)
+        ]
+
     if validation is None:
         return
-    own: dict[bytes, str] = {}
-    for block in data.blocks:
-        for i, row in enumerate(block.row):
-            own.setdefault(block.q[i].tobytes() + block.y[i].tobytes(), data.label[row])
-    copies = []
-    for block in validation.blocks:
-        for i, row in enumerate(block.row):
-            key = block.q[i].tobytes() + block.y[i].tobytes()
-            if key in own and block.measurement.columns:
-                copies.append(_alias(validation.label[row], own[key]))
+    own = dict(reversed(rows(data)))  # of copies the first
+    both = [(label, own[key]) for key, label in rows(validation) if key in own]
+    copies = [label if label == other else f"{label} ({other})" for label, other in both]
     if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
             f"{listed(copies)}. Its error says less than it seems: draw them apart (rpim-opt new --hold-out)."
         )
-
-
-def _alias(label: str, other: str) -> str:
-    if label == other:
-        return label
-    return f"{label} ({other})"
-
-
-def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows fit the joint values, or the reflector, of another row."""
-    points = points_of(problem)
-    if points is None:
-        return
-    found = placed(problem.robot, points)
-    label = [problem.data.label[i] for i in points.row]
-    far = np.flatnonzero(found.error > FAR * np.median(found.error))
-    pairs = _pairs(points, found, far)
-    if pairs:
-        named = listed([f"{label[i]} and {label[j]}" for i, j in pairs])
-        yield f"the measured values of rows {named} fit each other's joint values: exchange them."
-    markers = _other_markers(problem.robot, points, found, far)
-    if markers:
-        yield (
-            f"{_rows([label[i] for i in markers], 'fits', 'fit')} another reflector than the stated one "
-            "(column marker): reflectors swapped?"
-        )
-
-
-def _pairs(points: Points, found: Fit, far: np.ndarray) -> list[tuple[int, int]]:
-    pairs = []
-    for a, i in enumerate(far):
-        for j in far[a + 1 :]:
-            if points.marker[i] != points.marker[j]:
-                continue
-            crossed = np.linalg.norm([points.y[i] - found.modelled[j], points.y[j] - found.modelled[i]], axis=1)
-            if (crossed < FITS * found.error[[i, j]]).all():
-                pairs.append((int(i), int(j)))
-    return pairs
-
-
-def _other_markers(robot: Robot, points: Points, found: Fit, far: np.ndarray) -> list[int]:
-    """Return the rows that fit another reflector, which the other rows place."""
-    if len(points.tools) < 2 or not len(far):
-        return []
-    flange = forward_kinematics(robot, points.q[far])
-    rows = []
-    for k, i in enumerate(far):
-        body = found.tools @ flange[k, :3, :3].T + flange[k, :3, 3]
-        model = body @ found.base[:3, :3].T + found.base[:3, 3]
-        error = np.linalg.norm(points.y[i] - model, axis=1)
-        error[points.marker[i]] = np.inf
-        if error.min() < FITS * found.error[i]:
-            rows.append(int(i))
-    return rows
-
-
-def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Say whether joint values are rounded so that this explains the RMS error [m] of a fit."""
-    points = points_of(problem)
-    if points is None:
-        return
-    turning = np.array([kind == "revolute" for kind in problem.robot.joint_types])
-    if not turning.any():
-        return
-    arms = lever_arms(problem.robot, points.q, points.tools[0])[:, turning]
-    for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        decimals = _decimals(points.q[:, turning] / size)
-        if decimals is None:
-            continue
-        step = size * 10.0**-decimals
-        made = step / np.sqrt(12) * float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
-        if ALIKE[0] * made < error < ALIKE[1] * made:
-            yield (
-                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone makes "
-                f"{three_digits(1e3 * made)} mm, the fit is off by {three_digits(1e3 * error)} mm: "
-                "export them with more decimals."
-            )
-            return
-
-
-def _decimals(values: Array) -> int | None:
-    """Return how many decimals all values have at most, up to 4; None where they have more."""
-    for decimals in range(5):
-        scaled = values * 10.0**decimals
-        if np.abs(scaled - scaled.round()).max() < 1e-6 * max(np.abs(scaled).max(), 1.0) ** 0.5:
-            return decimals
-    return None
 
 
 def copied_rows(data: Dataset) -> Iterator[str]:
@@ -567,47 +445,68 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
             )
 
 
-def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say whether the residuals at x (n,) are those of a joint's gear ratio, or of a coupling to another joint.
+# What points of the nominal robot say
 
-    One column, the slope of a joint's zero times the value of a joint, is added to the last linearization. It must
-    explain half of the sum of squares, more than chance does once in a million (F test, all columns counted).
-    """
-    free = problem.parameters.free
-    model = problem.linearize(x)
-    if len(model.b) > MOST_EQUATIONS:
+
+def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which rows fit the joint values, or the reflector, of another row."""
+    points = points_of(problem)
+    if points is None:
         return
-    z = x / free.scale
-    n = len(z)
-    Q = np.linalg.qr(np.vstack([model.A, np.eye(n)]))[0]
-    rest = np.concatenate([model.b - model.A @ z, np.zeros(n)])
-    rest = rest - Q @ (Q.T @ rest)
-    row = np.concatenate([np.repeat(block.row, len(block.measurement.components)) for block in problem.data.blocks])
-    q = problem.joint_values[row]
-    found: list[tuple[float, int, int, float]] = []
-    for i, kind in enumerate(problem.robot.joint_types):
-        name = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
-        if name not in free.names:
+    found = placed(problem.robot, points)
+    label = [problem.data.label[i] for i in points.row]
+    far = np.flatnonzero(found.error > FAR * np.median(found.error))
+    pairs = []
+    for i, j in combinations(far, 2):
+        crossed = np.linalg.norm([points.y[i] - found.modelled[j], points.y[j] - found.modelled[i]], axis=1)
+        if points.marker[i] == points.marker[j] and (crossed < FITS * found.error[[i, j]]).all():
+            pairs.append(f"{label[i]} and {label[j]}")
+    if pairs:
+        yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
+    if len(points.tools) < 2 or not len(far):
+        return
+    flange = forward_kinematics(problem.robot, points.q[far])
+    body = found.tools @ flange[:, :3, :3].transpose(0, 2, 1) + flange[:, None, :3, 3]
+    model = body @ found.base[:3, :3].T + found.base[:3, 3]
+    error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
+    error[np.arange(len(far)), points.marker[far]] = np.inf
+    markers = [label[i] for i in far[error.min(axis=1) < FITS * found.error[far]]]
+    if markers:
+        yield (
+            f"{_rows(markers, 'fits', 'fit')} another reflector than the stated one (column marker): reflectors "
+            "swapped?"
+        )
+
+
+def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
+    """Say whether joint values are rounded so that this explains the RMS error [m] of a fit."""
+    points = points_of(problem)
+    turning = np.array([kind == "revolute" for kind in problem.robot.joint_types])
+    if points is None or not turning.any():
+        return
+    arms = lever_arms(problem.robot, points.q, points.tools[0])[:, turning]
+    for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
+        decimals = _decimals(points.q[:, turning] / size)
+        if decimals is None:
             continue
-        k = free.names.index(name)
-        for j in range(q.shape[1]):
-            g = np.concatenate([model.A[:, k] * q[:, j] / free.scale[k], np.zeros(n)])
-            g = g - Q @ (Q.T @ g)
-            size = float(g @ g)
-            if size > 0:
-                found.append((float(g @ rest) ** 2 / size, i, j, float(g @ rest) / size))
-    if not found:
-        return
-    gain, i, j, factor = max(found)
-    whole = float(rest @ rest)
-    freedom = max(len(model.b) - n - 1, 1)
-    chance = fdtrc(1, freedom, gain / max((whole - gain) / freedom, 1e-300)) * len(found)
-    if gain > (1 - MOVED) * whole and chance < RARE:
-        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder says (gear ratio)"
-        if i != j:
-            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
-        left = 100 * np.sqrt(max(whole - gain, 0.0) / whole)
-        yield f"{what}: that leaves {left:.0f} % of the residuals; write it into coupling in robot.toml."
+        step = size * 10.0**-decimals
+        made = step / np.sqrt(12) * float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
+        if ALIKE[0] * made < error < ALIKE[1] * made:
+            yield (
+                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone makes "
+                f"{three_digits(1e3 * made)} mm, the fit is off by {three_digits(1e3 * error)} mm: "
+                "export them with more decimals."
+            )
+            return
+
+
+def _decimals(values: Array) -> int | None:
+    """Return how many decimals all values have at most, up to 4; None where they have more."""
+    for decimals in range(5):
+        scaled = values * 10.0**decimals
+        if np.abs(scaled - scaled.round()).max() < 1e-6 * max(np.abs(scaled).max(), 1.0) ** 0.5:
+            return decimals
+    return None
 
 
 def moved_far(problem: CalibrationProblem) -> Iterator[str]:
@@ -618,21 +517,16 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     whole = misfit(problem.robot, points)
     if whole < FAR_MOVED:
         return
-    best = whole
-    place = 0
     rows = np.arange(len(points.row))
-    for k in _places(len(rows)):
-        parts = [misfit(problem.robot, points.take(rows[part])) for part in (slice(0, k), slice(k, None))]
-        if max(parts) < best:
-            best, place = max(parts), k
-    if best < FITS * whole:
-        label = problem.data.label[points.row[place]]
-        first = placed(problem.robot, points.take(rows[:place]))
-        second = placed(problem.robot, points.take(rows[place:]))
-        far = 1e3 * _apart(first, second)
+    left = {k: max(misfit(problem.robot, points.take(part)) for part in (rows[:k], rows[k:]))
+            for k in _places(len(rows))}  # fmt: skip
+    place = min(left, key=left.__getitem__)
+    if left[place] < FITS * whole:
+        first, second = (placed(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
         yield (
-            f"from row {label} on the points fit another base, {three_digits(far)} mm away: the instrument or the "
-            "robot's foot moved; calibrate the two parts apart, or register the second one anew."
+            f"from row {problem.data.label[points.row[place]]} on the points fit another base, "
+            f"{three_digits(1e3 * _apart(first, second))} mm away: the instrument or the robot's foot moved; calibrate "
+            "the two parts apart, or register the second one anew."
         )
 
 
@@ -643,11 +537,76 @@ def _apart(first: Fit, second: Fit) -> float:
     return float(np.linalg.norm(second.modelled - seen, axis=1).mean())
 
 
-def _places(count: int) -> np.ndarray:
+def _places(count: int) -> list[int]:
     """Return before which rows a table may be parted."""
-    if count < 2 * FEWEST:
-        return np.array([], dtype=int)
-    return np.unique(np.linspace(FEWEST, count - FEWEST, MOST_PLACES).round().astype(int))
+    return np.unique(np.linspace(FEWEST, count - FEWEST, MOST_PLACES).round().astype(int)).tolist()
+
+
+# What residuals say
+
+
+class _Residual(NamedTuple):
+    """A linearization A (m, n), and its residual without what parameters with their prior explain (m + n,)."""
+
+    A: Array
+    rest: Array
+    squares: float
+    own: Array
+
+    def without(self, columns: Array) -> Array:
+        """Return columns (m, c) without what parameters with their prior explain, (m + n, c)."""
+        G = np.vstack([columns, np.zeros((self.A.shape[1], columns.shape[1]))])
+        return G - self.own @ (self.own.T @ G)
+
+    def chance(self, gain: float, columns: int, whole: float, tried: int) -> float:
+        """Return with which probability one of the tried explains so much of a sum of squares by chance (F test)."""
+        freedom = max(len(self.A) - self.A.shape[1] - columns, 1)
+        left = max(whole - gain, 1e-300)
+        return float(fdtrc(columns, freedom, gain / columns / (left / freedom))) * tried
+
+
+def _residual_of(problem: CalibrationProblem, x: Array) -> _Residual | None:
+    """Return the residual of a linearization at x (n,); None of too many equations."""
+    model = problem.linearize(x)
+    if len(model.b) > MOST_EQUATIONS:
+        return None
+    r = model.b - model.A @ (x / problem.parameters.free.scale)
+    own = np.linalg.qr(np.vstack([model.A, np.eye(len(x))]))[0]
+    found = _Residual(model.A, r, float(r @ r), own)
+    return found._replace(rest=found.without(r[:, None])[:, 0])
+
+
+def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Say whether the residuals at x (n,) are those of a joint's gear ratio, or of a coupling to another joint.
+
+    One column, the slope of a joint's zero times the value of a joint, is added to the last linearization. It must
+    explain half of the sum of squares, more than chance does once in a million (F test, all columns counted).
+    """
+    free = problem.parameters.free
+    left = _residual_of(problem, x)
+    if left is None:
+        return
+    q = problem.joint_values[problem.owners]
+    found: list[tuple[float, int, int, float]] = []
+    for i, kind in enumerate(problem.robot.joint_types):
+        name = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
+        if name not in free.names:
+            continue
+        k = free.names.index(name)
+        G = left.without(left.A[:, k, None] * q / free.scale[k])
+        size = np.sum(G**2, axis=0)
+        along = left.rest @ G
+        found += [(along[j] ** 2 / size[j], i, int(j), along[j] / size[j]) for j in np.flatnonzero(size > 0)]
+    if not found:
+        return
+    gain, i, j, factor = max(found)
+    whole = float(left.rest @ left.rest)
+    if gain > (1 - MOVED) * whole and left.chance(gain, 1, whole, len(found)) < RARE:
+        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder says (gear ratio)"
+        if i != j:
+            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
+        share = 100 * np.sqrt(max(whole - gain, 0.0) / whole)
+        yield f"{what}: that leaves {share:.0f} % of the residuals; write it into coupling in robot.toml."
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
@@ -656,59 +615,38 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     Six columns, the base's motion for the rows from there on, are added to the last linearization. They must explain
     half of the sum of squares, more than chance does once in a million (F test, all places counted).
     """
-    names = problem.parameters.free.names
-    base = [names.index(f"base_{c}") for c in FRAME if f"base_{c}" in names]
+    free = problem.parameters.free
+    base = [free.names.index(f"base_{c}") for c in FRAME if f"base_{c}" in free.names]
     data = problem.data
-    if len(base) < len(FRAME) or len(data) < 2 * FEWEST:
+    left = None
+    if len(base) == len(FRAME) and len(data) >= 2 * FEWEST:
+        left = _residual_of(problem, x)
+    if left is None:
         return
-    model = problem.linearize(x)
-    if len(model.b) > MOST_EQUATIONS:
-        return
-    z = x / problem.parameters.free.scale
-    r = model.b - model.A @ z
-    n = len(z)
-    Q = np.linalg.qr(np.vstack([model.A, np.eye(n)]))[0]
-    row = np.concatenate([np.repeat(block.row, len(block.measurement.components)) for block in data.blocks])
-    rest = np.concatenate([r, np.zeros(n)])
-    rest = rest - Q @ (Q.T @ rest)
-    whole = float(r @ r)
     places = _places(len(data))
     best, place, step = 0.0, 0, np.zeros(6)
     for k in places:
-        G = np.vstack([model.A[:, base] * (row >= k)[:, None], np.zeros((n, 6))])
-        G = G - Q @ (Q.T @ G)
-        found = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
-        gain = float(rest @ rest - np.sum((rest - G @ found) ** 2))
+        G = left.without(left.A[:, base] * (problem.owners >= k)[:, None])
+        found = np.asarray(np.linalg.lstsq(G, left.rest, rcond=1e-9)[0], dtype=float)
+        gain = float(left.rest @ left.rest - np.sum((left.rest - G @ found) ** 2))
         if gain > best:
-            best, place, step = gain, int(k), found
-    freedom = max(len(r) - n - 6, 1)
-    left = max(whole - best, 1e-300)
-    chance = fdtrc(6, freedom, best / 6 / (left / freedom)) * len(places)
-    if best > (1 - MOVED) * whole and chance < RARE:
-        yield _moved_text(problem, x, base, place, step, np.sqrt(left / whole))
+            best, place, step = gain, k, found
+    if best > (1 - MOVED) * left.squares and left.chance(best, 6, left.squares, len(places)) < RARE:
+        block = data.blocks[0]
+        components = list(block.measurement.components)
+        lengths = [i for i, name in enumerate(components) if name in ("x", "y", "z", "distance")]
+        alone = problem.on(replace(data, blocks=data.blocks[:1]))
+        change = (alone.jacobian(x)[:, base] @ (free.scale[base] * step)).reshape(-1, len(components))
+        far = 1e3 * float(np.linalg.norm(change[block.row >= place][:, lengths], axis=1).mean())
+        share = 100 * np.sqrt(max(left.squares - best, 1e-300) / left.squares)
+        yield (
+            f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
+            f"them, and fit a base that moved (that leaves {share:.0f} % of the residuals): did the instrument or the "
+            "robot's foot move? Calibrate the two parts apart."
+        )
 
 
-def _moved_text(problem: CalibrationProblem, x: Array, base: list[int], place: int, step: Array, left: float) -> str:
-    free = problem.parameters.free
-    components = list(problem.data.blocks[0].measurement.components)
-    lengths = [i for i, name in enumerate(components) if name in ("x", "y", "z", "distance")]
-    alone = problem.on(replace(problem.data, blocks=problem.data.blocks[:1]))
-    change = alone.jacobian(x)[:, base] @ (free.scale[base] * step)
-    vectors = change.reshape(-1, len(components))[problem.data.blocks[0].row >= place][:, lengths]
-    far = 1e3 * float(np.linalg.norm(vectors, axis=1).mean())
-    return (
-        f"from row {problem.data.label[place]} on the points are {three_digits(far)} mm from where the others put "
-        f"them, and fit a base that moved (that leaves {100 * left:.0f} % of the residuals): did the instrument or the "
-        "robot's foot move? Calibrate the two parts apart."
-    )
-
-
-STATED = frozenset(kind.name for kind in KNOWN)
-"""Measurements that are statements of a drawing."""
-CLOSE = 0.05
-"""Places that are nearer [m] say little of the scale."""
-LEAST = 1.0
-"""A direction is seen that the data show better than the scales do."""
+# What touches say
 
 
 def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
@@ -726,49 +664,40 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
     touches = problem.touches
     if touches is None:
         return
-    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    x = np.zeros(len(problem.parameters.free))
+    model = problem.linearize(x)
     s = model.svd[1]
-    things = []
-    points = touches.planar.count(False)
-    planes = touches.planar.count(True)
-    if points:
-        things.append(f"{points} points")
-    if planes:
-        things.append(f"{planes} planes")
-    count = sum(len(index) for index in touches.rows)
+    kinds = {"points": touches.planar.count(False), "planes": touches.planar.count(True)}
+    things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
     yield (
-        f"{count} touches of {' and '.join(things)}: {int(np.count_nonzero(s > LEAST))} of {len(s)} directions are "
+        f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} directions are "
         "seen better than the scales say. Where the robot stands and how its first joint is counted no touch shows."
     )
-    yield _scale_sentence(problem, model.A)
-
-
-def _scale_sentence(problem: CalibrationProblem, A: Array) -> str:
-    without = problem.without({problem.labels[i] for b in problem.data.blocks if b.measurement.name in STATED
-                               for i in b.row})  # fmt: skip
-    bare = without.linearize(np.zeros(A.shape[1])).A
-    alone = _scale(problem, bare)
+    known = {problem.labels[i] for b in problem.data.blocks if b.measurement.name in STATED for i in b.row}
+    alone = _scale(problem, problem.without(known).linearize(x).A)
     if alone is None:
-        return "All that was touched is in one place: the robot's scale is that of the drawing."
-    if len(without.data) == len(problem.data):
-        return (
-            f"Distances between touched places: known to {_per_metre(alone)} by touches and the scales of the file; a "
-            "known distance between two of them ([[known_distance]]) would show how large the robot is."
+        yield "All that was touched is in one place: the robot's scale is that of the drawing."
+        return
+    by_touches = f"{1e3 * alone:.2g} mm in a metre"
+    if not known:
+        yield (
+            f"Distances between touched places: known to {by_touches} by touches and the scales of the file; a known "
+            "distance between two of them ([[known_distance]]) would show how large the robot is."
         )
-    known = _scale(problem, A)
-    return (
-        f"Distances between touched places: known to {_per_metre(known or alone)}, and to {_per_metre(alone)} without "
-        "what the drawing knows of them."
+        return
+    yield (
+        f"Distances between touched places: known to {1e3 * (_scale(problem, model.A) or alone):.2g} mm in a metre, "
+        f"and to {by_touches} without what the drawing knows of them."
     )
-
-
-def _per_metre(sd: float) -> str:
-    return f"{1e3 * sd:.2g} mm in a metre"
 
 
 def _scale(problem: CalibrationProblem, A: Array) -> float | None:
     """Return the relative standard deviation of distances between touched places; None for a single one."""
-    places, slopes = _touched_places(problem)
+    free = problem.parameters.free
+    residual, jacobian = problem.slopes(np.zeros(len(free)), centred=False)
+    rows = [] if problem.touches is None else problem.touches.rows
+    places = [-residual[index].mean(axis=0) for index in rows]
+    slopes = [jacobian[index].mean(axis=0) * free.scale for index in rows]
     C = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
     squares = []
     for i, j in combinations(range(len(places)), 2):
@@ -777,30 +706,4 @@ def _scale(problem: CalibrationProblem, A: Array) -> float | None:
         if length > CLOSE:
             g = apart @ (slopes[j] - slopes[i]) / length**2
             squares.append(float(g @ C @ g))
-    if not squares:
-        return None
-    return float(np.sqrt(np.mean(squares)))
-
-
-def _touched_places(problem: CalibrationProblem) -> tuple[Array, Array]:
-    """Return where the tool is at the touches of every thing in the mean (T, 3) [m], and its slopes by z (T, 3, n)."""
-    free = problem.parameters.free
-    x = np.zeros(len(free))
-    names = []
-    positions = []
-    slopes = []
-    for block in problem.data.blocks:
-        if not block.measurement.touching or block.point is None:
-            continue
-        rows = np.arange(len(block.row))
-        seen = replace(block, measurement=position, y=np.zeros((len(rows), 3)), row=rows, point=None)
-        labels = tuple(str(i) for i in range(len(block.row)))
-        there = problem.on(Dataset((seen,), labels, np.arange(len(labels))))
-        names += block.point[:, 0].tolist()
-        positions.append(there.modelled(x)[0])
-        slopes.append((there.jacobian(x) * free.scale).reshape(len(labels), 3, -1))
-    which = np.unique(names, return_inverse=True)[1]
-    p = np.concatenate(positions)
-    J = np.concatenate(slopes)
-    each = [which == k for k in range(which.max() + 1)]
-    return np.array([p[of].mean(axis=0) for of in each]), np.array([J[of].mean(axis=0) for of in each])
+    return float(np.sqrt(np.mean(squares))) if squares else None

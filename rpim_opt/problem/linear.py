@@ -1,10 +1,10 @@
-"""A calibration problem linearized: whitened, scaled equations, their triangle and their singular values."""
+"""A calibration problem linearized: whitened, scaled equations, their QR factor, and whose parameters they have."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -13,6 +13,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, counted
 from rpim_opt.basics.threads import on_all_cores, phase
+from rpim_opt.data.dataset import Dataset
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
@@ -51,15 +53,8 @@ class LinearModel(Brief):
     ((27, 26), 27, 20, (27, 27))
     >>> (model.svd[1][:3] / model.svd[1][0]).round(2)  # largest singular values, relative
     array([1.  , 0.96, 0.8 ])
-    >>> float(np.abs(model.with_values(0 * model.b).svd[0]).max())  # no data, no deviations
-    0.0
     >>> model.scaled(np.repeat([1.0, 0.0], [15, 12])).rank  # without the last four configurations
     15
-    >>> which, count = model.members  # three coordinates of every configuration
-    >>> len(count), count[which[:4]].tolist()
-    (9, [3, 3, 3, 3])
-    >>> model.norms(np.ones(27)).round(2)[:3]
-    array([1.73, 1.73, 1.73])
     """
 
     A: Array
@@ -119,92 +114,49 @@ class LinearModel(Brief):
 
 BLOCK = 430_000
 """Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
-triangles of the blocks cost little beside them."""
-
-
-NARROW, WIDE = 8, 32
-"""Columns that are reduced together, of matrices with few and with many columns: as is quickest."""
-MANY = 100
-"""Columns from which there are many."""
+R of the blocks cost little beside them."""
+NARROW, WIDE, MANY = 8, 32, 100
+"""Columns that are reduced together where there are few, and from `MANY` on: as is quickest."""
 (GEQRT,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
 def reduced_rows(rows: Array, R: Array | None = None) -> Array:
-    """Return the upper triangle (n+1, n+1) of R over ``rows`` (m, n+1), by Householder's QR."""
-    return reduced_equations(rows[:, :-1], rows[:, -1], R)
-
-
-def reduced_equations(A: Array, b: Array, R: Array | None = None) -> Array:
-    """Return the upper triangle (n+1, n+1) of R over [A b], A (m, n) and b (m,), by Householder's QR."""
-    stacked, rows = beneath(R, A.shape[1] + 1, len(b))
-    rows[:, :-1] = A
-    rows[:, -1] = b
-    return rotated(stacked)
-
-
-def beneath(R: Array | None, n: int, count: int) -> tuple[Array, Array]:
-    """Return a matrix (m, n) with R (k, n) above, whose columns stand together, and of it the rows (count, n) beneath.
-
-    The rows are to be written.
-    """
-    above = 0 if R is None else len(R)
-    stacked = np.empty((n, max(above + count, n))).T
-    stacked[:above] = 0.0 if R is None else R
-    stacked[above + count :] = 0.0
-    return stacked, stacked[above : above + count]
-
-
-def rotated(stacked: Array) -> Array:
-    """Return the upper triangle R (n, n) of a matrix (m, n) of `beneath`, which is overwritten.
-
-    LAPACK's blocked QR whose blocks are reduced by halves: twice as fast as the usual one where rows are many.
-    """
-    n = stacked.shape[1]
-    R: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
-    return np.triu(R)
+    """Return the QR factor R (n+1, n+1) of R over ``rows`` (m, n+1): LAPACK's blocked QR, twice as fast as QR."""
+    n = rows.shape[1]
+    above = np.zeros((0, n)) if R is None else R
+    stacked = np.zeros((max(len(above) + len(rows), n), n), order="F")
+    stacked[: len(above)] = above
+    stacked[len(above) : len(above) + len(rows)] = rows
+    found: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
+    return np.triu(found)
 
 
 def triangle_of(A: Array, b: Array) -> Array:
-    """Return the triangle (n+1, n+1) of [A b], A (m, n) and b (m,): that of every `BLOCK`, and of those by twos.
-
-    Blocks are reduced on all cores; which they are depends on the shape of A alone.
-    """
+    """Return R (n+1, n+1) of [A b] from that of every `BLOCK`: which they are depends on the shape of A alone."""
     columns = A.shape[1] + 1
     most = max(8 * columns, BLOCK // columns)
 
     def block(start: int) -> Array:
         part = slice(start, start + most)
-        return reduced_equations(A[part], b[part])
+        return reduced_rows(np.column_stack([A[part], b[part]]))
 
-    return by_twos(on_all_cores(block, range(0, max(len(b), 1), most)))
-
-
-def by_twos(triangles: list[Array]) -> Array:
-    """Return the triangle of several triangles (n+1, n+1), joined by twos."""
-    while len(triangles) > 1:
-        pairs = [triangles[i : i + 2] for i in range(0, len(triangles), 2)]
-        triangles = [reduced_rows(pair[-1], pair[0]) if len(pair) == 2 else pair[0] for pair in pairs]
-    return triangles[0]
+    return reduce(lambda R, other: reduced_rows(other, R), on_all_cores(block, range(0, max(len(b), 1), most)))
 
 
 def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0.0) -> LinearModel:
-    """Return the linear model of a triangle: n + 1 equations with the same |A z - b| as those it was reduced from.
-
-    ``like``: gives the parameters, and whether measured values are constraints; ``R``: (n+1, n+1) of [A b] = QR;
-    ``equations``: how many equations A and b had; ``offset``: as `LinearModel` has it.
-    """
+    """Return the linear model of a QR factor R (n+1, n+1) of [A b], which had so many equations."""
     group = np.zeros(len(R), dtype=int)
     return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)
 
 
 def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
-    """Rotate the equations of models, at least one, into one triangle, which stands for them all."""
+    """Reduce the equations of models, at least one, to one QR factor, which stands for them all."""
     R, equations, offset, last = None, 0, 0.0, None
     for last in models:
         equations += last.equations
         offset += last.offset
         with phase("reduction"):
-            R = reduced_equations(last.A, last.b, R)
+            R = reduced_rows(np.column_stack([last.A, last.b]), R)
     if last is None or R is None:
         raise InputError("data", "no row", "at least one")
     return from_triangle(last, R, equations, offset)
@@ -212,3 +164,53 @@ def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
 
 Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]
 """``reweigh(model, z)``: some equations whose squares, and a constant, stand at z (n,) for a loss of the model's."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Machine:
+    """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
+
+    They are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at. ``robot`` is None for several robots.
+    """
+
+    robot: Robot | None
+    parameters: Parameters
+    data: Dataset
+    at: Array | None = None
+    farthest: Array | None = None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Parameters):
+    """The n identified parameters of a problem, with the machine that they belong to; None for a table alone."""
+
+    machine: Machine | None = None
+
+
+def require_robot(machine: Machine) -> Robot:
+    """Return the machine's robot; InputError where there are several."""
+    if machine.robot is None:
+        raise InputError("positions", "several robots in one problem", "one robot: constraints of `problem.alone(...)`")
+    return machine.robot
+
+
+def identified_of(robot: Robot | None, parameters: Parameters, data: Dataset) -> Identified:
+    """Return the identified parameters of a table, with the machine; of the data one row of each kind."""
+    blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(data.blocks))
+    labels = tuple(f"{data.label[int(block.row[0])]}" for block in data.blocks)
+    few = Dataset(blocks, labels, np.arange(len(blocks)))
+    table = {each.name: getattr(parameters.free, each.name) for each in fields(Parameters)}
+    return Identified(**table, machine=Machine(robot, parameters, few))
+
+
+def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
+    """Return a linear model whose parameters predict positions linearly about deviations x (n,) [SI], or nominal.
+
+    Positions of a region are also those that move farthest at ``farthest`` (n,) [SI], by default at x.
+    """
+    known = model.parameters
+    if x is None or not isinstance(known, Identified) or known.machine is None:
+        return model
+    machine = replace(known.machine, at=x, farthest=x if farthest is None else farthest)
+    return replace(model, parameters=replace(known, machine=machine))

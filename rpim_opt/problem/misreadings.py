@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
-import scipy
+from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -59,25 +59,20 @@ def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
     return found
 
 
-def _angles(robot: Robot, q: Array, measured: Array) -> Array | None:
-    """Return the angles (N,) [rad] between measured poses and nominal ones; None where base and tool do not follow."""
-    flange = forward_kinematics(robot, q)
-    try:
-        Z, X = hand_eye(flange, measured)
-    except InputError:
-        return None
-    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
-    return scipy.spatial.transform.Rotation.from_matrix(error).magnitude()
-
-
 def pose_misfit(robot: Robot, data: Dataset) -> float:
     """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
 
     Base and tool are fitted; pi where the poses do not determine them.
     """
     block = next(each for each in data.blocks if each.measurement.name == "pose")
-    angles = _angles(robot, block.q[:, 0], transforms(block.y))
-    return float(np.pi) if angles is None else float(np.sqrt(np.mean(angles**2)))
+    measured = transforms(block.y)
+    flange = forward_kinematics(robot, block.q[:, 0])
+    try:
+        Z, X = hand_eye(flange, measured)
+    except InputError:
+        return float(np.pi)
+    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
+    return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
 
 
 def lever_arms(robot: Robot, q: Array, tool: Array) -> Array:
@@ -149,73 +144,77 @@ class Better(NamedTuple):
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
 
 
-def joint_readings(robot: Robot) -> Iterator[Reading]:
+# What a table may be mistaken for
+
+
+def _readings(robot: Robot, points: Points) -> list[Reading]:
+    """Return all single mistakes that are looked for."""
+    readings = [*_of_joints(robot), *_of_rows(len(points.row))]
+    if points.seen:
+        remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
+        return [*readings, Reading("the camera and the board exchanged", remedy, _inverted)]
+    readings += _of_positions()
+    if points.turns is not None:
+        readings += _of_poses()
+    return readings
+
+
+def _of_joints(robot: Robot) -> Iterator[Reading]:
     """Yield readings with other joint values: units, signs, orders, couplings; zeros are fitted."""
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
-    n = robot.dof
-    eye = np.eye(n)
 
     def of(what: str, remedy: str, M: Array) -> Reading:
         return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
-    units = {
-        "as degrees, not radians": (np.pi / 180, "name the columns q1_deg, ... (--units deg)"),
-        "as radians, not degrees": (180 / np.pi, "name the columns q1_rad, ... (--units rad)"),
-        "as gon, not degrees": (0.9, "multiply the joint values by 0.9"),
-    }
-    for what, (factor, remedy) in units.items():
+    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    eye = np.eye(robot.dof)
+    for what, factor, remedy in (
+        ("as degrees, not radians", np.pi / 180, "name the columns q1_deg, ... (--units deg)"),
+        ("as radians, not degrees", 180 / np.pi, "name the columns q1_rad, ... (--units rad)"),
+        ("as gon, not degrees", 0.9, "multiply the joint values by 0.9"),
+    ):
         yield of(f"joint values read {what}", remedy, np.diag(np.where(turning, factor, 1)))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         yield of(f"joint {i + 1} reversed", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
-    for i, j in combinations(range(n), 2):
+    for i, j in combinations(range(robot.dof), 2):
         if turning[i] == turning[j]:
-            order = list(range(n))
-            order[i], order[j] = order[j], order[i]
+            exchanged = eye.copy()
+            exchanged[[i, j]] = eye[[j, i]]
             remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
-            yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, eye[order])
-    yield from _couplings(robot, of)
-
-
-def _couplings(robot: Robot, of: Callable[..., Reading]) -> Iterator[Reading]:
-    """Yield readings in which a joint's value counts from another joint."""
-    n = robot.dof
-    turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
-    for i, j in permutations(turning, 2):
-        for factor in COUPLINGS[abs(i - j) == 1]:
-            M = np.eye(n)
+            yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
+    for i, j in permutations(np.flatnonzero(turning), 2):
+        for factor in COUPLINGS[bool(abs(i - j) == 1)]:
+            M = eye.copy()
             M[i, j] = factor
             rows = ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in M)
             size = "" if abs(factor) == 1 else f"{abs(factor):g} "
-            word = "plus" if factor > 0 else "minus"
-            what = f"joint {i + 1} coupled to joint {j + 1} (q{i + 1} {word} {size}q{j + 1})"
+            sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
+            what = f"joint {i + 1} coupled to joint {j + 1} ({sum_of})"
             yield of(what, f"write coupling = [{rows}] in robot.toml", M)
 
 
-def measured_readings() -> Iterator[Reading]:
-    """Yield readings with other measured values: units of all columns or one, handedness."""
+def _of_positions() -> Iterator[Reading]:
+    """Yield readings with other measured positions: units of all columns or one, handedness."""
 
-    def scaled(what: str, remedy: str, factors: list[float]) -> Reading:
+    def scaled(what: str, remedy: str, factors: Array) -> Reading:
         return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
     for factor, (unit, remedy) in LENGTHS.items():
-        yield scaled(f"measured lengths {unit}", remedy, [factor] * 3)
+        yield scaled(f"measured lengths {unit}", remedy, np.full(3, factor))
         for k, axis in enumerate("xyz"):
-            factors = [1.0] * 3
-            factors[k] = factor
+            factors = np.where(np.arange(3) == k, factor, 1.0)
             yield scaled(f"column {axis} {unit}", f"multiply column {axis} by {factor:g} or name its unit", factors)
     remedy = "change the sign of one coordinate, or exchange two"
     yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
-def pose_readings() -> Iterator[Reading]:
+def _of_poses() -> Iterator[Reading]:
     """Yield readings with other orientations."""
     yield Reading(
         "orientations the other way round (of the instrument in the tool)",
         "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
         lambda points: replace(points, turns=None if points.turns is None else np.swapaxes(points.turns, 1, 2)),
     )
-
     yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", _inverted)
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
@@ -232,10 +231,9 @@ def _euler(axes: str, factor: float = 1.0) -> Callable[[Points], Points]:
     def changed(points: Points) -> Points:
         if points.turns is None:
             return points
-        angles = factor * scipy.spatial.transform.Rotation.from_matrix(points.turns).as_euler("xyz")
+        angles = factor * Rotation.from_matrix(points.turns).as_euler("xyz")
         columns = ["xyz".index(axis) for axis in axes.lower()]
-        turns = scipy.spatial.transform.Rotation.from_euler(axes, angles[:, columns]).as_matrix()
-        return replace(points, turns=turns)
+        return replace(points, turns=Rotation.from_euler(axes, angles[:, columns]).as_matrix())
 
     return changed
 
@@ -247,13 +245,7 @@ def _inverted(points: Points) -> Points:
     return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
 
 
-def view_readings() -> Iterator[Reading]:
-    """Yield readings of a camera's views: it is not where it is said to be."""
-    remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
-    yield Reading("the camera and the board exchanged", remedy, _inverted)
-
-
-def row_readings(count: int) -> Iterator[Reading]:
+def _of_rows(count: int) -> Iterator[Reading]:
     """Yield readings with joint values of other rows: shifted, reversed, in the order of texts."""
 
     def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Reading:
@@ -263,25 +255,27 @@ def row_readings(count: int) -> Iterator[Reading]:
     for k in (1, 2, 3):
         if count - k >= 6:
             said = f"{k} row{'s' * (k > 1)}"
-            down = f"move the measured values {said} up, against the joint values"
-            yield of(f"measured values {said} too low in the table", down, rows[:-k], rows[k:])
-            up = f"move the measured values {said} down, against the joint values"
-            yield of(f"measured values {said} too high in the table", up, rows[k:], rows[:-k])
+            for low, back, joints, values in (
+                ("low", "up", rows[:-k], rows[k:]),
+                ("high", "down", rows[k:], rows[:-k]),
+            ):
+                remedy = f"move the measured values {said} {back}, against the joint values"
+                yield of(f"measured values {said} too {low} in the table", remedy, joints, values)
     yield of("the rows of joint values in the reverse order", "turn one of the two parts over", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     yield of("measured values sorted as texts (1, 10, 11, 2)", remedy, by_text, rows)
-    back = np.argsort(by_text)
-    yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, back, rows)
+    yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
+
+
+# Which of these fits
 
 
 def better_reading(problem: CalibrationProblem) -> Better | None:
     """Return the reading that fits far better than what is written, or None.
 
     Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
-    right, all orders of up to six joints, and the ready robots.
-
-    ``problem``: its robot as the drawing says; base and reflectors are fitted anew for every reading.
+    right, all orders of up to six joints, and the ready robots. Base and reflectors are fitted anew for every reading.
     """
     points = points_of(problem)
     if points is None:
@@ -301,29 +295,32 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     stated = misfit(robot, points)
     if not np.isfinite(stated):
         return None
-    found = _searched(robot, points, stated)
+    found = _mistakes(robot, points, stated)
     if found is None and stated > WRONG and not points.seen:
         found = _reordered(robot, points, stated) or _other_robot(robot, points, stated)
     return found
 
 
-def _all(robot: Robot, points: Points) -> list[Reading]:
-    readings = [*joint_readings(robot), *row_readings(len(points.row))]
-    if points.seen:
-        return [*readings, *view_readings()]
-    readings += measured_readings()
-    if points.turns is not None:
-        readings += pose_readings()
-    return readings
-
-
-def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
+def _mistakes(robot: Robot, points: Points, stated: float) -> Better | None:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
-    chain, best = _chained(robot, points, stated)
+    chain: list[Reading] = []
+    best = stated
+    changed = points
+    while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
+        each, size = _best(robot, changed, _readings(robot, changed))
+        if each is None or not size < FURTHER * best:
+            break
+        chain.append(each)
+        changed = each.change(changed)
+        best = size
     if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
-        pair = _pair(robot, points)
-        if pair is not None and pair[1] < min(best, BETTER * stated):
-            chain, best = pair
+        readings = _readings(robot, points)
+        for i in np.argsort(_tried(robot, points, readings))[:BEAM]:
+            changed = readings[i].change(points)
+            others = [each for each in _readings(robot, changed) if each.what != readings[i].what]
+            second, left = _best(robot, changed, others)
+            if second is not None and left < min(best, BETTER * stated):
+                chain, best = [readings[i], second], left
     if len(chain) > 1 and best > WRONG:  # of many pairs one always fits somewhat better
         chain = chain[:1]
         best = float(_tried(robot, points, chain)[0])
@@ -332,60 +329,30 @@ def _searched(robot: Robot, points: Points, stated: float) -> Better | None:
     return _compared(robot, chain, points, stated, best)
 
 
-def _chained(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:
-    """Return mistakes, each the best behind those before it, and what is left; no more once little is."""
-    chain: list[Reading] = []
-    best = stated
-    while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
-        each, size = _best(robot, points, _all(robot, points))
-        if each is None or not size < FURTHER * best:
-            break
-        chain.append(each)
-        points = each.change(points)
-        best = size
-    return chain, best
-
-
-def _pair(robot: Robot, points: Points) -> tuple[list[Reading], float] | None:
-    """Return the best two mistakes together, the first of them one of those that help most, or of all signs."""
-    readings = _all(robot, points)
-    size = _tried(robot, points, readings)
-    firsts = [readings[i] for i in np.argsort(size)[:BEAM]]
-    found: list[tuple[list[Reading], float]] = []
-    for first in firsts:
-        changed = first.change(points)
-        second, left = _best(robot, changed, [each for each in _all(robot, changed) if each.what != first.what])
-        if second is not None:
-            found.append(([first, second], left))
-    return min(found, key=lambda each: each[1], default=None)
-
-
 def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float, left: float) -> Better:
     """Return mistakes in words, each with what fits as well in its place: some are the same but for base and tool."""
-    same = [[each, *_in_place(robot, chain, i, points, left)] for i, each in enumerate(chain)]
-    what = " and ".join(", or ".join(each.what for each in place) for place in same)
-    remedy = "; ".join(", or ".join(each.remedy for each in place) for place in same)
-    return Better(what, remedy, stated * points.extent, left * _changed(chain, points).extent)
+    same = []
+    changed = points
+    for i, each in enumerate(chain):
+        behind = chain[i + 1 :]
+        alike = [each]
+        for other in each.others:
+            tried = _changed(behind, other.change(changed)) if _as_many(each, other, changed) else None
+            if not behind or (tried is not None and float(misfits(robot, [tried])[0]) <= SAME * left):
+                alike.append(other)
+        same.append(alike)
+        changed = each.change(changed)
+    what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
+    remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
+    return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
-def _in_place(robot: Robot, chain: list[Reading], i: int, points: Points, left: float) -> list[Reading]:
-    """Return what fits as well as a mistake; of one with others behind it, what still does with them."""
-    if i == len(chain) - 1:
-        return list(chain[i].others)
-    start = _changed(chain[:i], points)
-    count = len(chain[i].change(start).row)
-    found = []
-    for other in chain[i].others:
-        changed = other.change(start)
-        if len(changed.row) == count:  # the mistakes behind it are of so many rows
-            size = float(misfits(robot, [_changed(chain[i + 1 :], changed)])[0])
-            if size <= SAME * left:
-                found.append(other)
-    return found
+def _as_many(one: Reading, other: Reading, points: Points) -> bool:
+    """Return whether two readings leave as many rows: the mistakes behind them are of so many."""
+    return len(one.change(points).row) == len(other.change(points).row)
 
 
 def _changed(chain: Sequence[Reading], points: Points) -> Points:
-    """Return the points as they are without some mistakes."""
     for each in chain:
         points = each.change(points)
     return points
@@ -397,21 +364,16 @@ def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Readin
     least = float(size.min(initial=np.inf))
     if not np.isfinite(least):
         return None, float("inf")
-    near = [i for i in np.argsort(size) if size[i] <= NEAR * least][:8]
-    whole = misfits(robot, [readings[i].change(points) for i in near])
+    near = [readings[i] for i in np.argsort(size) if size[i] <= NEAR * least][:8]
+    whole = misfits(robot, [each.change(points) for each in near])
     k = int(np.argmin(whole))
-    same = [readings[i] for i, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
-    best = readings[near[k]]
-    return best._replace(others=tuple(each for each in same if each is not best)[:3]), float(whole[k])
+    same = [each for each, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
+    return near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3]), float(whole[k])
 
 
 def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
     """Return how badly readings fit, from few rows."""
-    changed = [each.change(points) for each in readings]
-    few = [
-        each.take(np.linspace(0, len(each.row) - 1, min(FEW, len(each.row))).round().astype(int)) for each in changed
-    ]
-    return misfits(robot, few)
+    return misfits(robot, [each.change(points).evenly(FEW) for each in readings])
 
 
 def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
@@ -433,19 +395,8 @@ def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
 
 
 def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
-    """Return the ready robot with as many joints that fits far better."""
-    tried = [(f"the ready robot {each}", f'write robot = "{each}" in problem.toml', read_robot(READY / f"{each}.toml"))
-             for each in robots()]  # fmt: skip
-    same = [each for each in tried if each[2].joint_types == robot.joint_types]
-    size = [misfit(other, points) for _, _, other in (*_conventions(robot), *same)]
-    what, remedy, _ = (*_conventions(robot), *same)[int(np.argmin(size))]
-    if not min(size) < BETTER * stated:
-        return None
-    return _compared(robot, [Reading(what, remedy, lambda points: points)], points, stated, min(size))
-
-
-def _conventions(robot: Robot) -> Iterator[tuple[str, str, Robot]]:
-    """Yield what was mistaken, what to write, and the robot of a table in the other Denavit-Hartenberg convention."""
+    """Return the table in the other Denavit-Hartenberg convention, or a ready robot, that fits far better."""
+    tried: list[tuple[str, str, Robot]] = []
     for which, shift, remedy in (
         ("standard (distal)", 1, "move alpha and a of every row to the next row (the first row's are 0)"),
         ("modified (proximal)", -1, "move alpha and a of every row to the row before"),
@@ -453,4 +404,13 @@ def _conventions(robot: Robot) -> Iterator[tuple[str, str, Robot]]:
         mdh = robot.mdh.copy()
         mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
         mdh[0 if shift > 0 else -1, :2] = 0.0
-        yield f"a table in the {which} Denavit-Hartenberg convention", remedy, replace(robot, mdh=mdh)
+        tried.append((f"a table in the {which} Denavit-Hartenberg convention", remedy, replace(robot, mdh=mdh)))
+    for name in robots():
+        ready = read_robot(READY / f"{name}.toml")
+        if ready.joint_types == robot.joint_types:
+            tried.append((f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready))
+    size = [misfit(other, points) for _, _, other in tried]
+    what, remedy, _ = tried[int(np.argmin(size))]
+    if not min(size) < BETTER * stated:
+        return None
+    return Better(what, remedy, stated * points.extent, min(size) * points.extent)

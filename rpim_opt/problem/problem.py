@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -15,19 +16,189 @@ from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.problem.identified import Identified, identifiable, identified_of
-from rpim_opt.problem.linear import LinearModel, Reweigh, beneath, from_triangle, reduced_models, rotated
-from rpim_opt.problem.row_functions import Evaluation, Kept, measured_torques, require_loads, require_same_torques
-from rpim_opt.problem.scatter import Scatter, Stack, joint_slopes, shifts, stacked
-from rpim_opt.problem.touches import Things, Touches, contrasted, of_rows
+from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
+from rpim_opt.problem.linear import Identified, LinearModel, Reweigh, identified_of
+from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
+from rpim_opt.problem.row_functions import (
+    Functions,
+    Kept,
+    Needs,
+    Structure,
+    asked,
+    loads_in,
+    loads_of,
+    measured_torques,
+    require_loads,
+    require_same_torques,
+)
+from rpim_opt.robot.evaluation import evaluate_rows
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters, with_terms
 from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
 
+GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
+BASE = re.compile(r"base_.*")
+PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
+POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
+"""Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
+SHIFTED = ("base_x", "base_y", "base_z")
+"""Parameters that move all of a robot alike."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CalibrationProblem(Tabled):
+class RobotModel(Tabled):
+    """The nominal robots, the parameters of their model and their repeatability: what all measurements share."""
+
+    robots: Robot | Mapping[str, Robot]
+    parameters: Parameters
+    asked: Kept | None = field(default=None, repr=False, kw_only=True)
+    scatter: Scatter | None = field(default=None, kw_only=True)
+
+    def sample(self) -> CalibrationProblem:
+        """Return rows enough to place frames by: all of them, of measurements in blocks the first block."""
+        raise NotImplementedError
+
+    def identify(self, patterns: Iterable[str]) -> Self:
+        """Return the same problem with just the parameters identified that match one of the patterns.
+
+        Parameters
+        ----------
+        patterns
+            Names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links, Hayati's
+            beta between nearly parallel axes, and the frames that the measurements can tell.
+
+        Raises
+        ------
+        InputError
+            For a pattern that matches no parameter.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> [len(problem.identify(each).parameters.free) for each in ("auto", ["theta?", "tool_[xyz]"])]
+        [34, 9]
+        """
+        p = self.parameters
+        return self.with_parameters(p.identify(identifiable(patterns, self.robot, p, self.sample().data)))
+
+    def _short(self) -> str:
+        names = ", ".join(f"'{robot.name}'" for robot in self.arms.values())
+        return f"of {names}: {self.sample().data._short()}, {counted(len(self.parameters.free), 'parameter')}"
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        """Return the identified parameters."""
+        return self.parameters.free._frame_rows()
+
+    @property
+    def arms(self) -> Mapping[str, Robot]:
+        """The nominal robots by name; ``""`` for the only one."""
+        if isinstance(self.robots, Robot):
+            return {"": self.robots}
+        return self.robots
+
+    @property
+    def robot(self) -> Robot:
+        """The nominal robot; InputError where there are several."""
+        if isinstance(self.robots, Robot):
+            return self.robots
+        names = ", ".join(self.robots)
+        raise InputError(
+            "robot", f"{len(self.robots)} in one problem ({names})", f"one: problem.alone('{min(self.robots)}')"
+        )
+
+    def with_parameters(self, parameters: Parameters) -> Self:
+        """Return the same problem with another table of parameters."""
+        return replace(self, parameters=parameters)
+
+    def identifying(self, identified: np.ndarray) -> Self:
+        """Return the same problem with other parameters identified, (P,) true or false."""
+        return replace(self, parameters=replace(self.parameters, identified=identified))
+
+    def scattered(self, scatter: Scatter | None) -> Self:
+        """Return the same problem with another repeatability of the robot, or none."""
+        return replace(self, scatter=scatter)
+
+    def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> Self:
+        """Return the same problem on an arm that moves by the terms of a model, too.
+
+        Parameters
+        ----------
+        model
+            The terms, beside those that the robot has. What reads blocks has to read the columns that they see.
+        identify
+            Patterns of the terms' parameters that are identified besides what is; all of them by default.
+
+        Raises
+        ------
+        InputError
+            For a name that the problem has, a pattern that matches none of the new ones, and data without a column
+            that an identified term sees.
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
+        >>> problem = ro.load("position").problem.with_model(ro.Model([wave]), identify=["bow[23]"])
+        >>> problem.parameters.free.names[-2:], problem.parameters.names[-1]
+        (('bow2', 'bow3'), 'bow6')
+        """
+        robot = replace(self.robot, model=Model((*self.robot.model.terms, *model.terms)))
+        p = self.parameters
+        whole = with_terms(p, model, robot.joint_types)
+        added = np.arange(len(whole)) >= len(p)
+        if added.any():
+            added[len(p) :] = whole.take(np.flatnonzero(added)).identify(identify).identified
+        return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
+
+    def with_transmission(self, curves: Sequence[Curve]) -> Self:
+        """Return the same problem with these transmission errors of joints identified, and no others.
+
+        The robot's repeatability, which was estimated without them, is left out.
+
+        Parameters
+        ----------
+        curves
+            One a joint; none for a robot without.
+        """
+        own = [term for term in self.robot.model.terms if not isinstance(term, Transmission)]
+        former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
+        p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
+        p = replace(p, terms=tuple(name for name in p.terms if name not in former))
+        bare = replace(self, robots=replace(self.robot, model=Model(own)), parameters=p, scatter=None)
+        if not curves:
+            return bare
+        return bare.with_model(Model([transmission(curve) for curve in curves]))
+
+    def frozen(self) -> Self:
+        """Return a copy that asks every measurement once, now, and keeps the answer.
+
+        A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
+        every call. Within a calibration one answer has to serve from the first iteration to the last.
+
+        >>> import numpy as np
+        >>> import rpim_opt as ro
+        >>> reading = {"zero": 0.0}
+        >>> height = ro.data.Measurement("height", lambda T: T[2, 3] + reading["zero"], {"z": "length"})
+        >>> arm = ro.load("paper_arm").problem
+        >>> problem = arm.on(ro.Dataset.of(arm.data.q, np.zeros((9, 1)), sigma=1e-5, measurement=height))
+        >>> kept, x = problem.frozen(), np.zeros(len(arm.parameters.free))
+        >>> before = problem.residual(x)
+        >>> reading["zero"] = 1.0
+        >>> bool(np.allclose(kept.residual(x), before)), bool(np.allclose(problem.residual(x), before - 1))
+        (True, True)
+        """
+        if self.asked is not None:
+            return self
+        copy = replace(self, asked=Kept())
+        for block in copy.sample().data.blocks:
+            copy.sample().functions(block)
+        return copy
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationProblem(RobotModel):
     """What was measured on which robot, and which parameters are to explain it.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
@@ -66,72 +237,17 @@ class CalibrationProblem(Tabled):
     [2.096, 2.649]
     >>> problem.labels[:2], problem.without({"T2-1"}).labels[0], problem.keeps_rows, list(problem.arms)
     (('T2-1', 'T2-2'), 'T2-2', True, [''])
-    >>> [len(part.data) for part in problem.rows()], problem.sample() is problem
-    ([9], True)
     >>> norms, count = problem.whitened_errors(nominal)  # 2 mm off, and 0.03 mm of noise
     >>> norms[:3].round(1), count[:3], len(problem.whitened_residual(nominal))
     (array([72.9, 68.5, 54.5]), array([3, 3, 3]), 27)
-    >>> norms, count = problem.configuration_errors(nominal)
-    >>> norms.shape, count[:2], problem.owners[:4], problem.groups.shape
-    ((9,), array([3, 3]), array([0, 0, 0, 1]), (27,))
-    >>> problem.scattered(ro.problem.Scatter(position=1e-4)).scatter.position, problem.joint_values.shape
-    (0.0001, (9, 6))
-    >>> problem.identifying(problem.parameters.of_frames).parameters.free.names[:2]
-    ('base_x', 'base_y')
     >>> len(problem.with_parameters(problem.parameters.identify(["a?"])).parameters.free)
     6
-    >>> [stack.index.shape for stack in problem.stacks()], [V.shape for V in problem.covariances()]
-    ([(9, 3)], [(1, 3, 3)])
-    >>> [part.shape for part in problem.slopes(nominal)], problem.contrasts(np.eye(27)).shape, problem.touches
-    ([(27,), (27, 26)], (27, 27), None)
-    >>> both = ro.together(left=problem, right=problem, shared=["tool_*"])
-    >>> len(both.data), len(both.alone("left").data), len(ro.load("contact").problem.touched)
-    (18, 9, 10)
-    >>> problem.triangle(nominal, 5).A.shape
-    (27, 26)
     """
 
-    robots: Robot | Mapping[str, Robot]
-    parameters: Parameters
     data: Dataset
-    asked: Kept | None = field(default=None, repr=False)
-    scatter: Scatter | None = None
-
-    def identify(self, patterns: Iterable[str]) -> CalibrationProblem:
-        """Return the same problem with just the parameters identified that match one of the patterns.
-
-        Parameters
-        ----------
-        patterns
-            Names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links, Hayati's
-            beta between nearly parallel axes, and the frames that the measurements can tell.
-
-        Raises
-        ------
-        InputError
-            For a pattern that matches no parameter.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> [len(problem.identify(each).parameters.free) for each in ("auto", ["theta?", "tool_[xyz]"])]
-        [34, 9]
-        """
-        p = self.parameters
-        return self.with_parameters(p.identify(identifiable(patterns, self.robot, p, self.data)))
-
-    def _short(self) -> str:
-        names = ", ".join(f"'{robot.name}'" for robot in self.arms.values())
-        return f"of {names}: {self.data._short()}, {counted(len(self.parameters.free), 'parameter')}"
-
-    def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the identified parameters."""
-        return self.parameters.free._frame_rows()
 
     def __post_init__(self) -> None:
-        p = self.parameters
-        if not p.identified.any():
+        if not self.parameters.identified.any():
             raise InputError("key identify", "no parameter", "at least one")
         for block in self.data.blocks:
             if block.robot not in self.arms:
@@ -140,7 +256,7 @@ class CalibrationProblem(Tabled):
             self._require_fit(block)
         for name, robot in self.arms.items():
             if name in self._present:
-                require_loads(robot, p.of_robot(name), self._rows_of(name))
+                require_loads(robot, self.parameters.of_robot(name), self._rows_of(name))
 
     def _require_fit(self, block: Block) -> None:
         """Refuse rows whose joints, reflectors or fixtures their robot does not have."""
@@ -156,23 +272,6 @@ class CalibrationProblem(Tabled):
             if of_fixture(name, block.fixture) not in names:
                 where = f"measurement {block.measurement.name}"
                 raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
-
-    @property
-    def arms(self) -> Mapping[str, Robot]:
-        """The nominal robots by name; ``""`` for the only one."""
-        if isinstance(self.robots, Robot):
-            return {"": self.robots}
-        return self.robots
-
-    @property
-    def robot(self) -> Robot:
-        """The nominal robot; InputError where there are several."""
-        if isinstance(self.robots, Robot):
-            return self.robots
-        names = ", ".join(self.robots)
-        raise InputError(
-            "robot", f"{len(self.robots)} in one problem ({names})", f"one: problem.alone('{min(self.robots)}')"
-        )
 
     def alone(self, robot: str) -> CalibrationProblem:
         """Return the problem of one of several robots: its parameters, as itself calls them, and its rows."""
@@ -212,87 +311,26 @@ class CalibrationProblem(Tabled):
         InputError
             When data and parameters do not fit, or compliances have measured torques here and not there.
         """
-        theirs = {block.robot for block in data.blocks}
-        for name in theirs & self._present:
+        for name in {block.robot for block in data.blocks} & self._present:
             p = self.parameters.of_robot(name)
             require_same_torques(self.arms[name], p, self._rows_of(name), measured_torques(data, name))
         return replace(self, data=data)
 
-    def with_parameters(self, parameters: Parameters) -> CalibrationProblem:
-        """Return the same problem with another table of parameters."""
-        return replace(self, parameters=parameters)
-
-    def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> CalibrationProblem:
-        """Return the same problem on an arm that moves by the terms of a model, too.
-
-        Parameters
-        ----------
-        model
-            The terms, beside those that the robot has.
-        identify
-            Patterns of the terms' parameters that are identified besides what is; all of them by default.
-
-        Raises
-        ------
-        InputError
-            For a name that the problem has, a pattern that matches none of the new ones, and data without a column
-            that an identified term sees.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
-        >>> problem = ro.load("position").problem.with_model(ro.Model([wave]), identify=["bow[23]"])
-        >>> problem.parameters.free.names[-2:], problem.parameters.names[-1]
-        (('bow2', 'bow3'), 'bow6')
-        """
-        robot = replace(self.robot, model=Model((*self.robot.model.terms, *model.terms)))
-        p = self.parameters
-        whole = with_terms(p, model, robot.joint_types)
-        added = np.arange(len(whole)) >= len(p)
-        if added.any():
-            added[len(p) :] = whole.take(np.flatnonzero(added)).identify(identify).identified
-        return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
-
-    def with_transmission(self, curves: Sequence[Curve]) -> CalibrationProblem:
-        """Return the same problem with these transmission errors of joints identified, and no others.
-
-        The robot's scatter, which was learned without them, is left out.
-
-        Parameters
-        ----------
-        curves
-            One a joint; none for a robot without.
-        """
-        own = [term for term in self.robot.model.terms if not isinstance(term, Transmission)]
-        former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
-        p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
-        p = replace(p, terms=tuple(name for name in p.terms if name not in former))
-        robot = replace(self.robot, model=Model(own))
-        bare = replace(self, robots=robot, parameters=p, scatter=None)
-        if not curves:
-            return bare
-        return bare.with_model(Model([transmission(curve) for curve in curves]))
-
-    def scattered(self, scatter: Scatter | None) -> CalibrationProblem:
-        """Return the same problem with other noise of the robot's own, or none."""
-        return replace(self, scatter=scatter)
-
-    def identifying(self, identified: np.ndarray) -> CalibrationProblem:
-        """Return the same problem with other parameters identified, (P,) true or false."""
-        return self.with_parameters(replace(self.parameters, identified=identified))
+    def without(self, labels: Collection[str]) -> CalibrationProblem:
+        """Return the same problem without the rows of these labels."""
+        return self.on(self.data.without(labels))
 
     def sample(self) -> CalibrationProblem:
-        """Return rows enough to place frames by: here all of them, of measurements in parts the first part."""
+        """Return rows enough to place frames by: here all of them, of measurements in blocks the first block."""
         return self
 
     def rows(self) -> Iterator[CalibrationProblem]:
-        """Yield problems that together have all the rows: here this one, of measurements in parts one a part."""
+        """Yield problems that together have all the rows: here this one, of measurements in blocks one a block."""
         yield self
 
     @property
     def keeps_rows(self) -> bool:
-        """Whether `linearize` returns the equations themselves, and not their triangle."""
+        """Whether `linearize` returns the equations themselves, and not their QR factor."""
         return True
 
     @property
@@ -300,64 +338,89 @@ class CalibrationProblem(Tabled):
         """N labels of the rows."""
         return self.data.label
 
-    def without(self, labels: Collection[str]) -> CalibrationProblem:
-        """Return the same problem without the rows of these labels."""
-        return self.on(self.data.without(labels))
+    # What a row's functions are, and what they return
 
-    def frozen(self) -> CalibrationProblem:
-        """Return a copy that asks every measurement once, now, and keeps the answer.
-
-        A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
-        every call. Within a calibration one answer has to serve from the first pass to the last.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> reading = {"zero": 0.0}
-        >>> height = ro.data.Measurement("height", lambda T: T[2, 3] + reading["zero"], {"z": "length"})
-        >>> arm = ro.load("paper_arm").problem
-        >>> problem = arm.on(ro.Dataset.of(arm.data.q, np.zeros((9, 1)), sigma=1e-5, measurement=height))
-        >>> kept, x = problem.frozen(), np.zeros(len(arm.parameters.free))
-        >>> before = problem.residual(x)
-        >>> reading["zero"] = 1.0
-        >>> bool(np.allclose(kept.residual(x), before)), bool(np.allclose(problem.residual(x), before - 1))
-        (True, True)
-        """
-        if self.asked is not None:
-            return self
-        copy = replace(self, asked=Kept())
-        for block in copy.data.blocks:
-            copy._rows.functions(block)
-        return copy
+    def functions(self, block: Block) -> Functions:
+        """Return the functions of a block's rows."""
+        if block not in self._structures:
+            self._structures[block] = self._structure(block)
+        return (self.asked or asked)(self._structures[block], block.measurement)
 
     @cached_property
-    def _rows(self) -> Evaluation:
-        return Evaluation(self.arms, self.parameters, self.data, self.asked)
-
-    def residual(self, x: Array) -> Array:
-        """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
-        residual = np.concatenate([self._rows.values(block, "residual", x).ravel() for block in self.data.blocks])
-        if self.touches is not None:
-            residual, _ = self.touches.centred(residual, size=self._size)
-        return residual
+    def _structures(self) -> dict[Block, Structure]:
+        return {}
 
     @cached_property
-    def touches(self) -> Touches | None:
-        """Points and planes that rows touched and nobody measured; None where there are none."""
-        return Touches.of(self.data)
+    def _arguments(self) -> dict[Block, Array]:
+        return {}
 
-    def _residuals(self, x: Array) -> Iterator[tuple[Block, Array]]:
-        """Yield every block with its residual (N, c) [SI]."""
-        start = 0
-        residual = self.residual(x)
-        for block in self.data.blocks:
-            each = len(block.measurement.components)
-            end = start + each * len(block.row)
-            yield block, residual[start:end].reshape(-1, each)
-            start = end
+    def _structure(self, block: Block) -> Structure:
+        """Return what the functions of a block's rows depend on, besides its measurement."""
+        p = self.parameters
+        absent = (p.nominal == 0) & ~p.identified
+        robot = self.arms[block.robot]
+        names = p.names
+        if block.robot:  # those of other robots keep their long names, which nobody asks for
+            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
+        loads = loads_of(robot, Needs.of(robot, p.of_robot(block.robot)), self.data, block)
+        return Structure(
+            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
+            tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
+        )  # fmt: skip
+
+    @cached_property
+    def _sessions(self) -> dict[str, tuple[str, ...]]:
+        """The prefixes of the sessions of every robot that shift anything."""
+        p = self.parameters
+        present = p.take(np.flatnonzero(p.identified | (p.nominal != 0)))
+        return {
+            robot: tuple(dict.fromkeys(frame_of(name) for name in present.of_robot(robot).names if of_session(name)))
+            for robot in self.arms
+        }
+
+    def _evaluated(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+        """Return the results of one of the functions for rows of a block at x (n,), (N, ...) each."""
+        if block not in self._arguments:
+            prefixes = self._sessions[block.robot]
+            own = np.array([session_prefix(name) for name in block.session_names], dtype=object) if prefixes else None
+            shifted = [(own == prefix).astype(float)[:, None] for prefix in prefixes]
+            self._arguments[block] = np.hstack([*loads_in(self.arms[block.robot], block), *shifted, block.y])
+        function = self.functions(block)[what]
+        with phase("evaluation"):
+            return evaluate_rows(function, [x, self.parameters.nominal], self._arguments[block][part])
+
+    def _values(self, block: Block, what: str, x: Array) -> Array:
+        return self._evaluated(block, what, x)[0][:, 0]
 
     def modelled(self, x: Array) -> list[Array]:
         """Return what the instrument would read at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
-        return [self._rows.values(block, "modelled", x) for block in self.data.blocks]
+        return [self._values(block, "modelled", x) for block in self.data.blocks]
+
+    def residual(self, x: Array) -> Array:
+        """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
+        residual = self._uncentred(x)
+        if self.touches is not None:
+            residual, _ = self.touches.centred(residual, np.zeros((len(residual), 0)), self._size)
+        return residual
+
+    def _uncentred(self, x: Array) -> Array:
+        """Return the residual (m,) with touched points at the origin."""
+        return np.concatenate([self._values(block, "residual", x).ravel() for block in self.data.blocks])
+
+    def slopes(self, x: Array, centred: bool = True) -> tuple[Array, Array]:
+        """Return residual (m,) and Jacobian (m, n) at x (n,) [SI]; touched points at the origin if not centred."""
+        both = [self._evaluated(block, "jacobian", x) for block in self.data.blocks]
+        residual = np.concatenate([r.ravel() for r, _ in both])
+        jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
+        if self.touches is None or not centred:
+            return residual, jacobian
+        return self.touches.centred(residual, jacobian, self._size)
+
+    def jacobian(self, x: Array) -> Array:
+        """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
+        return self.slopes(x)[1]
+
+    # Errors
 
     def errors(self, x: Array, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
@@ -383,47 +446,44 @@ class CalibrationProblem(Tabled):
         ['15.00', '7.07']
         """
         errors = np.full(len(self.data), np.nan)
-        for block, residual in self._residuals(x):
+        whole = self.residual(x)
+        for block, index in zip(self.data.blocks, equation_numbers(self.data), strict=True):
+            residual = whole[index]
             dimensions = list(block.measurement.components.values())
             if dimension != "pixel":
                 dimensions = error_dimensions(block)
                 if block.measurement.metres is not None:
-                    residual = residual * self._rows.values(block, "metres", x)
+                    residual = residual * self._values(block, "metres", x)
             of = [i for i, d in enumerate(dimensions) if d == dimension]
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
         if self.touches is not None:
-            errors[self._rows.owners[self.touches.alone]] = np.nan
+            errors[self._equations.row[self.touches.alone]] = np.nan
         return errors
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,)."""
         norms = np.zeros(len(self.data))
         count = np.zeros(len(self.data), dtype=int)
-        for (block, residual), whitening in zip(self._residuals(x), self._whitening, strict=True):
-            r = (whitening @ residual[:, :, None])[:, :, 0]
-            norms[block.row] = np.sqrt(np.sum(r**2, axis=1))
-            count[block.row] = r.shape[1]
+        residual = self.residual(x)
+        for block, index, L in zip(self.data.blocks, equation_numbers(self.data), self._whitening, strict=True):
+            norms[block.row] = np.linalg.norm(_times(L, residual[index][:, :, None])[:, :, 0], axis=1)
+            count[block.row] = index.shape[1]
         return norms, count
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the whitened norms (C,) of configurations' residuals at x (n,), and how many equations each has."""
         which = np.unique(self.groups, return_inverse=True)[1]
-        squares = np.bincount(which, self.whitened_residual(x) ** 2)
-        return np.sqrt(squares), np.bincount(which)
+        return np.sqrt(np.bincount(which, self.whitened_residual(x) ** 2)), np.bincount(which)
 
     def whitened_residual(self, x: Array) -> Array:
         """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations."""
-        if self.scatter is not None or self.touches is not None:
+        if self._shares_noise:
             return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
-        parts = []
-        for block, whitening in zip(self.data.blocks, self._whitening, strict=True):
-            parts.append((whitening @ self._rows.values(block, "residual", x)[:, :, None]).ravel())
-        return np.concatenate(parts)
+        both = zip(self.data.blocks, self._whitening, strict=True)
+        return np.concatenate([_times(L, self._values(block, "residual", x)[:, :, None]).ravel() for block, L in both])
 
-    def jacobian(self, x: Array) -> Array:
-        """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
-        return self.slopes(x)[1]
+    # Linearization
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
         """Return the whitened, scaled linear model around the deviations x (n,) [SI].
@@ -435,50 +495,42 @@ class CalibrationProblem(Tabled):
         reweigh
             What weighs the equations by their residuals there, or None.
         """
-        if self.scatter is not None or self.touches is not None:
-            model = next(self._by_configurations(x, len(self.data)))
-        else:
-            parts = [self._block(x, i) for i in range(len(self.data.blocks))]
-            A, r = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-            model = self._model(A, r + A @ (x / self.parameters.free.scale), self.groups)
+        z = x / self.parameters.free.scale
+        both = np.concatenate(list(self.equations(x, len(self.data))))
+        A = np.ascontiguousarray(both[:, :-1]) if self._shares_noise else np.asfortranarray(both[:, :-1])
+        model = self.model_of(A, both[:, -1] + A @ z, self.groups)
         if reweigh is None:
             return model
-        weighed, offset = reweigh(model, x / self.parameters.free.scale)
+        weighed, offset = reweigh(model, z)
         return replace(weighed, offset=offset)
 
-    def _block(self, x: Array, i: int) -> tuple[Array, Array]:
-        """Return whitened, scaled A (m, n) and r (m,) of a block."""
-        block = self.data.blocks[i]
-        columns = np.empty((len(x) + 1, len(block.row), len(block.measurement.components)))
-        self._write(x, i, slice(0, len(block.row)), columns.transpose(0, 2, 1))
-        return columns[:-1].reshape(len(x), -1).T, columns[-1].ravel()
+    def equations(self, x: Array, most: int) -> Iterator[Array]:
+        """Yield the whitened, scaled equations [A r] (m', n + 1) at x (n,) [SI], of at most so many rows together.
 
-    def triangle(self, x: Array, most: int) -> LinearModel:
-        """Return the model of `linearize` as its QR factor: n + 1 rows, the same |A z - b|. Arguments as for `errors`.
-
-        Rows are evaluated where they are reduced, ``most`` together, so that memory does not grow with their number.
+        Where rows of a configuration share noise, they are whole configurations.
         """
-        if self.scatter is not None or self.touches is not None:
-            return reduced_models(self._by_configurations(x, most))
-        R, equations, n = None, 0, len(x) + 1
-        spans = [
-            (i, slice(start, min(start + most, len(block.row))))
-            for i, block in enumerate(self.data.blocks)
-            for start in range(0, len(block.row), most)
-        ]
-        for i, part in spans:
-            each = len(self.data.blocks[i].measurement.components)
-            stacked, rows = beneath(R, n, each * (part.stop - part.start))
-            self._write(x, i, part, rows.T.reshape(n, each, -1))
-            equations += len(rows)
-            with phase("reduction"):
-                R = rotated(stacked)
-        if R is None:
-            raise InputError("data", "no row", "at least one")
-        R[:, -1] += R[:, :-1] @ (x / self.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
-        return from_triangle(self._model(R[:, :-1], R[:, -1], np.zeros(n, dtype=int)), R, equations)
+        scale = np.append(self.parameters.free.scale, 1.0)
+        if not self._shares_noise:
+            for block, L in zip(self.data.blocks, self._whitening, strict=True):
+                for start in range(0, len(block.row), most):
+                    part = slice(start, start + most)
+                    residual, jacobian = self._evaluated(block, "jacobian", x, part)
+                    whitening = L if len(L) == 1 else L[part]
+                    both = np.empty((len(scale), *residual.shape[::2]))  # a column of all equations is dense
+                    _times(whitening, jacobian, scale[:-1], both[:-1].transpose(1, 2, 0))
+                    _times(whitening, residual.transpose(0, 2, 1), 1.0, both[-1:].transpose(1, 2, 0))
+                    yield both.reshape(len(scale), -1).T
+            return
+        parts = [np.arange(len(self.data))]
+        if len(self.data) > most:
+            parts = whole_configurations(self.data, most)
+        for rows in parts:
+            problem = self if len(parts) == 1 else self.on(self.data.take(rows))
+            residual, jacobian = problem.slopes(x)
+            yield problem._whitened(problem.contrasts(np.column_stack([jacobian, residual]) * scale))
 
-    def _model(self, A: Array, b: Array, group: np.ndarray) -> LinearModel:
+    def model_of(self, A: Array, b: Array, group: np.ndarray) -> LinearModel:
+        """Return the linear model of equations A (m, n), b (m,), and the numbers of their configurations (m,)."""
         kinds = [block.measurement for block in self.data.blocks]
         constrained = any(not kind.columns and not kind.touching for kind in kinds)
         return LinearModel(A, b, group, self._identified, constrained)
@@ -488,40 +540,44 @@ class CalibrationProblem(Tabled):
         only = self.robots if isinstance(self.robots, Robot) else None
         return identified_of(only, self.parameters, self.data)
 
-    def _write(self, x: Array, i: int, part: slice, found: Array) -> None:
-        """Write the whitened, scaled [A r] of N rows of a block into ``found`` (n + 1, k, N); b = r + A z."""
-        block, whitening, factors = self.data.blocks[i], self._whitening[i], self._factors[i]
-        if factors is not None:
-            self._rows.write(block, x, part, found, factors)
-            return
-        L = whitening if len(whitening) == 1 else whitening[part]
-        residual, jacobian = self._rows.of(block, "jacobian", x, part)
-        _weigh(L, jacobian.transpose(1, 2, 0), self.parameters.free.scale, found[:-1])
-        _weigh(L, residual.transpose(2, 1, 0), np.ones(1), found[-1:])
+    @cached_property
+    def _equations(self) -> Equations:
+        return Equations.of(self.data)
 
-    def _by_configurations(self, x: Array, most: int) -> Iterator[LinearModel]:
-        """Yield the linear model by whole configurations, whose rows share the robot's repeatability."""
-        scale = self.parameters.free.scale
-        parts = [np.arange(len(self.data))]
-        if len(self.data) > most:
-            parts = whole_configurations(self.data, most)
-        for rows in parts:
-            problem = self
-            if len(rows) < len(self.data):
-                problem = self.on(self.data.take(rows))
-            residual, jacobian = problem.slopes(x)
-            both = problem._whitened(problem.contrasts(np.column_stack([jacobian * scale, residual])))
-            A, r = np.ascontiguousarray(both[:, :-1]), both[:, -1]
-            yield self._model(A, r + A @ (x / scale), problem.groups)
+    @cached_property
+    def groups(self) -> np.ndarray:
+        """Number of the configuration that every equation belongs to, (m,)."""
+        return np.asarray(self.data.configuration[self.owners])
 
-    def slopes(self, x: Array) -> tuple[Array, Array]:
-        """Return residual (m,) and Jacobian (m, n) at x (n,) [SI], evaluated together."""
-        both = [self._rows.of(block, "jacobian", x) for block in self.data.blocks]
-        residual = np.concatenate([r.ravel() for r, _ in both])
-        jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
+    @cached_property
+    def owners(self) -> np.ndarray:
+        """Number of the row that every equation of `linearize` belongs to, (m,)."""
         if self.touches is None:
-            return residual, jacobian
-        return self.touches.centred(residual, jacobian, self._size)
+            return self._equations.row
+        return self._equations.row[self.touches.kept(self.touched)]
+
+    # Touched points and planes
+
+    @cached_property
+    def touches(self) -> Touches | None:
+        """Points and planes that rows touched and nobody measured; None where there are none."""
+        return Touches.of(self.data)
+
+    @cached_property
+    def touched(self) -> Things:
+        """Where the nominal robot puts the points and planes that were touched, in its base frame."""
+        if self.touches is None:
+            return ()
+        return [thing.level for thing in self.touches.located(self._nominal_residual)]
+
+    @cached_property
+    def _nominal_residual(self) -> Array:
+        return self._uncentred(np.zeros(len(self.parameters.free)))
+
+    @cached_property
+    def _size(self) -> float:
+        """How far the nominal robot's touches spread [m]."""
+        return 0.0 if self.touches is None else self.touches.size(self._nominal_residual)
 
     def contrasts(self, values: Array) -> Array:
         """Return what values of the rows' equations (m, c) say without the points that were touched, (k, c).
@@ -531,6 +587,20 @@ class CalibrationProblem(Tabled):
         if self.touches is None:
             return values
         return self.touches.contrasts(values, self.touched)
+
+    # Noise
+
+    @property
+    def _shares_noise(self) -> bool:
+        """Whether the noise of a configuration's equations is correlated from row to row."""
+        return self.scatter is not None or self.touches is not None
+
+    @cached_property
+    def _whitening(self) -> list[Array]:
+        """L^-1 with a row's covariance = L L', for every block."""
+        if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
+            raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
+        return [_inverse_root(covariance) for covariance in self.covariances()]
 
     def _whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise, configuration by configuration."""
@@ -544,115 +614,84 @@ class CalibrationProblem(Tabled):
         """L^-1 of the covariances L L' of whole configurations."""
         scatter = self.scatter or Scatter()
         stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        return [(stack, _whitening(stack.covariance(scatter))) for stack in stacks]
+        return [(stack, _inverse_root(stack.covariance(scatter))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.
 
-        Parameters
-        ----------
-        joints
-            Whether the slopes by the joints' angles are wanted.
-        at
-            (P,) values of all parameters at which they are taken [SI]; None for nominal.
+        ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
+        they are taken [SI], None for nominal.
         """
-        slopes = joint_slopes(self._rows, at) if joints else None
-        found = stacked(self.data, slopes, shifts(self._rows, at))
+        slopes = self.joint_slopes(at) if joints else None
+        shifts = self._shifts(at)
+        groups = self._equations.grouped(self.data.configuration[self._equations.row])
+        found = [self._equations.stack(index, slopes, shifts) for index in groups]
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, found, self.touched, stop[self._rows.owners])
-
-    @cached_property
-    def _size(self) -> float:
-        """How far the nominal robot's touches spread [m]."""
-        if self.touches is None:
-            return 0.0
-        return self.touches.size(self._untouched)
-
-    @cached_property
-    def _untouched(self) -> Array:
-        """The residual (m,) of the nominal robot [SI] with touched points at the origin."""
-        x = np.zeros(len(self.parameters.free))
-        return np.concatenate([self._rows.values(block, "residual", x).ravel() for block in self.data.blocks])
-
-    @cached_property
-    def touched(self) -> Things:
-        """Where the nominal robot puts the points and planes that were touched, in its base frame."""
-        if self.touches is None:
-            return ()
-        return [thing.level for thing in self.touches.located(self._untouched)]
-
-    @cached_property
-    def groups(self) -> np.ndarray:
-        """Number of the configuration that every equation belongs to, (m,)."""
-        return np.asarray(self.data.configuration[self.owners])
-
-    @cached_property
-    def owners(self) -> np.ndarray:
-        """Number of the row that every equation of `linearize` belongs to, (m,)."""
-        if self.touches is None:
-            return self._rows.owners
-        return self._rows.owners[self.touches.kept(self.touched)]
-
-    @cached_property
-    def _whitening(self) -> list[Array]:
-        """L^-1 with a row's covariance = L L', for every block."""
-        if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
-            raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
-        return [_whitening(covariance) for covariance in self.covariances()]
-
-    @cached_property
-    def _factors(self) -> list[Array | None]:
-        """By what the numbers of a block's residual (k,) and Jacobian (k, n) are multiplied to be whitened and scaled.
-
-        None where that takes more: components that are correlated, or rows that are not alike.
-        """
-        found: list[Array | None] = []
-        for whitening in self._whitening:
-            diagonal = np.diagonal(whitening[0])
-            factors = None
-            if len(whitening) == 1 and np.count_nonzero(whitening) == len(diagonal):
-                factors = np.concatenate([diagonal, np.outer(diagonal, self.parameters.free.scale).ravel()])
-            found.append(factors)
-        return found
+        return contrasted(self.touches, found, self.touched, stop[self._equations.row])
 
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].
 
-        Parameters
-        ----------
-        reading
-            Of a reading; otherwise without the instrument's part: the robot's own scatter.
-
+        ``reading``: of a reading; otherwise without the instrument's part, the robot's repeatability alone.
         """
-        found = self._of_rows(reading)
+        scatter = self.scatter
+        if scatter is None:
+            found = [block.covariance * reading for block in self.data.blocks]
+        else:
+            slopes = self.joint_slopes(scatter.at) if scatter.joint > 0 else None
+            shifts = self._shifts(scatter.at)
+            stacks = [self._equations.stack(index, slopes, shifts) for index in equation_numbers(self.data)]
+            found = [stack.covariance(scatter, reading) for stack in stacks]
         if self.touches is None:
             return found
         return of_rows(self.touches, self.data, found, self.touched, reading)
 
-    def _of_rows(self, reading: bool) -> list[Array]:
-        """Return the covariances of the rows, each touch's by itself."""
-        scatter = self.scatter
-        if scatter is None:
-            return [block.covariance * reading for block in self.data.blocks]
-        slopes = joint_slopes(self._rows, scatter.at) if scatter.joint > 0 else None
-        # each row as a configuration of its own
-        alone = replace(self.data, configuration=np.arange(len(self.data)))
-        count = len(self._rows.owners)
-        found = {}
-        for stack in stacked(alone, slopes, shifts(self._rows, scatter.at)):
-            place = np.full(count, -1)
-            place[stack.index[:, 0]] = np.arange(len(stack.index))
-            found[stack.index.shape[1]] = (place, stack.covariance(scatter, reading))
-        blocks = []
-        begin = 0
-        for block in self.data.blocks:
-            k = len(block.measurement.components)
-            place, covariance = found[k]
-            blocks.append(covariance[place[begin + k * np.arange(len(block.row))]])
-            begin += k * len(block.row)
-        return blocks
+    def _slopes_by(self, chosen: np.ndarray, at: Array | None) -> list[Array]:
+        """Return the slopes (m, c) of each block by chosen parameters (P,), at values (P,) of all [SI] or nominal."""
+        nominal = self.parameters.nominal if at is None else at
+        alone = self.with_parameters(replace(self.parameters, nominal=nominal, identified=chosen))
+        x = np.zeros(int(chosen.sum()))
+        return [alone._evaluated(block, "jacobian", x)[1].reshape(-1, len(x)) for block in self.data.blocks]
+
+    def joint_slopes(self, at: Array | None = None) -> Array:
+        """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
+
+        They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
+        """
+        joints = {}
+        for name, robot in self.arms.items():
+            for i, kind in enumerate(robot.joint_types):
+                if kind == "revolute":
+                    joints[f"theta{i + 1}"] = i
+                    joints[f"{name}.theta{i + 1}"] = i
+        names = self.parameters.names
+        chosen = np.array([name in joints for name in names])
+        found = np.zeros((len(self._equations.row), max(robot.dof for robot in self.arms.values())))
+        if chosen.any():
+            J = np.concatenate(self._slopes_by(chosen, at))
+            # the same joint of several robots: a row has slopes by those of its own robot alone
+            np.add.at(found.T, [joints[name] for name in names if name in joints], J.T)
+        return found
+
+    def _shifts(self, at: Array | None) -> Array | None:
+        """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
+
+        Zero for other rows, whose own lengths are shifted. A camera or a board that the robot holds elsewhere shifts
+        all points of a view together.
+        """
+        seen = [block.measurement.metres is not None for block in self.data.blocks]
+        if not any(seen):
+            return None
+        names = [own_name(name) for name in self.parameters.names]
+        columns = [SHIFTED.index(name) for name in names if name in SHIFTED]
+        parts = self._slopes_by(np.array([name in SHIFTED for name in names]), at)
+        found = [np.zeros((len(part), 3)) for part in parts]
+        for sums, part, camera in zip(found, parts, seen, strict=True):
+            if camera:
+                np.add.at(sums.T, columns, part.T)
+        return np.concatenate(found)
 
 
 def error_dimensions(block: Block) -> list[str]:
@@ -665,7 +704,7 @@ def error_dimensions(block: Block) -> list[str]:
     return dimensions
 
 
-def _whitening(covariance: Array) -> Array:
+def _inverse_root(covariance: Array) -> Array:
     """Return L^-1 of covariances L L'."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=float)
@@ -673,15 +712,39 @@ def _whitening(covariance: Array) -> Array:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
 
-def _weigh(L: Array, values: Array, scale: Array, found: Array) -> None:
-    """Write L (N or 1, k, k) times values (k, c, N) of every row times scales (c,) into ``found`` (c, k, N)."""
-    nonzero = np.any(L, axis=0).tolist()
-    for i, terms in enumerate(nonzero):
-        first, *others = [j for j, there in enumerate(terms) if there]  # a triangle's diagonal has no zero
-        np.multiply(values[first], _factors(L[:, i, first], scale), out=found[:, i])
-        for j in others:
-            found[:, i] += values[j] * _factors(L[:, i, j], scale)
+def _times(L: Array, values: Array, scale: float | Array = 1.0, out: Array | None = None) -> Array:
+    """Return L (N or 1, k, k) times values (N, k, c) times scales (c,), in ``out`` if given."""
+    if len(L) == 1 and np.count_nonzero(L) == L.shape[1]:  # most instruments: a multiplication each
+        return np.multiply(values, np.diagonal(L[0])[:, None] * scale, out=out)
+    found = np.empty_like(values) if out is None else out
+    found[:] = 0.0
+    for j in range(L.shape[1]):
+        found += L[:, :, j, None] * scale * values[:, j, None]
+    return found
 
 
-def _factors(entries: Array, scale: Array) -> Array:
-    return scale[:, None] * entries
+def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
+    """Return Hayati's parameters that a robot needs: ``beta{i}`` where the axes of joints i and i+1 are near parallel.
+
+    Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
+    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
+    from parallel an axis pair still counts.
+    """
+    return tuple(
+        f"beta{i}"
+        for i in range(1, robot.dof)
+        if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
+    )
+
+
+def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
+    """Return patterns of parameters; ``"auto"`` stands for geometry, Hayati's beta where it is needed, and frames."""
+    if patterns != "auto":
+        return patterns
+    kinds = [block.measurement for block in data.blocks]
+    kept = [GEOMETRY]
+    if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
+        kept.append(BASE)
+    kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
+    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
+    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

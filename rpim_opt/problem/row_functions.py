@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -13,23 +13,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.registry import READY
-from rpim_opt.robot.evaluation import SYMBOLS, evaluate_rows, write_rows
+from rpim_opt.robot.evaluation import SYMBOLS
 from rpim_opt.robot.extensions import Statics
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
-from rpim_opt.robot.parameter_names import (
-    EXPANSION,
-    REFERENCE,
-    frame_of,
-    of_session,
-    of_term,
-    session_prefix,
-    tool_prefix,
-)
+from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Posture, Symbol, Term, Transmission, dependencies
 
@@ -66,20 +57,13 @@ class Structure(NamedTuple):
     several: bool = False
     sessions: tuple[str, ...] = ()
 
-
-class Row(NamedTuple):
-    """The symbols and expressions of one row."""
-
-    x: ca.SX
-    nominal: ca.SX
-    row: ca.SX
-    residual: ca.SX
-    modelled: ca.SX
-    metres: ca.SX
+    def is_pure(self, measurement: Measurement) -> bool:
+        """Return whether the functions depend on nothing but what is stated here."""
+        return measurement in _READY and all(isinstance(term, Transmission) for term in self.terms)
 
 
 class Kept:
-    """Functions that are asked for once: what a calibration works with from its first pass to its last."""
+    """Functions that are asked for once: what a calibration works with from its first iteration to its last."""
 
     def __init__(self) -> None:
         self._functions: dict[tuple[Structure, Measurement], Functions] = {}
@@ -94,9 +78,9 @@ class Kept:
     def __getstate__(self) -> dict[tuple[Structure, Measurement], dict[str, str]]:
         """Return what cannot be asked for elsewhere: answers of a user's functions, as they were."""
         return {
-            key: {name: function.serialize() for name, function in functions.items()}
-            for key, functions in self._functions.items()
-            if not _is_pure(*key)
+            (structure, measurement): {name: function.serialize() for name, function in functions.items()}
+            for (structure, measurement), functions in self._functions.items()
+            if not structure.is_pure(measurement)
         }
 
     def __setstate__(self, kept: dict[tuple[Structure, Measurement], dict[str, str]]) -> None:
@@ -111,124 +95,93 @@ def _restored(text: str) -> ca.Function:
     return ca.Function.deserialize(text)
 
 
-def _is_pure(structure: Structure, measurement: Measurement) -> bool:
-    """Whether the functions depend on nothing but what is asked."""
-    return measurement in _READY and all(isinstance(term, Transmission) for term in structure.terms)
-
-
 def asked(structure: Structure, measurement: Measurement) -> Functions:
-    """Return the functions of a row.
+    """Return the functions of a row; InputError for another number of components than the measurement declares.
 
     Ready measurements are pure, and built once. A user's model or term may read a variable that has changed: it is
     asked anew, and what was built before is taken only when it answers the same expression.
-
-    Raises
-    ------
-    InputError
-        For a residual with more or fewer components than the measurement declares.
     """
-    if _is_pure(structure, measurement):
+    if structure.is_pure(measurement):
         return _ready(structure, measurement)
     with SYMBOLS:
-        expressions = _expressions(structure, measurement)
-        answer = ca.Function("row", list(expressions[:3]), list(expressions[3:]))
-        return _built(answer.serialize())
+        inputs, outputs = _expressions(structure, measurement)
+        return _built(ca.Function("row", inputs, outputs).serialize())
 
 
 @lru_cache(maxsize=MANY)
 def _ready(structure: Structure, measurement: Measurement) -> Functions:
     with SYMBOLS:
-        return _derived(_expressions(structure, measurement))
+        return _derived(*_expressions(structure, measurement))
 
 
 @lru_cache(maxsize=256)
 def _built(answer: str) -> Functions:
     function = ca.Function.deserialize(answer)
     symbols = function.sx_in()
-    return _derived(Row(*symbols, *function.call(symbols)))
+    return _derived(symbols, list(function.call(symbols)))
 
 
-def _derived(of: Row) -> Functions:
-    inputs = [of.x, of.nominal, of.row]
-    # call_rows returns the transposes: the derivative by x stands in rows
-    transposed = ca.densify(-ca.jacobian(of.residual, of.x).T)
+def _derived(inputs: list[ca.SX], outputs: list[ca.SX]) -> Functions:
+    residual, modelled, metres = outputs
+    # evaluated rows are transposed: the derivative by x stands in rows
+    transposed = ca.densify(-ca.jacobian(residual, inputs[0]).T)
     return {
-        "residual": ca.Function("residual", inputs, [of.residual]),
-        "jacobian": ca.Function("jacobian", inputs, [of.residual, transposed]),
-        "modelled": ca.Function("modelled", inputs, [of.modelled]),
-        "metres": ca.Function("metres", inputs, [of.metres]),
+        "residual": ca.Function("residual", inputs, [residual]),
+        "jacobian": ca.Function("jacobian", inputs, [residual, transposed]),
+        "modelled": ca.Function("modelled", inputs, [modelled]),
+        "metres": ca.Function("metres", inputs, [metres]),
     }
 
 
-class _Entries:
-    """Entries of a vector by name, zero where a place is None; a row sees few of many, which are taken as asked for."""
-
-    def __init__(self, vector: ca.SX, places: Mapping[str, int | None]) -> None:
-        self._vector, self._places = vector, places
-
-    def __getitem__(self, name: str) -> Symbol:
-        place = self._places[name]
-        if place is None:
-            return ca.SX(0)
-        return self._vector[place]
-
-    def get(self, name: str) -> Symbol:
-        """Return an entry, zero where there is none of this name."""
-        if name not in self._places:
-            return ca.SX(0)
-        return self[name]
-
-
 @lru_cache(maxsize=16)
-def _places(
-    names: tuple[str, ...], identified: bytes, absent: bytes
-) -> tuple[dict[str, int | None], dict[str, int | None]]:
-    """Return the places of nominal values, None where they are zero, and of deviations, None where they are none."""
-    start: dict[str, int | None] = {name: i for i, name in enumerate(names)}
-    start.update((names[i], None) for i in np.flatnonzero(np.frombuffer(absent, dtype=bool)))
+def _places(names: tuple[str, ...], identified: bytes, absent: bytes) -> tuple[dict[str, int], dict[str, int]]:
+    """Return the places of nominal values that are not zero, and of deviations of what is identified."""
+    there = np.flatnonzero(~np.frombuffer(absent, dtype=bool))
     free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
-    return start, dict.fromkeys(names) | {names[i]: k for k, i in enumerate(free)}
+    return {names[i]: int(i) for i in there}, {names[i]: k for k, i in enumerate(free)}
 
 
-class _Parameters(NamedTuple):
-    """The parameters of a row by name: where they start, and the deviations of those that are identified."""
+class _Parameters:
+    """The parameters of a row by name: symbols are taken as asked for, since a row sees few of many."""
 
-    x: ca.SX
-    nominal: ca.SX
-    start: _Entries
-    deviation: _Entries
+    def __init__(self, of: Structure) -> None:
+        self._start, self._free = _places(of.names, of.identified, of.absent)
+        self.x = ca.SX.sym("x", len(self._free))
+        self.nominal = ca.SX.sym("nominal", len(of.names))
 
-    @classmethod
-    def of(cls, names: tuple[str, ...], identified: bytes, absent: bytes) -> _Parameters:
-        start, deviation = _places(names, identified, absent)
-        x = ca.SX.sym("x", sum(place is not None for place in deviation.values()))
-        nominal = ca.SX.sym("nominal", len(names))
-        return cls(x, nominal, _Entries(nominal, start), _Entries(x, deviation))
+    def start(self, name: str) -> Symbol:
+        """Return the nominal value, zero where there is none of this name."""
+        return self.nominal[self._start[name]] if name in self._start else ca.SX(0)
+
+    def deviation(self, name: str) -> Symbol:
+        """Return the deviation, zero where it is not identified."""
+        return self.x[self._free[name]] if name in self._free else ca.SX(0)
 
     def value(self, name: str) -> Symbol:
-        """Return a parameter, zero where there is none of this name."""
-        return self.start.get(name) + self.deviation.get(name)
+        """Return the sum of both."""
+        return self.start(name) + self.deviation(name)
 
-    def place(self, prefix: str) -> list[ca.SX]:
+    def frame(self, prefix: str) -> list[ca.SX]:
         """Return the factors of the frame whose six parameters begin with a prefix."""
         names = [prefix + component for component in FRAME]
-        return placed([self.start[name] for name in names], [self.deviation[name] for name in names])
+        return placed([self.start(name) for name in names], [self.deviation(name) for name in names])
 
     def chosen(self, prefixes: tuple[str, ...], chosen: ca.SX) -> list[ca.SX]:
         """Return the factors of one of several frames, whose entry of ``chosen`` is 1; the identity where all are 0."""
         start, moved = (
-            [ca.dot(chosen, ca.vertcat(*(of.get(p + c) for p in prefixes))) for c in FRAME]
+            [ca.dot(chosen, ca.vertcat(*(of(prefix + component) for prefix in prefixes))) for component in FRAME]
             for of in (self.start, self.deviation)
         )
         return placed(start, moved)
 
 
-def _expressions(of: Structure, measurement: Measurement) -> Row:
-    p = _Parameters.of(of.names, of.identified, of.absent)
+def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], list[ca.SX]]:
+    """Return deviations, nominal values and the row; residual, modelled values, and metres of a residual of one."""
+    p = _Parameters(of)
     stated = of.loads.symbols(len(of.joint_types), len(of.markers))
     session = ca.SX.sym("session", len(of.sessions))
     y = ca.SX.sym("y", len(measurement.columns))
-    transforms = _reflectors(of, measurement, p, stated, session)
+    transforms = [_reflector(of, measurement, p, stated, session, point) for point in range(len(of.markers))]
     own = _keywords(of, measurement, p, stated)
     modelled = ca.densify(measurement.model(*transforms, **own))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
@@ -238,35 +191,30 @@ def _expressions(of: Structure, measurement: Measurement) -> Row:
     metres = ca.SX(1)
     if measurement.metres is not None:
         metres = measurement.metres(*transforms, **own)
-    return Row(p.x, p.nominal, ca.vertcat(*stated, session, y), residual, modelled, ca.densify(metres))
+    return [p.x, p.nominal, ca.vertcat(*stated, session, y)], [residual, modelled, ca.densify(metres)]
 
 
-def _reflectors(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX) -> list[ca.SX]:
-    """Return the transform of each point's reflector in the frame that measures."""
-    found = []
-    for point, marker in enumerate(of.markers):
-        posture = of.loads.posture(of.joint_types, p.start.__getitem__, stated, point)
-        factors = []
-        if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
-            factors += p.place("base_")
-        if of.sessions:
-            factors += p.chosen(of.sessions, session)
-        factors += _grown(chain(of.joint_types, posture, p.value, of.terms), p, posture.columns.get("temperature"))
-        found.append(product([*factors, *p.place(tool_prefix(marker))]))
-    return found
-
-
-def _grown(flange: list[ca.SX], p: _Parameters, temperature: Symbol | None) -> list[ca.SX]:
-    """Return the flange's factors when all lengths have grown with temperature: it is as far again from the base."""
-    if temperature is None:
-        return flange
-    growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
-    return [translation(*ca.vertsplit(growth * product(flange)[:3, 3])), *flange]
+def _reflector(
+    of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX, point: int
+) -> ca.SX:
+    """Return the transform of a point's reflector in the frame that measures."""
+    posture = of.loads.posture(of.joint_types, p.start, stated, point)
+    factors = []
+    if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
+        factors += p.frame("base_")
+    if of.sessions:
+        factors += p.chosen(of.sessions, session)
+    flange = chain(of.joint_types, posture, p.value, of.terms)
+    temperature = posture.columns.get("temperature")
+    if temperature is not None:  # all lengths have grown: the flange is as far again from the base
+        growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
+        factors.append(translation(*ca.vertsplit(growth * product(flange)[:3, 3])))
+    return product([*factors, *flange, *p.frame(tool_prefix(of.markers[point]))])
 
 
 def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> dict[str, Symbol]:
     """Return the frames, parameters and columns that a measurement's model takes by name."""
-    own = {name: product(p.place(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
+    own: dict[str, Symbol] = {name: product(p.frame(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
     in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
     for name in measurement.parameters:
         if not name.startswith(in_frames):
@@ -275,16 +223,12 @@ def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: S
     known = of.loads.named(stated) | {"q": ca.reshape(stated.q, -1, points)}
     if stated.torque.numel():
         known["torque"] = ca.reshape(stated.torque, -1, points)
-    return own | _seen(measurement, known)
-
-
-def _seen(measurement: Measurement, known: Mapping[str, Symbol]) -> dict[str, Symbol]:
-    """Return what a measurement sees besides transforms and parameters, by keyword."""
     for name in measurement.sees:
         if name not in known:
             where = f"measurement {measurement.name}"
             raise InputError(where, f"data without '{name}', which it sees", "data that state it in every row")
-    return {name: known[name] for name in measurement.sees}
+        own[name] = known[name]
+    return own
 
 
 class Loads(NamedTuple):
@@ -327,9 +271,7 @@ class Loads(NamedTuple):
         weight = None
         if self.gravity is not None:
             weight = Statics(joint_types, q, nominal, self.gravity, stated.payload if self.payload else None)
-        directions = None
-        if self.approach:
-            directions = ca.vertsplit(stated.approach[at])
+        directions = ca.vertsplit(stated.approach[at]) if self.approach else None
         return Posture(q, torque, directions, weight, self.named(stated))
 
     def named(self, stated: Stated) -> dict[str, Symbol]:
@@ -338,7 +280,7 @@ class Loads(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """The symbols of what a row states of its joints, in the order in which `columns` lays it side by side.
+    """The symbols of what a row states of its joints, in the order in which `loads_in` lays it side by side.
 
     ``q``, ``torque`` and ``approach`` are (dof x points, 1), point by point; ``payload`` (1, 1), ``columns`` (c, 1).
     """
@@ -405,7 +347,7 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
 def loads_in(robot: Robot, block: Block) -> list[Array]:
     """Return what rows state of the joints of the model, (N, c) each, in the order of `Stated`."""
     N = len(block.y)
-    found = []
+    found = [(block.q @ robot.joint_map.T).reshape(N, -1)]
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
         found.append((block.torque @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
     if block.payload is not None:
@@ -417,22 +359,18 @@ def loads_in(robot: Robot, block: Block) -> list[Array]:
 
 def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
     """Refuse to identify from data of a robot what needs columns that they do not have."""
-    free = parameters.free.names
-    sided = [name for name in free if (name.startswith("backlash") and of_term(name)) or _sees_approach(robot, name)]
-    if sided and all(block.approach is None for block in data.blocks):
-        found = f"'{sided[0]}' without directions of approach"
-        raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
+    for name in parameters.free.names:
+        sided = name.startswith("backlash") and of_term(name)
+        if not sided and any(not isinstance(term, Transmission) for term in robot.model.terms):
+            sided = dependencies(robot.model, robot.joint_types, lambda other, name=name: other == name).approach
+        if sided and all(block.approach is None for block in data.blocks):
+            found = f"'{name}' without directions of approach"
+            raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
     needed = Needs.of(robot, parameters).columns
     for block in data.blocks:
         for name in sorted({*needed, *block.measurement.extra} - {*block.columns}):
             accepted = f"a column '{name}' of the table, or Dataset.of(..., columns={{'{name}': ...}})"
             raise InputError("data", f"no column '{name}', which a term or a measurement sees", accepted)
-
-
-def _sees_approach(robot: Robot, name: str) -> bool:
-    if all(isinstance(term, Transmission) for term in robot.model.terms):
-        return False
-    return dependencies(robot.model, robot.joint_types, lambda other: other == name).approach
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:
@@ -442,11 +380,10 @@ def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, me
     """
     if not Needs.of(robot, parameters).torques or measured_torques(data) == measured:
         return
-    where = "compliances"
     if measured:
         accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"
-        raise InputError(where, "joint torques", accepted)
-    raise InputError(where, "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
+        raise InputError("compliances", "joint torques", accepted)
+    raise InputError("compliances", "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
 
 
 def bearing(
@@ -456,14 +393,11 @@ def bearing(
     payload: float | Array | None = None,
     columns: Mapping[str, Array] = MappingProxyType({}),
 ) -> Dataset:
-    """Return rows of one point in one block with what their joints bear.
+    """Return rows of one point in one block with what their joints bear, as rows of a problem with data ``like`` these.
 
-    Directions of approach are not known, 0, where the data of a problem ``like`` these state them: the joints are in
-    the middle of their backlash.
-
-    ``data``: the rows; ``like``: data of the problem whose rows these are to be; ``torque``: (N, dof) joint torques
-    [Nm]; ``payload``: mass at the flange [kg], one or (N,); ``columns``: further columns by name [SI], one number or
-    (N,).
+    ``torque``: (N, dof) joint torques [Nm]; ``payload``: mass at the flange [kg], one or (N,); ``columns``: further
+    columns by name [SI], one number or (N,). Directions of approach are 0 where those data state them: the joints are
+    in the middle of their backlash.
     """
     (block,) = data.blocks
     if torque is not None:
@@ -482,103 +416,3 @@ def repeatable(block: Block) -> Array:
     """Return what is the same (N, c) in rows that repeat a measurement: joint values and a model's own columns."""
     seen = [block.columns[name][:, None] for name in block.measurement.sees if name in block.columns]
     return np.hstack([block.q.reshape(len(block.row), -1), *seen])
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """Rows of a dataset, evaluated by the CasADi functions of their blocks.
-
-    ``arms`` are the nominal robots by name, ``kept`` the functions that were asked for once, if any were.
-    """
-
-    arms: Mapping[str, Robot]
-    parameters: Parameters
-    data: Dataset
-    kept: Kept | None = None
-
-    def of(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
-        """Return the results of a function of `Functions` for rows of a block at x (n,), (N, ...) each."""
-        function = self.functions(block)[what]
-        with phase("evaluation"):
-            return evaluate_rows(function, [x, self.parameters.nominal], self._stated(block)[part])
-
-    def values(self, block: Block, what: str, x: Array) -> Array:
-        """Return the vector (N, c) of a function of every row of a block at x (n,)."""
-        return self.of(block, what, x)[0][:, 0]
-
-    def write(self, block: Block, x: Array, part: slice, found: Array, factors: Array) -> None:
-        """Write [J r] of N rows, each entry times its factor, into ``found`` (n + 1, k, N)."""
-        into = [found[-1:], found[:-1].transpose(1, 0, 2)]
-        function = self.functions(block)["jacobian"]
-        rows = self._stated(block)[part]
-        with phase("evaluation"):
-            write_rows(function, [x, self.parameters.nominal], rows, into, factors)
-
-    def slopes_by(self, chosen: np.ndarray, at: Array | None = None) -> list[Array]:
-        """Return the slopes (m, c) of each block by chosen parameters (P,), at values (P,) of all [SI] or nominal."""
-        nominal = self.parameters.nominal if at is None else at
-        alone = replace(self, parameters=replace(self.parameters, nominal=nominal, identified=chosen))
-        x = np.zeros(int(chosen.sum()))
-        return [alone.of(block, "jacobian", x)[1].reshape(-1, len(x)) for block in self.data.blocks]
-
-    @cached_property
-    def owners(self) -> np.ndarray:
-        """Number of the row of every equation (m,)."""
-        rows = [np.repeat(block.row, len(block.measurement.components)) for block in self.data.blocks]
-        return np.concatenate(rows)
-
-    def functions(self, block: Block) -> Functions:
-        """Return the functions of a block's rows."""
-        if block not in self._structures:
-            self._structures[block] = self._structure(block)
-        return (self.kept or asked)(self._structures[block], block.measurement)
-
-    @cached_property
-    def _structures(self) -> dict[Block, Structure]:
-        return {}
-
-    @cached_property
-    def _arguments(self) -> dict[Block, Array]:
-        return {}
-
-    def _structure(self, block: Block) -> Structure:
-        """Return what the functions of a block's rows depend on, besides its measurement."""
-        p = self.parameters
-        absent = (p.nominal == 0) & ~p.identified
-        robot = self.arms[block.robot]
-        names = p.names
-        if block.robot:  # those of other robots keep their long names, which nobody asks for
-            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-        needs = Needs.of(robot, p.of_robot(block.robot))
-        return Structure(
-            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture,
-            loads_of(robot, needs, self.data, block), tuple(robot.model.terms), len(self.arms) > 1,
-            self._sessions[block.robot],
-        )  # fmt: skip
-
-    def _stated(self, block: Block) -> Array:
-        """Return joint values of the model, what the joints bear, sessions and measured values, side by side."""
-        if block not in self._arguments:
-            robot = self.arms[block.robot]
-            joints = (block.q.reshape(-1, block.q.shape[-1]) @ robot.joint_map.T).reshape(len(block.y), -1)
-            columns = loads_in(robot, block)
-            self._arguments[block] = np.hstack([joints, *columns, self._of_sessions(block), block.y])
-        return self._arguments[block]
-
-    @cached_property
-    def _sessions(self) -> dict[str, tuple[str, ...]]:
-        """The prefixes of the sessions of every robot that shift anything."""
-        p = self.parameters
-        present = p.take(np.flatnonzero(p.identified | (p.nominal != 0)))
-        return {
-            robot: tuple(dict.fromkeys(frame_of(name) for name in present.of_robot(robot).names if of_session(name)))
-            for robot in self.arms
-        }
-
-    def _of_sessions(self, block: Block) -> Array:
-        """Return 1 where a row is of a session that shifts anything, (N, sessions)."""
-        known = self._sessions[block.robot]
-        if not known:
-            return np.zeros((len(block.row), 0))
-        mine = np.array([session_prefix(name) for name in block.session_names], dtype=object)
-        return np.column_stack([mine == prefix for prefix in known]).astype(float)

@@ -16,7 +16,7 @@ from rpim_opt.data.measurements.contact import revisit
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.identified import Machine, require_robot
+from rpim_opt.problem.linear import Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.row_functions import bearing

@@ -31,7 +31,7 @@ from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
-from rpim_opt.problem.observability import combination, observe
+from rpim_opt.problem.design import combination, observe
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import charts, summary
 from rpim_opt.report.chart import Picture, tag

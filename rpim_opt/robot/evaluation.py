@@ -67,21 +67,8 @@ def evaluate_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -
     if vectorized is None:
         return call_rows(function, shared, rows)
     results = [np.empty((c, r, len(rows))) for r, c in vectorized.shapes]
-    _evaluate(vectorized, shared, rows, results, None)
+    _evaluate(vectorized, shared, rows, results)
     return [values.transpose(2, 0, 1) for values in results]
-
-
-def write_rows(
-    function: ca.Function, shared: Sequence[Array], rows: Array, results: Sequence[Array], factors: Array
-) -> None:
-    """Write what `evaluate_rows` returns, times factors, into arrays."""
-    vectorized = _quickest(function, len(shared), len(rows))
-    if vectorized is not None:
-        _evaluate(vectorized, shared, rows, results, factors)
-        return
-    by_output = _split(factors[:, None], results)
-    for into, factor, values in zip(results, by_output, call_rows(function, shared, rows), strict=True):
-        np.multiply(values.transpose(1, 2, 0), factor, out=into)
 
 
 def _split(numbers: Array, results: Sequence[Array]) -> list[Array]:
@@ -195,10 +182,8 @@ def _memory(vectorized: _Vectorized, _thread: int) -> _Memory:
     return _Memory(vectorized)
 
 
-def _evaluate(
-    vectorized: _Vectorized, shared: Sequence[Array], rows: Array, results: Sequence[Array], factors: Array | None
-) -> None:
-    """Write the numbers of a table (N, k), times factors (n,), into arrays (c, r, N)."""
+def _evaluate(vectorized: _Vectorized, shared: Sequence[Array], rows: Array, results: Sequence[Array]) -> None:
+    """Write the numbers of a table (N, k) into arrays (c, r, N)."""
 
     def evaluate(begin: int) -> None:
         memory = _memory(vectorized, threading.get_ident())
@@ -213,8 +198,6 @@ def _evaluate(
             memory.table[:, count:] = rows[part.stop - 1][:, None]  # stands for those missing
             memory.rows[0]()
             numbers = memory.numbers[:, :count]
-            if factors is not None:
-                numbers *= factors[:, None]
             for into, values in zip(results, _split(numbers, results), strict=True):
                 into[:, :, part] = values
 

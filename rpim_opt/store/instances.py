@@ -29,10 +29,10 @@ from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance,
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record, Requirement
 from rpim_opt.data.tables.reading import read_data, robodk_columns
-from rpim_opt.problem.identified import identified_of
+from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.linear import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel

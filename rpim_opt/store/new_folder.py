@@ -21,7 +21,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.problem.identified import identifiable
+from rpim_opt.problem.problem import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import Described, placed, same_place

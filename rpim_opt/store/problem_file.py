@@ -20,8 +20,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.identified import identifiable
-from rpim_opt.problem.scatter import Scatter
+from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.problem import identifiable
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame

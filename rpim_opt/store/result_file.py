@@ -34,11 +34,10 @@ from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.data.record import Record
-from rpim_opt.problem.identified import around
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.linear import LinearModel, around
+from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.global_start import JointMapping
-from rpim_opt.problem.scatter import Scatter
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Curve, Model, Transmission, transmission

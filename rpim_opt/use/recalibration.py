@@ -25,10 +25,10 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Record
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+from rpim_opt.problem.multi_robot import knowing_sessions
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.several import knowing_sessions
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.store.result_file import content

@@ -26,7 +26,7 @@ from rpim_opt.bayes.evidence import (
 )
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.problem.scatter import Stack
+from rpim_opt.problem.noise import Stack
 
 NOISE = ("position", "orientation", "joint")
 

@@ -11,7 +11,6 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
 from rpim_opt.bayes.outliers import clustered, error_ratios, resistant_fit, suspects, unexplained
-from rpim_opt.problem.scatter import joint_slopes
 
 POSITION = ro.load("position").problem
 
@@ -22,7 +21,7 @@ def measured(
     """Return the problem with positions of a robot that deviates by x, instrument noise and a scatter of its own."""
     rng = np.random.default_rng(seed)
     blocks = []
-    T = joint_slopes(problem._rows)
+    T = problem.joint_slopes()
     for block, y in zip(problem.data.blocks, problem.modelled(x), strict=True):
         e = np.einsum("nij,nj->ni", np.linalg.cholesky(block.covariance), rng.normal(size=y.shape))
         e = e + scatter * rng.normal(size=y.shape)

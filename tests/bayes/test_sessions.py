@@ -14,8 +14,8 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.problem.parts import PartitionedProblem
-from rpim_opt.problem.several import unknown_sessions
+from rpim_opt.problem.blocks import PartitionedProblem
+from rpim_opt.problem.multi_robot import unknown_sessions
 from rpim_opt.robot.parameter_names import of_session
 from rpim_opt.robot.parameters import model_parameters
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL

@@ -9,8 +9,8 @@ import rpim_opt as ro
 from rpim_opt.calibration import influence
 from rpim_opt.calibration.leverage import Influence
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.parts import PartitionedProblem
 
 
 def without(model: LinearModel, number: int) -> LinearModel:

@@ -15,7 +15,7 @@ from rpim_opt.calibration.baselines import gradient_descent
 from rpim_opt.calibration.held_out import refit_all
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.data.record import Requirement
-from rpim_opt.problem.parts import PartitionedProblem
+from rpim_opt.problem.blocks import PartitionedProblem
 from tests.simulate import simulated
 
 IDENTIFY = ("theta[23]", "d4", "tool_[xyz]", "base_*")

@@ -13,7 +13,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.row_functions import Kept, _built, _ready, asked
+from rpim_opt.problem.row_functions import Kept, asked
 
 ZERO = 0.0
 COLUMNS = {"z": "length"}
@@ -120,23 +120,20 @@ def test_the_same_answer_builds_no_second_function() -> None:
     measurement, change = by_closure()
     problem = heights(measurement)
     block = problem.data.blocks[0]
-    first = problem._rows.functions(block)
+    first = problem.functions(block)
     change(1.0)
-    second = problem._rows.functions(block)
+    second = problem.functions(block)
     change(0.0)
-    assert problem._rows.functions(block) is first
+    assert problem.functions(block) is first
     assert second is not first
     twin = ro.data.Measurement("height", lambda T: T[2, 3] + 0.0, COLUMNS)
-    assert heights(twin)._rows.functions(replace(block, measurement=twin)) is first
+    assert heights(twin).functions(replace(block, measurement=twin)) is first
 
 
 def test_ready_measurements_are_built_once() -> None:
     problem = ro.load("pose").problem
     block = problem.data.blocks[0]
-    assert problem._rows.functions(block) is problem._rows.functions(block)
-    hits = _built.cache_info()
-    _ready(*next(iter(problem.frozen().asked._functions)))
-    assert _built.cache_info() == hits
+    assert problem.functions(block) is problem.functions(block)
 
 
 def test_a_model_that_imitates_a_ready_one_gives_its_numbers() -> None:
@@ -180,10 +177,10 @@ def test_a_kept_function_is_the_one_of_its_structure() -> None:
     problem = heights(by_closure()[0])
     one = replace(problem, asked=kept)
     block = problem.data.blocks[0]
-    both = one._rows.functions(block)
+    both = one.functions(block)
     other = one.identifying(problem.parameters.identify(["base_z"]).identified)
-    assert other._rows.functions(block)["jacobian"].size_in(0) == (1, 1)
-    assert one._rows.functions(block) is both
+    assert other.functions(block)["jacobian"].size_in(0) == (1, 1)
+    assert one.functions(block) is both
 
 
 def test_a_wrong_number_of_components_is_named() -> None:

@@ -105,10 +105,10 @@ def test_a_nominal_compliance_bends_a_robot_too() -> None:
 
 def test_what_no_parameter_asks_for_is_not_evaluated() -> None:
     problem, _ = simulated(("a?", "ecc2_*"), configurations=4)
-    assert problem._rows._structure(problem.data.blocks[0]).loads.gravity is None
+    assert problem._structure(problem.data.blocks[0]).loads.gravity is None
     for pattern in ("compliance3", "bend3_4x"):
         asking = problem.with_parameters(problem.parameters.identify([pattern]))
-        assert asking._rows._structure(problem.data.blocks[0]).loads.gravity is ARM.gravity
+        assert asking._structure(problem.data.blocks[0]).loads.gravity is ARM.gravity
 
 
 def test_backlash_needs_directions_of_approach() -> None:

@@ -13,8 +13,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.convex.trust import Squares, trusted_rows
-from rpim_opt.problem import parts as parts_module
-from rpim_opt.problem.parts import PartitionedProblem, in_parts, on_cluster, whole_configurations
+from rpim_opt.problem import blocks as parts_module
+from rpim_opt.problem.blocks import PartitionedProblem, in_parts, on_cluster, whole_configurations
 
 
 def thirds(problem: ro.CalibrationProblem) -> list[np.ndarray]:

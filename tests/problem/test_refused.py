@@ -15,7 +15,7 @@ from rpim_opt.data.measurements.plane import plane
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.noise import declared_noise
-from rpim_opt.problem.parts import partitions
+from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.problem.workspace import Machine, postures_at, touched_place, within_box

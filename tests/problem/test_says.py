@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import _angle_units, contact_sentences, moved_far, rounded_joints, shared_rows
-from tests.simulate import ARM, simulated
+from rpim_opt.problem.diagnosis import contact_sentences, moved_far, rounded_joints, shared_rows
+from tests.simulate import simulated
 
 
 def sockets(names: tuple[str, ...], stated: bool = False) -> ro.CalibrationProblem:
@@ -66,13 +66,6 @@ def test_rounded_joints_are_named_where_that_explains_the_fit() -> None:
     assert made
     assert 1e-4 < np.median(made) < 3e-3
     assert list(rounded_joints(problem, float(np.median(made)))) == []
-
-
-def test_sliding_joints_have_no_degrees() -> None:
-    gantry = ro.robot.Robot("gantry", np.zeros((2, 5)), ("prismatic", "prismatic"))
-    assert list(_angle_units(gantry, np.array([[100.0, 3.0]]))) == []
-    assert list(_angle_units(ARM, np.full((2, 6), 100.0))) == ["joints reach 5730 deg: degrees given as radians?"]
-    assert list(_angle_units(ARM, np.full((2, 6), 0.01))) == ["no joint leaves 6.3 deg: radians given as degrees?"]
 
 
 def test_readings_of_one_configuration_are_said_to_agree() -> None:

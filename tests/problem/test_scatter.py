@@ -9,9 +9,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.problem.blocks import reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.parts import reduced
-from rpim_opt.problem.scatter import Scatter, joint_slopes
+from rpim_opt.problem.noise import Scatter
 
 SCATTER = Scatter(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8)
 NAMES = ("position", "pose", "markers", "mixed", "cable", "distance")
@@ -35,7 +35,7 @@ def dense(problem: ro.CalibrationProblem, scatter: Scatter) -> Array:
         R[at : at + len(C), at : at + len(C)] = scatter.instrument**2 * C
         at += len(C)
     R += np.diag(scatter.position**2 * np.array(lengths) + scatter.orientation**2 * np.array(angles))
-    T = joint_slopes(problem._rows, scatter.at)
+    T = problem.joint_slopes(scatter.at)
     same = np.equal.outer(groups, groups)
     return R + scatter.joint**2 * np.where(same, T @ T.T, 0.0)
 
@@ -100,7 +100,7 @@ def test_without_a_size_nothing_changes() -> None:
 def test_slopes_by_the_joints_are_differences() -> None:
     problem = ro.load("pose").problem
     h = 1e-6
-    for joint, slopes in enumerate(joint_slopes(problem._rows).T):
+    for joint, slopes in enumerate(problem.joint_slopes().T):
         ahead = np.zeros(problem.robot.dof)
         ahead[joint] = h
         moved = []
@@ -119,14 +119,14 @@ def test_slopes_are_taken_where_the_scatter_says() -> None:
     values[p.identified] = p.free.values(x)
     theta = [p.free.names.index(f"theta{i}") for i in range(2, 6)]
     J = problem.jacobian(x)
-    assert np.allclose(joint_slopes(problem._rows, values)[:, 1:5], J[:, theta], atol=1e-9)
+    assert np.allclose(problem.joint_slopes(values)[:, 1:5], J[:, theta], atol=1e-9)
 
 
 def test_sliding_joints_do_not_turn() -> None:
     problem = ro.load("scara").problem
     slides = [i for i, kind in enumerate(problem.robot.joint_types) if kind == "prismatic"]
     assert slides
-    assert not joint_slopes(problem._rows)[:, slides].any()
+    assert not problem.joint_slopes()[:, slides].any()
 
 
 def test_robots_part_and_reading_differ_by_the_instrument() -> None:

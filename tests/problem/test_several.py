@@ -12,7 +12,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.problem.scatter import joint_slopes
 from tests.simulate import ALL, ARM, simulated
 
 SIGMA = 5e-5
@@ -122,9 +121,9 @@ def test_configurations_labels_scatter_and_gravity_are_each_robots_own() -> None
     assert whole.labels[0] == "left:1"
     assert whole.data.q.shape == (35, 6)
     m = 3 * 20
-    slopes = joint_slopes(whole._rows)
-    assert np.array_equal(slopes[:m], joint_slopes(left._rows))
-    assert np.array_equal(slopes[m:, :5], joint_slopes(right._rows))
+    slopes = whole.joint_slopes()
+    assert np.array_equal(slopes[:m], left.joint_slopes())
+    assert np.array_equal(slopes[m:, :5], right.joint_slopes())
     assert not slopes[m:, 5].any()
     x = np.zeros(len(whole.parameters.free))
     rough = ro.problem.Scatter(position=1e-4, joint=1e-4)
@@ -325,7 +324,7 @@ def test_more_equations_than_are_kept_come_in_parts(monkeypatch: pytest.MonkeyPa
     left, right, _ = two(counts=(30, 30))
     whole = ro.together(left=left, right=right, shared=TOOL)
     expected = ro.calibrate(whole, ro.tikhonov, weight=1.0)
-    monkeypatch.setattr("rpim_opt.problem.parts.KEPT", 60)
+    monkeypatch.setattr("rpim_opt.problem.blocks.KEPT", 60)
     found = ro.calibrate(whole, ro.tikhonov, weight=1.0)
     assert found.converged
     assert np.abs(found.z - expected.z).max() < 1e-8

@@ -15,9 +15,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem import parts as streaming
+from rpim_opt.problem import blocks as streaming
+from rpim_opt.problem.blocks import PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.parts import PartitionedProblem, on_cluster, partitions, reduced
 from rpim_opt.problem.problem import CalibrationProblem
 
 PARTS, ROWS = 5, 1100
@@ -74,7 +74,7 @@ def test_a_triangle_says_all_that_a_squared_loss_sees(whole: CalibrationProblem)
 @pytest.mark.parametrize("name", ["position", "mixed", "pose", "tracker", "markers"])
 @pytest.mark.parametrize("few", [3, 7, 1024])
 def test_rows_that_are_written_where_they_are_reduced_say_the_same(name: str, few: int, monkeypatch) -> None:
-    monkeypatch.setattr("rpim_opt.problem.parts.FEW", few)
+    monkeypatch.setattr("rpim_opt.problem.blocks.FEW", few)
     problem = ro.load(name).problem
     x = 0.1 * problem.parameters.free.scale
     rows, found = problem.linearize(x), reduced(problem, x)
@@ -206,7 +206,7 @@ def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.D
 
 
 def jacobian_of(problem: CalibrationProblem):
-    return problem._rows.functions(problem.data.blocks[0])["jacobian"]
+    return problem.functions(problem.data.blocks[0])["jacobian"]
 
 
 def test_ready_measurements_stay_the_same_in_other_processes() -> None:
@@ -244,7 +244,7 @@ def test_rows_are_whitened_by_their_covariances(alike: bool, whole: CalibrationP
 
 def test_what_workers_get_holds_no_function_that_they_know(whole: CalibrationProblem) -> None:
     """A function that arrives anew with every part would be prepared anew for its rows."""
-    frozen = streaming.sketch(whole.frozen())
+    frozen = whole.on(whole.data.take([0])).frozen()
     frozen.linearize(0 * whole.parameters.free.nominal)
     sent = pickle.dumps(frozen)
     assert len(sent) < 20_000  # functions of this arm take twenty times that

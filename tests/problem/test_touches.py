@@ -15,8 +15,8 @@ from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.outliers import clustered, error_ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
-from rpim_opt.problem.scatter import Scatter, stacked
-from rpim_opt.problem.touches import Plane, Touches, contrasted
+from rpim_opt.problem.contact import Plane, Touches, contrasted
+from rpim_opt.problem.noise import Equations, Scatter
 
 SIGMA = 3e-5
 NAMES = ("A", "B", "C", "D")
@@ -151,8 +151,10 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
     data = replace(data, blocks=tuple(blocks))
     slopes = rng.normal(size=(found.equations, 6)) if joints else None
     scatter = Scatter(position=4e-5, joint=2e-5 * joints)
-    stacks = contrasted(found, stacked(data, slopes), where, np.arange(found.equations) // 3)
-    left, moved = found.centred(raw, J)
+    of = Equations.of(data)
+    whole = [of.stack(index, slopes) for index in of.grouped(data.configuration[of.row])]
+    stacks = contrasted(found, whole, where, np.arange(found.equations) // 3)
+    left, moved = found.centred(raw, J, 0.0)
     r, A = (found.contrasts(v.reshape(found.equations, -1), where) for v in (left, moved))
     H, h, square, count = 0.0, 0.0, 0.0, 0
     for stack in stacks:

@@ -70,19 +70,6 @@ def test_threads_change_no_bit(cores: int, monkeypatch: pytest.MonkeyPatch) -> N
     require_same(evaluation.evaluate_rows(function, SHARED, rows), call_rows(function, SHARED, rows))
 
 
-@pytest.mark.parametrize("pays", [1, 10**9])
-def test_values_are_written_with_their_factors_wherever_they_are_wanted(pays: int, monkeypatch) -> None:
-    monkeypatch.setattr(evaluation, "PAYS", pays)
-    function, rows = every_operation(), table(300)
-    wanted = call_rows(function, SHARED, rows)
-    factors = np.arange(1.0, 1 + sum(values[0].size for values in wanted))
-    for step in (1, 3):
-        found = [np.zeros((*values.shape[1:], step * len(rows)))[:, :, ::step] for values in wanted]
-        evaluation.write_rows(function, SHARED, rows, found, factors)
-        whole = np.concatenate([values.reshape(len(rows), -1) for values in wanted], axis=1) * factors
-        assert np.array_equal(np.concatenate([into.reshape(-1, len(rows)) for into in found]), whole.T)
-
-
 def test_few_rows_are_evaluated_one_after_the_other() -> None:
     function = every_operation()
     assert evaluation._quickest(function, 2, evaluation.PAYS - 1) is None

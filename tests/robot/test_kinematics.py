@@ -86,7 +86,7 @@ def test_a_jacobian_takes_few_operations() -> None:
     """Twelve an entry, where products from the left need thirty: what every evaluation of a table costs."""
     problem = simulated(ALL)[0]
     block = problem.data.blocks[0]
-    jacobian = problem._rows.functions(block)["jacobian"]
+    jacobian = problem.functions(block)["jacobian"]
     entries = 3 * len(problem.parameters.free)
     assert jacobian.n_instructions() <= 16 * entries
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.parts import PartitionedProblem
-from rpim_opt.problem.scatter import Scatter
+from rpim_opt.problem.blocks import PartitionedProblem
+from rpim_opt.problem.noise import Scatter
 from rpim_opt.use.export import export_ur_calibration, export_urdf, write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved

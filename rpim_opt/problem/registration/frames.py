@@ -16,10 +16,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.problem.identified import identifiable
+from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.parts import in_parts
-from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
 from rpim_opt.problem.registration.certified import CertifiedStart, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import (
@@ -33,7 +32,6 @@ from rpim_opt.problem.registration.closed_forms import (
     transforms,
 )
 from rpim_opt.problem.registration.points import Candidates, fit_arms
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm

@@ -14,10 +14,10 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import joined, three_digits
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import proper
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
-from rpim_opt.problem.source import Source
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.problem.scatter import Stack
+from rpim_opt.problem.noise import Stack, equation_numbers
 
 UNKNOWNS = 3
 """Of a point its coordinates; of a plane a distance and two tilts."""
@@ -186,7 +186,6 @@ CLOSE = 0.05
 ROUNDING = 1e-12
 """Relative size of a covariance that is none."""
 Things = Sequence[Point | Plane]
-PER_CONFIGURATION = ("index", "instrument", "length", "angle", "joint", "unit")
 
 
 class Tie(NamedTuple):
@@ -222,31 +221,27 @@ class Touches:
         """Return the touches of a dataset; None where there are none."""
         at: dict[str, list[int]] = {}
         planar: dict[str, bool] = {}
-        stated: list[tuple[np.ndarray, Block, int, tuple[str, str]]] = []
-        start = 0
-        for block in data.blocks:
-            each = len(block.measurement.components)
-            first = start + each * np.arange(len(block.row))
-            start += each * len(block.row)
+        stated: list[tuple[np.ndarray, Block, int]] = []
+        for block, numbers in zip(data.blocks, equation_numbers(data), strict=True):
             if block.touched is None:
                 continue
             if not block.measurement.touching:
-                for i, (one, other) in enumerate(block.touched):
-                    stated.append((first[i] + np.arange(each), block, i, (one, other)))
+                stated += [(numbers[i], block, i) for i in range(len(numbers))]
                 continue
-            for equation, name in zip(first, block.touched[:, 0], strict=True):
+            for equation, name in zip(numbers[:, 0], block.touched[:, 0], strict=True):
                 at.setdefault(name, []).append(int(equation))
                 planar[name] = block.measurement.planar
         if not at:
             return None
         number = {name: i for i, name in enumerate(at)}
-        ties = tuple(
-            Tie(equations, block.measurement.name, float(block.y[i, 0]), (number[one], number[other]))
-            for equations, block, i, (one, other) in stated
-            if one in number and other in number
-        )
+        ties = []
+        for equations, block, i in stated:
+            ends = [number.get(name) for name in (() if block.touched is None else block.touched[i])]
+            one, other = ends
+            if one is not None and other is not None:
+                ties.append(Tie(equations, block.measurement.name, float(block.y[i, 0]), (one, other)))
         rows = tuple(np.array(first)[:, None] + AXES for first in at.values())
-        return cls(rows, tuple(planar.values()), ties, start)
+        return cls(rows, tuple(planar.values()), tuple(ties), sum(map(np.size, equation_numbers(data))))
 
     def located(self, residual: Array) -> Things:
         """Return where points and planes are, of a residual (m,) that is -p_i for touches."""
@@ -258,13 +253,7 @@ class Touches:
         p = -residual[np.concatenate(self.rows)]
         return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
 
-    @overload
-    def centred(self, residual: Array, jacobian: None = None, size: float = 0.0) -> tuple[Array, None]: ...
-
-    @overload
-    def centred(self, residual: Array, jacobian: Array, size: float = 0.0) -> tuple[Array, Array]: ...
-
-    def centred(self, residual: Array, jacobian: Array | None = None, size: float = 0.0) -> tuple[Array, Array | None]:
+    def centred(self, residual: Array, jacobian: Array, size: float) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) with every point and plane where its touches put it.
 
         A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
@@ -282,8 +271,6 @@ class Touches:
             left[index] = unit * thing.seen((residual[index] + centre)[:, :, None])[:, :, 0]
         for tie in self.ties:
             left[tie.equations] = _off(tie, where)
-        if jacobian is None:
-            return left, None
         slopes = jacobian.copy()
         for thing, index in zip(where, self.rows, strict=True):
             slopes[index] = unit * thing.slopes(jacobian[index])
@@ -358,14 +345,9 @@ def _off(tie: Tie, where: Things) -> Array:
         return -np.arcsin(np.clip(first.normal @ second.normal, -1, 1))[None]
     if tie.kind == "known_parallel":
         return -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
-    return np.array([tie.value - _distance(first, second)])
-
-
-def _distance(first: Point | Plane, second: Point | Plane) -> float:
     apart = second.centre - first.centre
-    if isinstance(first, Plane):
-        return abs(float(first.normal @ apart))
-    return float(np.linalg.norm(apart))
+    distance = abs(first.normal @ apart) if isinstance(first, Plane) else np.linalg.norm(apart)
+    return np.array([tie.value - float(distance)])
 
 
 def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
@@ -396,64 +378,53 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: n
     touch.
     """
     place = np.cumsum(touches.kept(where)) - 1
-    group = np.full(touches.equations, -1)
-    count = 0
-    for stack in stacks:
-        group[stack.index] = count + np.arange(len(stack.index))[:, None]
-        count += len(stack.index)
-    things: list[list[int]] = [[] for _ in range(count)]
-    ties: list[list[int]] = [[] for _ in range(count)]
-    for i, index in enumerate(touches.rows):
-        things[group[index[0, 0]]].append(i)
-    for i, tie in enumerate(touches.ties):
-        ties[group[tie.equations[0]]].append(i)
+    of_thing = {int(index[0, 0]): i for i, index in enumerate(touches.rows)}
+    of_tie = {int(tie.equations[0]): i for i, tie in enumerate(touches.ties)}
     found: dict[tuple[int, int], list[Stack]] = {}
-    for lone in (lone for stack in stacks for lone in _singly(stack)):
-        index = lone.index[0]
-        number = group[index[0]]
-        part = touches.within(index, things[number], ties[number])
-        there = [where[i] for i in things[number]]
-        made = _stack(part, lone, there, stop[index])
-        made = replace(made, index=place[index[part.kept(there)]][None])
-        for each in _apart(made):
-            found.setdefault((each.index.shape[1], each.joint.shape[2]), []).append(each)
-    return [_together(same) for (size, _), same in found.items() if size]
+    for stack in stacks:
+        for n, index in enumerate(stack.index):
+            things = sorted(of_thing[e] for e in index.tolist() if e in of_thing)
+            ties = sorted(of_tie[e] for e in index.tolist() if e in of_tie)
+            part = touches.within(index, things, ties)
+            there = [where[i] for i in things]
+            made = _stack(part, stack, n, there, stop[index])
+            made = replace(made, index=place[index[part.kept(there)]][None])
+            for each in _independent(made):
+                found.setdefault((each.index.shape[1], each.joint.shape[2]), []).append(each)
+    names = ("index", "instrument", "length", "angle", "joint", "unit")
+    return [
+        Stack(**{name: np.concatenate([getattr(each, name) for each in same]) for name in names})
+        for (size, _), same in found.items()
+        if size
+    ]
 
 
-def _stack(touches: Touches, one: Stack, where: Things, stop: np.ndarray) -> Stack:
-    """Return one configuration's contrasts with what divides their noise; ``index`` is left as it is."""
+def _stack(touches: Touches, stack: Stack, n: int, where: Things, stop: np.ndarray) -> Stack:
+    """Return the contrasts of a stack's configuration n with what divides their noise; ``index`` is that of all."""
     m = touches.equations
     W = touches.noise(where)
     own = np.ones(m, dtype=bool)
     for tie in touches.ties:
         own[tie.equations] = False  # its touches scatter, and not what is stated
-    length = one.length[0] & own
     stops = np.unique(stop, return_inverse=True)[1]
-    spread = np.zeros((m, stops.max(initial=0) + 1, one.joint.shape[2]))
-    spread[np.arange(m), stops] = one.joint[0] * own[:, None]
+    spread = np.zeros((m, stops.max(initial=0) + 1, stack.joint.shape[2]))
+    spread[np.arange(m), stops] = stack.joint[n] * own[:, None]
     joint = W @ spread.reshape(m, -1)
     if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
         joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
     kept = touches.kept(where)
     return Stack(
-        index=one.index,
-        instrument=(W @ one.instrument[0] @ W.T)[None],
-        length=(one.length & own)[:, kept],
-        angle=(one.angle & own)[:, kept],
+        index=stack.index[n : n + 1],
+        instrument=(W @ stack.instrument[n] @ W.T)[None],
+        length=(stack.length[n] & own)[None, kept],
+        angle=(stack.angle[n] & own)[None, kept],
         joint=joint[None],
-        unit=((W * length) @ W.T)[None],
+        unit=((W * (stack.length[n] & own)) @ W.T)[None],
     )
 
 
-def _singly(stack: Stack) -> Iterator[Stack]:
-    """Yield a stack's configurations one by one."""
-    for i in range(len(stack.index)):
-        one = {name: getattr(stack, name)[i : i + 1] for name in PER_CONFIGURATION[:-1]}
-        yield replace(stack, **one)
-
-
-def _apart(stack: Stack) -> Iterator[Stack]:
-    """Yield a configuration's equations in parts whose noise is independent of each other's."""
+def _independent(stack: Stack) -> Iterator[Stack]:
+    """Yield a configuration's equations in groups whose noise is independent of each other's."""
     k = stack.index.shape[1]
     if stack.joint.shape[2] or stack.unit is None:
         yield stack
@@ -473,37 +444,30 @@ def _apart(stack: Stack) -> Iterator[Stack]:
         )
 
 
-def _together(stacks: Sequence[Stack]) -> Stack:
-    """Return configurations of one size as one stack."""
-    return Stack(**{name: np.concatenate([getattr(each, name) for each in stacks]) for name in PER_CONFIGURATION})
-
-
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
     """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of the rows by themselves.
 
     What a drawing states counts as the instrument's part of a reading.
     """
-    found = []
-    first = []
+    numbers = [index[:, 0] for index in equation_numbers(data)]
     touch = np.zeros((touches.equations, 3, 3))
-    start = 0
-    for block, V in zip(data.blocks, each, strict=True):
-        k = len(block.measurement.components)
-        first.append(start + k * np.arange(len(block.row)))
-        found.append(np.broadcast_to(V, (len(block.row), k, k)).copy())
+    for block, V, first in zip(data.blocks, each, numbers, strict=True):
         if block.measurement.touching:
-            touch[first[-1]] = found[-1]
-        start += k * len(block.row)
+            touch[first] = V
     left = touch.copy()
     for thing, index in zip(where, touches.rows, strict=True):
         left[index[:, 0]] = _left(thing, touch[index[:, 0]])
     through = {tie.equations[0]: _of_tie(touches, tie, where, touch) for tie in touches.ties}
-    for block, V, numbers in zip(data.blocks, found, first, strict=True):
+    found = []
+    for block, V, first in zip(data.blocks, each, numbers, strict=True):
         if block.measurement.touching:
-            V[:] = left[numbers]
-        for i, equation in enumerate(numbers):
+            found.append(left[first])
+            continue
+        rows = np.broadcast_to(V, (len(first), *V.shape[1:])).copy()
+        for i, equation in enumerate(first):
             if equation in through:
-                V[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + through[equation]
+                rows[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + through[equation]
+        found.append(rows)
     return found
 
 
@@ -512,9 +476,7 @@ def _left(thing: Point | Plane, V: Array) -> Array:
     K = len(V)
     if K == 1:
         return V
-    values = np.zeros((K, 3, K, 3))
-    values[np.arange(K), :, np.arange(K)] = np.eye(3)
-    through = thing.slopes(values.reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
+    through = thing.slopes(np.eye(3 * K).reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
     found = np.einsum("aibj,bjk,albk->ail", through, V, through)
     own = np.einsum("kii->ki", found)
     # directions that a touch does not show have no error: any positive variance serves

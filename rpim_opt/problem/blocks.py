@@ -1,0 +1,292 @@
+"""Blocks of measurements that are read one after another and reduced to the QR factor R."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from operator import methodcaller
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.threads import on_all_cores, one_blas_thread, phase
+from rpim_opt.data.dataset import Dataset, whole_configurations
+from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.position import position
+from rpim_opt.data.tables.reading import read_data
+from rpim_opt.problem.linear import LinearModel, Reweigh, from_triangle, reduced_models, reduced_rows
+from rpim_opt.problem.noise import equation_numbers
+from rpim_opt.problem.problem import CalibrationProblem, RobotModel
+from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
+from rpim_opt.robot.parameters import Parameters
+
+ROWS = 4096
+"""Rows that are weighed and reduced together, of losses that are no squares."""
+FEW = 1024
+"""Rows that are evaluated and reduced together: as many as a core's cache holds."""
+KEPT = 200_000
+"""Equations up to which a problem keeps its rows; beyond, only their QR factor."""
+Part = Callable[[], Dataset]
+"""Reads some of the measurements; whole configurations."""
+
+
+@one_blas_thread
+def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
+    """Return the model of ``problem.linearize(x)`` as its QR factor: n + 1 equations, the same |A z - b| for every z.
+
+    Rows are evaluated, whitened and reduced `FEW` at a time, so that memory does not grow with their number; where a
+    loss weighs them by their residuals at x (n,) [SI], `ROWS` at a time, whole configurations.
+    """
+    if reweigh is not None:
+        groups = whole_configurations(problem.data, ROWS)
+        return reduced_models(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
+    R, equations = None, 0
+    for rows in problem.equations(x, FEW):
+        equations += len(rows)
+        with phase("reduction"):
+            R = reduced_rows(rows, R)
+    if R is None:
+        raise InputError("data", "no row", "at least one")
+    R[:, -1] += R[:, :-1] @ (x / problem.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
+    return from_triangle(problem.model_of(R[:, :-1], R[:, -1], np.zeros(len(R), dtype=int)), R, equations)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PartitionedProblem(RobotModel):
+    """A calibration problem whose measurements come in blocks, read anew at every iteration.
+
+    Every block is reduced to a QR factor (n+1, n+1), and these to one; so that memory depends on the largest block and
+    not on their number, and blocks may be read by threads or by the workers of a cluster. What needs rows goes through
+    `rows`, one block after the other; a row's label is preceded by the number of its block, ``2:T8-6``.
+
+    Parameters
+    ----------
+    robots, parameters
+        As `CalibrationProblem` has them.
+    first
+        The first block, or what resembles it: it finds the frames' start, and is checked as a problem's data are.
+    parts
+        Functions that read the blocks, at least one; `partitions` makes them from files.
+    compute
+        Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or `on_cluster` (client).
+        By default files of `partitions` are read and reduced on all cores, while functions of a script are called one
+        after the other. Each block has one QR factor, so that no digit depends on who computed it.
+    dropped
+        Labels of rows that are left out.
+
+    Raises
+    ------
+    InputError
+        For no blocks, as `CalibrationProblem`, and for `data` of all the blocks, which do not stand anywhere; when a
+        block is read whose sessions the parameters do not have, where they have others (`starting_parameters`).
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> whole = ro.load("position").problem
+    >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
+    >>> problem = ro.problem.PartitionedProblem(whole.robot, whole.parameters, halves[0](), tuple(halves))
+    >>> problem.linearize(0 * whole.parameters.free.nominal).equations
+    120
+    >>> [part.labels[0] for part in problem.rows()], problem.keeps_rows
+    (['1:c0', '2:c20'], False)
+    >>> f"{ro.calibrate(problem, ro.tikhonov, weight=ro.reml).weight:.2f}"
+    '1.55'
+    >>> len(problem.without({"1:c3", "2:c33", "2:c34"}).labels), problem.on(whole.data).labels[0]
+    (37, 'c0')
+    """
+
+    first: Dataset
+    parts: Sequence[Part] = ()
+    compute: Callable[..., Iterable[Any]] | None = None
+    dropped: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise InputError("parts", "none", "at least one function that reads measurements")
+        self.sample()  # is checked
+        if self.compute is None:
+            ours = all(isinstance(part, partial) and part.func in (read_data, _taken) for part in self.parts)
+            object.__setattr__(self, "compute", on_all_cores if ours else map)
+
+    @property
+    def data(self) -> NoReturn:
+        """Raises InputError: the measurements do not stand together anywhere."""
+        raise InputError("problem.data", "measurements in parts", "problem.rows(), one problem a part")
+
+    @property
+    def keeps_rows(self) -> bool:
+        """False: linear models are QR factors."""
+        return False
+
+    def sample(self) -> CalibrationProblem:
+        """Return the first block: rows enough to place frames by."""
+        return self._sample
+
+    @cached_property
+    def _sample(self) -> CalibrationProblem:
+        return CalibrationProblem(self.robots, self.parameters, self.first, asked=self.asked, scatter=self.scatter)
+
+    def on(self, data: Dataset) -> CalibrationProblem:
+        """Return the same problem with other measurements, in memory."""
+        return self.sample().on(data)
+
+    def without(self, labels: Collection[str]) -> PartitionedProblem:
+        """Return the same problem without the rows of these labels, wherever they stand."""
+        return replace(self, dropped=self.dropped | frozenset(labels))
+
+    def rows(self) -> Iterator[CalibrationProblem]:
+        """Yield one problem a block, read in this process; no two blocks share the number of a configuration."""
+        configurations = 0
+        for number, part in enumerate(self.parts, start=1):
+            data = _read(self.parameters, self.dropped, (number, part))
+            if len(data):
+                label = tuple(f"{number}:{name}" for name in data.label)
+                yield self.on(replace(data, label=label, configuration=data.configuration + configurations))
+                configurations += int(data.configuration.max()) + 1
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """N labels of the rows, ``block:label``, blocks counted from 1."""
+        return tuple(label for part in self.rows() for label in part.labels)
+
+    def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
+        """Return the linear model of all blocks around the deviations x (n,) [SI], as a QR factor.
+
+        Arguments as for `CalibrationProblem.linearize`; ``reweigh`` gets some thousand rows at a time, whole
+        configurations, where a block is read.
+        """
+        return reduced_models(self._everywhere(partial(reduced, x=x, reweigh=reweigh)))
+
+    def errors(self, x: Array, dimension: str = "length") -> Array:
+        """Return the norm of every row's residual, (N,) [m]; arguments as for `CalibrationProblem.errors`."""
+        return np.concatenate(self._everywhere(methodcaller("errors", x, dimension)))
+
+    def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the whitened norm of every row's residual at x (n,), (N,), and how many equations each has (N,)."""
+        norms, equations = zip(*self._everywhere(methodcaller("whitened_errors", x)), strict=True)
+        return np.concatenate(norms), np.concatenate(equations)
+
+    def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Return the same of every configuration, (C,) and (C,); its rows stand in one block."""
+        norms, equations = zip(*self._everywhere(methodcaller("configuration_errors", x)), strict=True)
+        return np.concatenate(norms), np.concatenate(equations)
+
+    def _everywhere(self, what: Callable[[CalibrationProblem], Any]) -> list[Any]:
+        """Return what a function makes of every block, read and evaluated where ``compute`` does so."""
+        known = self.on(self.first.take([0]))  # one row: what a worker must know besides its own block
+        task = partial(_on_part, what, known, self.dropped)
+        results = (self.compute or map)(task, list(enumerate(self.parts, start=1)))
+        found = [result for result in results if result is not None]
+        if not found:
+            raise InputError("data", "no row", "at least one")
+        return found
+
+
+Source = CalibrationProblem | PartitionedProblem
+"""What a calibration needs of its measurements, in memory or in blocks: linear models, and rows block by block."""
+
+
+def in_parts(problem: Source) -> Source:
+    """Return the problem in blocks of whole configurations where it has more than `KEPT` equations, else as it is."""
+    if isinstance(problem, PartitionedProblem):
+        return problem
+    if sum(index.size for index in equation_numbers(problem.data)) <= KEPT:
+        return problem
+    parts = [partial(_taken, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
+    return PartitionedProblem(
+        problem.robots, problem.parameters, problem.data, parts, asked=problem.asked, scatter=problem.scatter
+    )
+
+
+def _taken(data: Dataset, rows: np.ndarray) -> Dataset:
+    return data.take(rows)
+
+
+def _on_part(
+    what: Callable[[CalibrationProblem], Any],
+    known: CalibrationProblem,
+    dropped: frozenset[str],
+    part: tuple[int, Part],
+) -> Any:
+    """Return what a function makes of a part, where a worker reads it; None for one without rows."""
+    data = _read(known.parameters, dropped, part)
+    return what(known.on(data)) if len(data) else None
+
+
+def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
+    """Return the measurements of a part, without what was dropped of it.
+
+    Refuse a session that the parameters lack while they have others: its rows would be taken for unshifted.
+    """
+    number, read = part
+    mine = f"{number}:"
+    out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}
+    data = read()
+    if out:
+        data = data.without(out)
+    known = {frame_of(name) for name in parameters.names if of_session(name)}
+    strange = [name for name in data.sessions if session_prefix(name) not in known]
+    if known and strange:
+        accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
+        raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
+    return data
+
+
+def partitions(
+    paths: Sequence[str | Path], robot: Robot, noise: Mapping[str, Any], measurement: Measurement = position
+) -> tuple[Part, ...]:
+    """Return functions that read the files, each a table as `read_data` takes it, of a few hundred thousand rows.
+
+    A configuration's rows stand in one file. Parquet is read fastest.
+
+    Parameters
+    ----------
+    paths
+        Tables; at least one.
+    robot, noise, measurement
+        As for `read_data`.
+
+    Raises
+    ------
+    InputError
+        For no paths; when a part is read, as `read_data`.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> robot = ro.load("paper_arm").problem.robot
+    >>> parts = ro.problem.partitions(["targets.csv"], robot, {"position_mm": 0.03})
+    >>> len(parts), len(parts[0]())
+    (1, 18)
+    """
+    if not paths:
+        raise InputError("paths", "no file", "at least one")
+    return tuple(partial(read_data, Path(path), robot, noise, measurement) for path in paths)
+
+
+def on_cluster(client: Any) -> Callable[..., Iterable[Any]]:
+    """Return a ``compute`` for `PartitionedProblem` that lets the workers of a Dask cluster read and reduce the parts.
+
+    Parameters
+    ----------
+    client
+        A ``distributed.Client``.
+
+    Examples
+    --------
+    With ``from distributed import Client`` and the address of the cluster's scheduler::
+
+        compute = ro.problem.on_cluster(Client("tcp://10.0.0.7:8786"))
+        problem = ro.problem.PartitionedProblem(robot, parameters, parts[0](), parts, compute)
+    """
+
+    def compute(task: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
+        return client.gather(client.map(task, list(parts), pure=False))
+
+    return compute

@@ -1,0 +1,172 @@
+"""The robot's repeatability beside the instrument's noise, and the equations of a configuration that share it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.data.dataset import Dataset
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """The repeatability of a robot: by how much it misses where its model sends it.
+
+    The covariance of all that was measured in one configuration is::
+
+        instrument^2 Sigma + position^2 I_length + orientation^2 I_angle + joint^2 J_theta J_theta'
+
+    with Sigma as the rows state it and J_theta (k, dof) the slopes by the angles of the revolute joints: a joint that
+    stops elsewhere shows in every reflector of a configuration, and the more the longer the lever arm.
+
+    Parameters
+    ----------
+    position
+        Standard deviation of every measured length, apart from the joints' part [m].
+    orientation
+        Of every measured angle [rad].
+    joint
+        Of every revolute joint [rad].
+    instrument
+        By how much the stated noise is multiplied; 1 for as stated.
+    at
+        (P,) values of all parameters at which the joints' slopes are taken [SI]; nominal if there are none.
+
+    Examples
+    --------
+    >>> import dataclasses
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> problem = ro.load("position").problem  # 0.03 mm of instrument
+    >>> rough = dataclasses.replace(problem, scatter=ro.problem.Scatter(position=40e-6))
+    >>> x = np.zeros(len(problem.parameters.free))
+    >>> bool(np.allclose(problem.linearize(x).b / rough.linearize(x).b, 5 / 3))
+    True
+    """
+
+    position: float = 0.0
+    orientation: float = 0.0
+    joint: float = 0.0
+    instrument: float = 1.0
+    at: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Configurations with the same number k of equations: what divides their noise, one array each.
+
+    Parameters
+    ----------
+    index
+        (N, k) numbers of the equations.
+    instrument
+        (N, k, k) covariance as the rows state it [SI].
+    length, angle
+        (N, k) which equations are lengths, and which angles.
+    joint
+        (N, k, dof) slopes by the revolute joints' angles [SI]; (N, k, 0) where nobody asks. Where equations mix several
+        stops of the joints, dof columns a stop.
+    unit
+        (N, k, k) covariance of a unit scatter of every measured position where equations mix several, or a camera sees
+        several points of one; None where each has its own, 1 on the diagonal for lengths.
+    """
+
+    index: np.ndarray
+    instrument: Array
+    length: np.ndarray
+    angle: np.ndarray
+    joint: Array
+    unit: Array | None = None
+
+    @property
+    def positional(self) -> bool:
+        """Whether any equation shows a scatter of positions."""
+        return self.unit is not None or bool(self.length.any())
+
+    def of(self, dimension: str) -> np.ndarray:
+        """Return which equations (N, k) are of a dimension: ``length``, ``angle``, or any other."""
+        if dimension == "length":
+            return self.length
+        if dimension == "angle":
+            return self.angle
+        return ~(self.length | self.angle)
+
+    def covariance(self, scatter: Scatter, reading: bool = True) -> Array:
+        """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""
+        k = self.index.shape[1]
+        own = scatter.orientation**2 * self.angle
+        if self.unit is None:
+            own = scatter.position**2 * self.length + own
+        found = own[:, :, None] * np.eye(k)
+        if self.unit is not None:
+            found += scatter.position**2 * self.unit
+        if scatter.joint > 0:
+            found += scatter.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
+        if reading:
+            found += scatter.instrument**2 * self.instrument
+        return found
+
+
+def equation_numbers(data: Dataset) -> list[np.ndarray]:
+    """Return the numbers (N, k) of the equations of every block's rows."""
+    found = []
+    start = 0
+    for block in data.blocks:
+        k = len(block.measurement.components)
+        found.append(start + np.arange(k * len(block.row)).reshape(-1, k))
+        start += found[-1].size
+    return found
+
+
+class Equations(NamedTuple):
+    """The equations (m,) of a dataset: their row, their component of it, what they are, and the row's covariance.
+
+    ``covariance`` (m, K) is with the components of the same row.
+    """
+
+    row: np.ndarray
+    component: np.ndarray
+    length: np.ndarray
+    angle: np.ndarray
+    covariance: Array
+
+    @classmethod
+    def of(cls, data: Dataset) -> Equations:
+        """Return the equations in the order of the data's blocks."""
+        widest = max(len(block.measurement.components) for block in data.blocks)
+        parts = []
+        for block in data.blocks:
+            N = len(block.row)
+            dimensions = np.array(list(block.measurement.components.values()))
+            k = len(dimensions)
+            V = np.zeros((N, k, widest))
+            V[:, :, :k] = block.covariance
+            kinds = [np.tile(dimensions == dimension, N) for dimension in ("length", "angle")]
+            parts.append((np.repeat(block.row, k), np.tile(np.arange(k), N), *kinds, V.reshape(-1, widest)))
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def stack(self, index: np.ndarray, slopes: Array | None = None, shifts: Array | None = None) -> Stack:
+        """Return what divides the noise of equations (N, k) that stand together.
+
+        ``slopes`` (m, dof) are by the joints' angles, ``shifts`` (m, 3) those of what cameras see by where the robot
+        is, zero for other equations; None for none.
+        """
+        row = self.row[index]
+        V = self.covariance[index[:, :, None], self.component[index][:, None, :]]
+        V = V * (row[:, :, None] == row[:, None, :])
+        length = self.length[index]
+        joint = np.zeros((*index.shape, 0)) if slopes is None else slopes[index]
+        unit = None
+        if shifts is not None:
+            G = shifts[index]
+            unit = G @ G.transpose(0, 2, 1) + length[:, :, None] * np.eye(index.shape[1])
+        return Stack(index, V, length, self.angle[index], joint, unit)
+
+    def grouped(self, number: np.ndarray) -> list[np.ndarray]:
+        """Return the equations (N, k) of every k that groups have, by the number (m,) of their group, row by row."""
+        order = np.lexsort((self.row, number))
+        _, first, count = np.unique(number[order], return_index=True, return_counts=True)
+        return [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count)]
