@@ -140,7 +140,7 @@ def new(
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
     dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
-    sheet: Annotated[str, Option(help="Excel sheet, by name or number.")] = "",
+    sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = "",
     columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = "",
     key: Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")] = "",
     time_tolerance: Annotated[Number, Option(help="Join files by the nearest time, within so many s.")] = None,

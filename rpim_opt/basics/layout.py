@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +41,8 @@ VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.
 """What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
+UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\s*[:=]?\s+(.+)", re.IGNORECASE)
+"""A line above the header that states units."""
 READING = ("encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "joints")
 """What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
@@ -137,12 +140,14 @@ class RawTable:
     """A table as its file has it, numbers as Python writes them.
 
     ``columns`` are cells by what stands above them (a name that is there again has its place behind it, ``X #7``),
-    ``heads`` the same taken apart; ``notes`` say how it was read, and what was left out, a sentence each.
+    ``heads`` the same taken apart; ``notes`` say how it was read, and what was left out, a sentence each; ``units`` are
+    those that stand above the header, as `parse_units` has them.
     """
 
     columns: Columns
     heads: Mapping[str, Head] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
@@ -161,19 +166,20 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     """
     options = options or TableOptions()
     notes: list[str] = []
+    units: dict[str, str] = {}
     try:
         if columns is None and path.suffix.lower() == ".parquet":
             columns = read_columns(path)
         if columns is not None:
             found = [Column(name, Head(name), cells) for name, cells in columns.items()]
         else:
-            found, notes = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
+            found, notes, units = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
         found = [each for column in found for each in _one_number_each(column)]
         found, note = _one_row_each(found)
     except InputError as error:
         raise error.within(path) from None
     by_name = {column.name: column.cells for column in found}
-    return RawTable(by_name, {column.name: column.head for column in found}, (*notes, *note))
+    return RawTable(by_name, {column.name: column.head for column in found}, (*notes, *note), units)
 
 
 def is_missing(cell: str) -> bool:
@@ -181,14 +187,15 @@ def is_missing(cell: str) -> bool:
     return MISSING.fullmatch(cell.strip()) is not None
 
 
-def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]]:
-    """Return the table among the rows of a file, and how it was read."""
+def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str], dict[str, str]]:
+    """Return the table among the rows of a file, how it was read, and the units above its header."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
     if not grid.rows:
         raise InputError("the table", "an empty file", "a header and at least one row")
     if most < 2:
-        raise InputError("the table", "a header and no rows", "at least one row of numbers")
+        found = f"{len(grid.rows)} lines, none of numbers" if len(grid.rows) > 1 else "a header and no rows"
+        raise InputError("the table", found, "at least one row of numbers")
     full = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, full, options)
     first = {i: next(filter(None, grid.rows[i])) for i in full}
@@ -198,7 +205,13 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     notes += [f"line {grid.lines[i]} sums others up: left out '{first[i]}'." for i in summing]
     if mark == ",":
         notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can part thousands'}.")
-    return columns, notes
+    units: dict[str, str] = {}
+    lines = [" ".join(filter(None, row)) for row in grid.rows[: above[0] if above else 0]]
+    for stated in filter(None, map(UNITS_LINE.fullmatch, lines)):
+        with suppress(InputError):  # a sentence that happens to begin so
+            units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
+            notes.append(f"units above the header: {stated[1]}.")
+    return columns, notes, units
 
 
 def _count(row: Sequence[str]) -> int:
@@ -341,20 +354,16 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOpt
         if name in columns:
             name = f"{name} #{j + 1}"
         columns[name] = Column(name, head, cells)
-    numeric = [column.cells for column in columns.values() if _is_numeric(column.cells)]
-    mark = _decimal_mark((cell for cells in numeric for cell in cells), options.decimal)
-    found = []
-    for column in columns.values():
-        unit = ""
-        if _is_numeric(column.cells):
-            column = column._replace(cells=[_as_python(cell, mark) for cell in column.cells])
-        else:
-            unit = _unit_of(column.cells)
+    for name, column in columns.items():
+        unit = "" if _is_numeric(column.cells) else _unit_of(column.cells)
         if unit:
-            bare = [_as_python(cell.removesuffix(unit).strip(), ".") for cell in column.cells]
-            column = column._replace(head=column.head._replace(unit=unit), cells=bare)
-        found.append(column)
-    return found, mark
+            bare = [cell.removesuffix(unit).strip() for cell in column.cells]
+            columns[name] = Column(name, column.head._replace(unit=unit), bare)
+    numeric = {name: column.cells for name, column in columns.items() if _is_numeric(column.cells)}
+    mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), options.decimal)
+    for name, cells in numeric.items():
+        columns[name] = columns[name]._replace(cells=[_as_python(cell, mark) for cell in cells])
+    return list(columns.values()), mark
 
 
 def _require_width(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:

@@ -42,8 +42,8 @@ SAMPLE_CHARACTERS = 2**16
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
-THOUSANDS = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))")
-"""Signs between thousands that are no decimal marks."""
+THOUSANDS = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)")
+"""Signs between thousands that are no decimal marks, and that before an uncertainty."""
 LIST_OPENS = re.compile(r"[\[({][\s\d.+\-\[({]")
 ZEROS = bytes(8)
 """No text has so many zeros in a row, in whatever encoding."""
@@ -360,7 +360,7 @@ def _excel(path: Path, sheet: str) -> Grid:
         raise
     except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
         raise InputError("the file", _first_line(error), "a readable Excel workbook (.xlsx)") from None
-    how = "as stated" if sheet else "the first with cells; another one by --sheet"
+    how = "as stated" if sheet else "the first with cells; another one, or several, by --sheet"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 

@@ -212,22 +212,21 @@ def fits(name: str, pattern: str) -> bool:
 # --- units as headers of tables spell them ---------------------------------------------------------------------------
 
 SPELLED = {
-    "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "meter": "m", "metre": "m",
-    "meters": "m", "metres": "m", "millimeter": "mm", "millimetre": "mm", "millimeters": "mm", "millimetres": "mm",
-    "nm": "Nm", "n.m": "Nm", "n·m": "Nm", "µm": "um", "μm": "um", "micron": "um", "microns": "um", "inch": "in",
-    "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm",
-    "°c": "degC", "celsius": "degC", "kelvin": "K", "gradi": "deg", "degrés": "deg", "度": "deg", "毫米": "mm",
+    "°": "deg", "º": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "meter": "m",
+    "metre": "m", "meters": "m", "metres": "m", "millimeter": "mm", "millimetre": "mm", "millimeters": "mm",
+    "millimetres": "mm", "nm": "Nm", "n.m": "Nm", "n·m": "Nm", "µm": "um", "μm": "um", "micron": "um", "microns": "um",
+    "inch": "in", "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm", "°c": "degC", "celsius": "degC",
+    "kelvin": "K", "Grad": "deg", "gradi": "deg", "grados": "deg", "graus": "deg", "degrés": "deg", "度": "deg",
+    "毫米": "mm", "ミリ": "mm", "gons": "gon",
 }  # fmt: skip
-UNIT_SIGNS = frozenset({
-    *UNITS, "°", "grad", "degree", "degrees", "radian", "radians", "inch", "in", "cm", "gon", "µm", "μm", "nm", "n.m",
-    "n·m", "-", "s", "1",
-})  # fmt: skip
-"""What stands in a line of units."""
+"""Units as they are spelled in headers; a small grad may be a gon."""
+UNIT_SIGNS = frozenset(map(str.lower, [*UNITS, *SPELLED, "in", "cm", "gon", "-", "s", "1"]))
+"""What stands in a line of units, in lower case."""
 IN_A_NAME = (
     re.compile(r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]"),
     re.compile(r"(.+?)\s*/\s*(\S+)"),
     re.compile(r"(.+?)\s+in\s+(\S+)"),
-    re.compile(r"(.+?)[\s_]+(\S+)"),
+    re.compile(r"(.+)[\s_]+([^\s_]+)"),
 )
 
 
@@ -244,7 +243,7 @@ FOREIGN = {"in": Foreign("mm", 25.4), "cm": Foreign("mm", 10.0), "gon": Foreign(
 
 def _spelled(text: str) -> str:
     """Return the name of a unit, or nothing where a text is none."""
-    names = (text, SPELLED.get(text.lower(), ""), text.lower())
+    names = (text, SPELLED.get(text) or SPELLED.get(text.lower(), ""), text.lower() if len(text) > 1 else "")
     return next((name for name in names if name in UNITS or name in FOREIGN), "")
 
 

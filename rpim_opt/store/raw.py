@@ -173,7 +173,9 @@ def understand_of(
     """Return what raw tables of an arm say, as `understand_tables` does."""
     options = options or TableOptions()
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
-    files = [(Path(each), read_raw(Path(each), options)) for each in data]
+    sheets = options.sheet.split(",")
+    every = [(Path(each), replace(options, sheet=sheet.strip())) for each in data for sheet in sheets]
+    files = [(path, read_raw(path, stated)) for path, stated in every]
     if known is None:
         columns = [raw.columns for _, raw in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
@@ -186,6 +188,7 @@ def understand_of(
             return _checked(found, files, arm, doubt) if doubt and kind.turning else found
     names = ", ".join(name for _, raw in files for name in raw.columns)
     accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
+    accepted += "".join(f"; {note.rstrip('.')}" for _, raw in files for note in raw.notes if note.startswith("sheet '"))
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
 
 

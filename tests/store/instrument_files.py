@@ -12,6 +12,7 @@ import openpyxl
 from scipy.spatial.transform import Rotation
 
 from tests.store.raw_files import (
+    BARE,
     COUNT,
     HEAD,
     JOINTS,
@@ -22,6 +23,7 @@ from tests.store.raw_files import (
     RADIANS,
     ROWS,
     UR,
+    WANTED,
     WXYZ,
     Options,
     P,
@@ -29,6 +31,7 @@ from tests.store.raw_files import (
     beside,
     book,
     cells,
+    excel,
     joint_names,
     one,
     text,
@@ -326,3 +329,55 @@ INSTRUMENTS: dict[str, Shape] = {
     ),
 }  # fmt: skip
 """Written down before the readers that read them; `test_instruments` says which are read at once."""
+
+
+def lines(pattern: str) -> str:
+    """Return a line a configuration, its number and joints put into a pattern."""
+    return "".join(pattern.format(i, *q) for i, q in enumerate(JOINTS))
+
+
+BOTH = [[c for v in q for c in (f"{float(v) + 1:.3f}", v)] for q in JOINTS]
+IST_SOLL = [f"Achse{i} {what} [°]" for i in range(1, 7) for what in ("Sollwert", "Istwert")]
+PENDANT = [f"{name} [°]" for name in ("Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3")]
+WITH_UNITS = [[r[0], *(f"{v}°" for v in r[1:7]), *(f"{v} mm" for v in r[7:])] for r in ROWS]
+OBJECTS = [
+    {"id": n, "joints_deg": [float(v) for v in q], "seen_mm": {a: float(v) for a, v in zip("xyz", p, strict=True)}}
+    for n, q, p in zip(LABELS, JOINTS, POINTS, strict=True)
+]
+STRANGERS: dict[str, Shape] = {
+    "Spanish": one(
+        text([["Punto", *joint_names("Eje {} [grados]"), *(f"{a} medida [mm]" for a in "XYZ")]], ROWS, ";", comma=True)
+    ),
+    "Japanese, the number first": one(text([["測定点", *joint_names("{}軸[度]"), "X[mm]", "Y[mm]", "Z[mm]"]], ROWS)),
+    "German, Ist and Soll": one(
+        text([["Messpunkt", *IST_SOLL, *(f"{a} Istwert [mm]" for a in "XYZ")]], beside(NAMED, BOTH, POINTS), ";", True)
+    ),
+    "a pendant's Base to Wrist 3": one(text([["Pose", *PENDANT, *HEAD[7:]]], ROWS)),
+    "subscripts": one(text([["label", *(f"θ{i} (°)" for i in "₁₂₃₄₅₆"), *HEAD[7:]]], ROWS)),
+    "capitals": one(text([["POINT_ID", *joint_names("JOINT_{}_DEG"), *(f"MEAS_{a}_MM" for a in "XYZ")]], ROWS)),
+    "units of many letters in a row": one(text([BARE, ["", *["degrees"] * 6, *["millimeters"] * 3]], ROWS)),
+    "units above the header": one("Cell 7\nUnits: mm, deg\n\n" + text([BARE], ROWS, "\t"), "raw.txt"),
+    "units in the cells, decimal commas": one(text([BARE], WITH_UNITS, ";", comma=True)),
+    "the robot's own position beside the measured one": one(
+        text([["name", *joint_names("joint_{}_position_deg"), *(f"{c}_{a}_mm" for c in ("tcp", "tracker") for a in "xyz")]],
+             beside(NAMED, JOINTS, WANTED, POINTS))
+    ),
+    "ROS 2, indices": one(
+        text([[*joint_names("position[{}]", 0), *(f"pose.position.{a}" for a in "xyz")]], beside(RADIANS, METRES))
+    ),
+    "JSON below a key": one(json.dumps({"robot": "r", "rows": OBJECTS}), "raw.json"),
+    "Excel, two sheets": excel(
+        {"Joints": [HEAD[:7], *beside(NAMED, JOINTS)], "Points": [[HEAD[0], *HEAD[7:]], *beside(NAMED, POINTS)]},
+        sheet="Joints,Points",
+    ),
+    "VAL3": program(
+        "p.dtx", lines('<Value key="{}" j1="{}" j2="{}" j3="{}" j4="{}" j5="{}" j6="{}"/>\n'), key="row"
+    ),
+    "Yaskawa job": program("P.JBI", "///POSTYPE ANGLE\n" + lines("C{:05d}={},{},{},{},{},{}\n"), key="row"),
+    "KUKA, inline axes": program("m.src", lines("PTP {{A1 {1},A2 {2},A3 {3},A4 {4},A5 {5},A6 {6}}}\n"), key="row"),
+    "RAPID, MoveAbsJ alone": program("m.mod", lines("MoveAbsJ [[{1},{2},{3},{4},{5},{6}],[9E9,9E9]],v9;\n"), key="row"),
+    "URScript, degrees": program(
+        "m.script", lines("movej([d2r({1}),d2r({2}),d2r({3}),d2r({4}),d2r({5}),d2r({6})])\n"), key="row"
+    ),
+}  # fmt: skip
+"""As strangers write, written down before the readers that read them."""

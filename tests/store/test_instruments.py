@@ -12,13 +12,17 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
-from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, krl
+from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
 from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, cells, text
 from tests.test_cli import run
 
 NOT_READ = {"ROS, rostopic echo as YAML", "MELFA joint variables"}
 """Formats without a reader."""
-FILES = {**REFUSED_THOUGH_RIGHT, **{name: shape for name, shape in INSTRUMENTS.items() if name not in NOT_READ}}
+FILES = {
+    **REFUSED_THOUGH_RIGHT,
+    **STRANGERS,
+    **{name: shape for name, shape in INSTRUMENTS.items() if name not in NOT_READ},
+}
 
 
 @pytest.fixture

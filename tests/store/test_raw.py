@@ -166,7 +166,7 @@ REFUSED = {
     "a rotation vector without a unit": (
         text([[*HEAD, "rx", "ry", "rz"]], beside(ROWS, POINTS)), ["--rotation", "vector"], ["(rx, ry, rz)", "--units"]
     ),
-    "nothing but text": ("a,b,c\nd,e,f\n", [], ["a header and no rows"]),
+    "nothing but text": ("a,b,c\nd,e,f\n", [], ["2 lines, none of numbers"]),
     "bytes": ("a\x00b,1,2\n", [], ["bytes that are zero"]),
 }  # fmt: skip
 

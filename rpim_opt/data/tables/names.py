@@ -8,6 +8,7 @@ field.pose.orientation.w, /joint_states/elbow_joint/position``; Universal Robots
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import NamedTuple
@@ -51,6 +52,7 @@ NAMES = (
     Name(r"(?:joints?|axes|axis|achsen|gelenke)(?:_(?:angles?|positions?|values?|pos))?_(?:q|j|a|joint|axis)?_?(\d+)",
          r"q\1"),
     Name(r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
+    Name(r"(\d+)_?(?:軸|轴|축)", r"q\1"),
     Name(r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
     Name(rf"{_WHERE}([xyz])(?:_?1|坐标)?", r"\1"),
     Name(r"az(?:imuth|imut)?", "azimuth", "azimuth, counterclockwise from x about z"),
@@ -67,7 +69,7 @@ NAMES = (
     Name(rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
     Name(r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
     Name(r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
-         r"|punkt_?nr|feature|nom_du_point|punto|点名", "label"),
+         r"|punkt_?nr|feature|nom_du_point|punto|pt|点名|点号|測定点|測点", "label"),
     Name(r"configuration|config|pose|pose_id", "configuration"),
     Name(r"marker|reflector|smr", "marker"),
     Name(r"temp(?:erature|eratur)?", "temperature"),
@@ -75,16 +77,18 @@ NAMES = (
 )  # fmt: skip
 """What else a column may be called, in lower case and with underscores: unambiguous names alone."""
 DIALECTS = (
-    Dialect(r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w", "rad", "m", "ROS: SI units (REP 103)"),
+    Dialect(r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]", "rad", "m", "ROS: SI units (REP 103)"),
     Dialect(r"(?:actual|target)_q_\d", "rad", "m", "Universal Robots' RTDE: SI units"),
 )
 KINDS = {
     "derived": frozenset({"deviation", "dev", "delta", "diff", "difference", "error", "err", "residual", "velocity",
                           "vel", "speed", "acceleration"}),
-    "wanted": frozenset({"nominal", "nom", "target", "soll", "theoretical", "programmed", "commanded", "command", "cmd",
-                         "desired", "setpoint", "reference", "ref", "théorique", "nominale", "teorico", "理论"}),
+    "wanted": frozenset({"nominal", "nom", "target", "soll", "sollwert", "theoretical", "programmed", "commanded",
+                         "command", "cmd", "desired", "setpoint", "reference", "ref", "théorique", "nominale",
+                         "teorico", "理论"}),
     "measured": frozenset({"measured", "meas", "measurement", "actual", "act", "ist", "tracker", "leica", "observed",
-                          "mesuré", "mesurée", "misurato", "misurata", "medido", "gemessen", "实测"}),
+                          "istwert", "messwert", "gemessen", "mesuré", "mesurée", "misurato", "misurata", "medido",
+                          "medida", "实测"}),
 }  # fmt: skip
 """Words of a name that say whether it was measured, wanted or computed from others."""
 TURNS = (
@@ -93,8 +97,11 @@ TURNS = (
     (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
 )
 """Three letters that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
-MOTOMAN = "slurbt"
-"""Yaskawa's joints, from the base, where all of them are there."""
+JOINTS = (
+    (("s", "l", "u", "r", "b", "t"), "Yaskawa: S, L, U, R, B, T"),
+    (("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"), "Universal Robots: Base, Shoulder, ..., Wrist 3"),
+)
+"""Joints from the base, where all of them are there."""
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
 MOST_PREFIXES = 6
@@ -116,7 +123,8 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     ['x', 'q3', 'qw', 'sigma_y', 'q1']
     """
     path = [part for part in re.split(r"[/.]", stem.strip().strip("%")) if part]
-    plain = re.sub(r"[\s.\-/:\[\]()$]+", "_", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower())).strip("_% ")
+    plain = unicodedata.normalize("NFKC", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower()))
+    plain = re.sub(r"[\s.\-/:\[\]()$]+", "_", plain).strip("_% ")
     words = plain.split("_")
     kind = next((name for name, signs in KINDS.items() if len(words) > 1 and signs & set(words)), "")
     rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import (
-    MOTOMAN,
+    JOINTS,
     TURNS,
     UR_JOINTS,
     Reading,
@@ -111,6 +111,7 @@ def understand(
     options = options or TableOptions()
     path = source if isinstance(source, Path) else None
     raw = source if isinstance(source, RawTable) else read_raw(source, options)
+    options = replace(options, units={**raw.units, **options.units})
     require_rotation(options.rotation)
     known = number_columns(robot, kind)
     try:
@@ -202,9 +203,9 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
 def _of_letters(read: Readings, dof: int) -> str:
     """Take letters for joints or angles where all of them are there, and return the rotation that they tell."""
     stems = {found.stem for found in read.values()}
-    if dof == len(MOTOMAN) and stems >= set(MOTOMAN):
-        joints = {letter: f"q{i}" for i, letter in enumerate(MOTOMAN, start=1)}
-        _rename(read, joints, "Yaskawa: S, L, U, R, B, T")
+    for words, why in JOINTS:
+        if dof == len(words) and stems >= set(words):
+            _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
     for letters, meant, why, rotation in TURNS:
         if {"x", "y", "z", *letters} <= stems:
             _rename(read, dict(zip(letters, meant, strict=True)), why)
@@ -287,10 +288,13 @@ def _left_out(read: Readings, targets: bool) -> dict[str, str]:
     """
     why: dict[str, str] = {}
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
+    called_so = {each.stem for each in read.values() if each.kind == "measured"} & {"x", "y", "z"}
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
     for name, each in list(read.items()):
         if each.kind == "derived":
             why[name] = "computed from others"
+        elif not each.kind and each.stem in called_so:
+            why[name] = "another column is called measured"
         elif targets:
             if each.kind != "wanted" and each.stem in wanted:
                 why[name] = "it is not where the robot is to go"

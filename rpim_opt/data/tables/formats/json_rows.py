@@ -7,6 +7,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import parse_json
+from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
 
@@ -25,17 +26,24 @@ def read(text: str) -> Rows:
             raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
         found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
     elif isinstance(found, dict):
-        found = [found]
-    if not all(isinstance(row, dict) for row in found):
+        inner = [value for value in found.values() if isinstance(value, list) and all(map(_is_object, value))]
+        found = inner[0] if len(inner) == 1 else [found]
+    if not all(map(_is_object, found)):
         raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
     return [dict(_flat("", row)) for row in found]
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict)
 
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the values of an object with their names; lists of numbers stay together."""
     if isinstance(value, Mapping):
+        stem, unit = split(prefix)
         for name, part in value.items():
-            yield from _flat(f"{prefix}.{name}" if prefix else name, part)
+            whole = f"{stem}.{name} [{unit}]" if unit else f"{prefix}.{name}"
+            yield from _flat(whole if prefix else name, part)
     elif value is not None:
         yield prefix, value
 

@@ -6,7 +6,8 @@ import re
 
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
-TARGET = re.compile(r"(E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=\s*\{([^}]*)\}", re.IGNORECASE)
+TARGET = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^}]*)\}", re.IGNORECASE)
+AXES = re.compile(r"\bA1\b", re.IGNORECASE)
 FIELD = re.compile(r"\b([A-Z]\d?)\s+([+-]?[\d.]+(?:E[+-]?\d+)?)", re.IGNORECASE)
 NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **{axis: f"commanded {axis} [mm]" for axis in "XYZ"},
          **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
@@ -15,12 +16,12 @@ NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **{axis: f"commanded {
 def read(text: str) -> Rows:
     """Return the targets: axis values if there are some, else poses; external axes are left out."""
     found = TARGET.findall(text)
-    axes = [each for each in found if "AXIS" in each[0].upper()]
-    inline = all(name.upper().startswith("X") for _, name, _ in axes or found)  # as inline forms name P1's data
+    axes = [each for each in found if AXES.search(each[1])]
+    inline = all(name.upper().startswith("X") for name, _ in axes or found)  # as inline forms name P1's data
     rows = []
-    for _, name, fields in axes or found:
+    for i, (name, fields) in enumerate(axes or found, start=1):
         values = {NAMES[key.upper()]: value for key, value in FIELD.findall(fields) if key.upper() in NAMES}
-        rows.append({"label": name[1:] if inline else name, **values})
+        rows.append({"label": name[1:] if inline else name or str(i), **values})
     return rows
 
 

@@ -23,4 +23,8 @@ def read(text: str) -> Rows:
     return rows
 
 
-FORMATS = (TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), lambda text: "target" in text.lower(), read),)
+def _has_targets(text: str) -> bool:
+    return any(pattern.search(text) for pattern in (JOINTS, POSES))
+
+
+FORMATS = (TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), _has_targets, read),)

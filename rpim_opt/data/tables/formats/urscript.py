@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import scipy
@@ -12,9 +13,15 @@ NUMBERS = r"\[\s*((?:[+-]?[\d.]+(?:e[+-]?\d+)?\s*,\s*){5}[+-]?[\d.]+(?:e[+-]?\d+
 TARGET = re.compile(rf"(?:(\w+)\s*=|(move[jlp])\s*\()\s*(p?){NUMBERS}", re.IGNORECASE)
 
 
+def _plain(text: str) -> str:
+    """Return a program without comments, its angles in rad."""
+    radians = re.sub(r"d2r\(\s*([+-]?[\d.]+)\s*\)", lambda degrees: repr(math.radians(float(degrees[1]))), text)
+    return re.sub(r"#.*", "", radians)
+
+
 def read(text: str) -> Rows:
     """Return the joint values that are commanded or named if there are some, else the poses."""
-    found = [each for each in TARGET.findall(re.sub(r"#.*", "", text)) if each[0].lower() != "set_tcp"]
+    found = [each for each in TARGET.findall(_plain(text)) if each[0].lower() != "set_tcp"]
     joints = [each for each in found if not each[2]]
     rows = []
     for i, (name, _, pose, text_of) in enumerate(joints or found, start=1):
@@ -30,4 +37,6 @@ def read(text: str) -> Rows:
     return rows
 
 
-FORMATS = (TableFormat("URScript", (".script", ".urscript"), lambda text: TARGET.search(text) is not None, read),)
+FORMATS = (
+    TableFormat("URScript", (".script", ".urscript"), lambda text: TARGET.search(_plain(text)) is not None, read),
+)
