@@ -54,11 +54,8 @@ class Formulation(Brief):
     solvable
         False for one that was read from a file, which cannot hold a script's functions.
 
-    Raises
-    ------
-    InputError
-        For another ``loss_over`` or ``largest``, and what is no function; when it is posed, for a program that is
-        not convex.
+    InputError for another ``loss_over`` or ``largest``, and what is no function; when it is posed, for a program that
+    is not convex.
 
     Examples
     --------

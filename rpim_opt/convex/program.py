@@ -216,11 +216,6 @@ class Program(Brief):
             raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
         return _squared(self.model, form)
 
-    @property
-    def squared_rows(self) -> bool:
-        """Whether the loss is the sum of the equations' squares."""
-        return self.loss_form is not None and self.squared is self.model
-
     @cached_property
     def ridge(self) -> Ridge:
         """The closed form of a program with quadratic loss and penalty, its constraints left out."""
@@ -483,7 +478,12 @@ class Program(Brief):
         checked = np.array([self._weight(weight) for weight in weights])
         if self.closed_form:
             Z = self.ridge.minima(checked)
-            rows = zip(Z, checked, *self._quadratic_values(Z), strict=True)
+            R, n, form = self.squared.triangle, self.structure.n, self.penalty_form
+            losses = np.sum((Z @ R[:, :n].T - R[:, n]) ** 2, axis=1) + self.squared.offset
+            penalties = np.zeros(len(Z))
+            if form is not None:
+                penalties = np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
+            rows = zip(Z, checked, losses, penalties, strict=True)
             return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
         found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
         return [found[weight] for weight in checked.tolist()]
@@ -529,8 +529,12 @@ class Program(Brief):
         """
         if not self.formulation.constraints or self.structure.predicts:
             return None
-        found = self.apart(self.model)._minimum_at(z, weight)
-        if found is None:
+        if self.structure.joint:
+            return None
+        begun = self.apart(self.model).beginning(z)
+        try:
+            found = minimum(self.structure.loss, self._rows, begun._warm, weight, self._squares)
+        except Unsolved:
             return None
         p = self.structure.canonical
         limit = ACTIVE * max(np.abs(found.dual).max(initial=0.0), TOUCHING)
@@ -553,24 +557,12 @@ class Program(Brief):
         U, values, _ = np.linalg.svd(moves, full_matrices=False)
         return U[:, values > TOUCHING]
 
-    def _minimum_at(self, z: Array, weight: float) -> Minimum | None:
-        """Return the minimum next to a solution z (n,), with its multipliers; None where it is not found."""
-        if self.structure.joint:
-            return None
-        self.beginning(z)
-        try:
-            return minimum(self.structure.loss, self._rows, self._warm, weight, self._squares)
-        except Unsolved:
-            return None
-
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""
         number = isinstance(weight, int | float | np.integer | np.floating) and not isinstance(weight, bool)
         if not (number and np.isfinite(weight) and weight >= 0):
             raise InputError("weight", f"{weight!r}", "a finite number, zero or more")
-        if self.formulation.penalty is None:
-            return 0.0
-        return float(weight)
+        return 0.0 if self.formulation.penalty is None else float(weight)
 
     def _at(self, z: Array, weight: float, duals: tuple[Array, ...] = (), iterations: int = 0) -> Estimate:
         if not self.quadratic:  # a quadratic is finite everywhere
@@ -594,15 +586,6 @@ class Program(Brief):
         stacked = np.vstack(A)
         rcond = RANK_TOLERANCE if damping is None else None
         return z + np.linalg.lstsq(stacked, np.concatenate(b) - stacked @ z, rcond=rcond)[0]
-
-    def _quadratic_values(self, Z: Array) -> tuple[Array, Array]:
-        """Return loss and penalty (K,) of many points Z (K, n) of a quadratic program."""
-        R, n = self.squared.triangle, Z.shape[1]
-        loss = np.sum((Z @ R[:, :n].T - R[:, n]) ** 2, axis=1) + self.squared.offset
-        form = self.penalty_form
-        if form is None:
-            return loss, np.zeros(len(Z))
-        return loss, np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
@@ -659,7 +642,9 @@ class Program(Brief):
         first: str = "",
     ) -> Estimate:
         """Return the minimum that a solver of CVXPY finds; ``first`` is why another way failed before."""
-        _require_installed(solver)
+        if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
+            installed = ", ".join(cp.installed_solvers())
+            raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
         answers = self.structure.answers
         stated = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
         problem, z, groups = self._written((*self.rows, weight), stated, damping)
@@ -715,12 +700,6 @@ def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
 def _sides(lower: Array, upper: Array) -> np.ndarray:
     """Return the components that the rows of a box bound: fixed ones, lower and upper bounds."""
     return np.concatenate([np.flatnonzero(side) for side in box_sides(lower, upper)])
-
-
-def _require_installed(solver: Any) -> None:
-    if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
-        installed = ", ".join(cp.installed_solvers())
-        raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
 
 
 def pose(formulation: Formulation | str, model: LinearModel) -> Program:

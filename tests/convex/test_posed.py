@@ -11,7 +11,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.expressions import Frozen, Term, listed, norms, scalar, term
-from rpim_opt.convex.infeasible import Stated, _irreducible, _least, conflict, name_of
+from rpim_opt.convex.infeasible import conflict, name_of
 from rpim_opt.convex.quadratic import quadratic
 from rpim_opt.convex.rules.scores import Rule, linear_rule
 from rpim_opt.convex.rules.selection import EDGES
@@ -267,13 +267,12 @@ def test_a_conflict_says_the_least_loosening_of_boxes() -> None:
     """A box in [2, 3] and one in [-1, 0.5] are 1.5 scales apart; components 3 on alone are in both."""
     upper = np.full(N, 0.5)
     upper[3:] = 10.0
-    found, stated = contradiction(box(2.0, 30.0), box(-1.0, upper))
+    found, _ = contradiction(box(2.0, 30.0), box(-1.0, upper))
     free = MODEL.parameters
     assert set(found.parameters) == set(free.names[:3])
     loosening = [found.parameters[name] / free.scale[i] for i, name in enumerate(free.names[:3])]
     assert loosening == pytest.approx([0.75] * 3, rel=1e-4)  # each box by half
     assert found.configurations == {}
-    assert _least(stated, MODEL, "configurations") == pytest.approx(np.zeros(10), abs=1e-6)
 
 
 def test_a_conflict_says_which_configurations_do_not_reach_their_bound() -> None:
@@ -310,14 +309,6 @@ def test_a_bound_that_is_nearly_reached_is_named_with_the_little_that_it_lacks()
     assert found is not None
     assert found.configurations
     assert 1e-4 < sum(found.configurations.values()) < 2e-2
-
-
-def test_what_is_not_needed_for_a_contradiction_is_left_out() -> None:
-    _, stated = contradiction(low, high)
-    z = cp.Variable(2)
-    units = [[Stated(name, (demand,))] for name, demand in (("a", z[0] >= 1), ("b", z[1] >= 0), ("c", z[0] <= 0))]
-    assert [[s.name for s in unit] for unit in _irreducible(units)] == [["a"], ["c"]]
-    assert stated.constrained
 
 
 # --- a rule's search ---------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import cvxpy as cp
@@ -14,8 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.rules import scores as select_scores
 from rpim_opt.convex.rules.curve import menger
-from rpim_opt.convex.rules.folds import AHEAD, _end_of_fall, _error_of_folds, _least, held_out_error
-from rpim_opt.convex.rules.scores import _lowest
+from rpim_opt.convex.rules.folds import held_out_error
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import SELECTORS, disagreement
 from rpim_opt.problem.linear import LinearModel
@@ -252,7 +250,7 @@ def test_a_search_by_holding_out_says_its_edges(values: str, edge: str) -> None:
     if values == "noise":
         b = np.random.default_rng(1).normal(size=60)
     program = ro.convex.pose(ro.tikhonov, NOISY.with_values(b))
-    chosen = _least(program, "mine", _error_of_folds(program, None))
+    chosen = ro.k_fold(program)
     if edge == "lower":
         assert (chosen.weight, chosen.interior) == (chosen.weights[0], False)
         assert "smallest weight of the grid is best" in chosen.note
@@ -284,59 +282,6 @@ def test_two_steps_are_those_of_the_paper() -> None:
     assert chosen.weight == chosen.weights[k]
     assert chosen.interior == (0 < k < 9)
     assert ("a wider search would go on" in chosen.note) != chosen.interior
-
-
-class Fall:
-    """A program whose residual norm falls by a tenth a weight, down to the one where the fall ends."""
-
-    def __init__(self, end: int, closed_form: bool):
-        self.closed_form = closed_form
-        self.end = end
-        self.asked: list[float] = []
-
-    def path(self, weights: np.ndarray) -> list[SimpleNamespace]:
-        places = len(self.asked) + np.arange(len(weights))
-        self.asked += weights.tolist()
-        norms = 0.9 ** np.minimum(places, self.end) * 0.991 ** np.maximum(places - self.end, 0)
-        return [SimpleNamespace(z=w, loss=norm**2) for w, norm in zip(weights, norms, strict=True)]
-
-
-@pytest.mark.parametrize("end", [0, 3, AHEAD - 2, AHEAD - 1, AHEAD, 17, 28])
-def test_a_fall_ends_where_one_more_step_brings_less_than_a_hundredth(end: int) -> None:
-    weights = np.geomspace(1.0, 1e-10, 30)
-    whole, some = Fall(end, closed_form=True), Fall(end, closed_form=False)
-    assert _end_of_fall(whole, weights) == _end_of_fall(some, weights) == weights[end]  # type: ignore[arg-type]
-    assert len(whole.asked) == 30
-    assert some.asked == weights[: AHEAD * ((end + 1) // AHEAD + 1)].tolist()  # no farther than where that is seen
-
-
-def test_a_fall_without_end_leaves_the_weight() -> None:
-    weights = np.geomspace(1.0, 1e-10, 30)
-    for closed_form in (True, False):
-        assert _end_of_fall(Fall(29, closed_form), weights) == weights[0]  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("best", [0, 1, 8, 9])
-def test_two_steps_say_an_edge(best: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def error(program: Any) -> Any:
-        return lambda weights: np.abs(np.arange(len(weights)) - best) + 1.0
-
-    monkeypatch.setattr("rpim_opt.convex.rules.folds._left_out_error", error)
-    chosen = ro.two_step(PROGRAM)
-    assert chosen.interior == (0 < best < 9)
-    assert ("a wider search would go on" in chosen.note) != chosen.interior
-
-
-@pytest.mark.parametrize("best", [0, 1, 198, 199])
-def test_holding_out_says_an_edge(best: int) -> None:
-    def error(weights: np.ndarray) -> np.ndarray:
-        return np.abs(np.arange(len(weights)) - best) + 1.0
-
-    chosen = _least(PROGRAM, "mine", error)
-    assert chosen.weight == chosen.weights[best]
-    assert chosen.interior == (0 < best < 199)
-    said = {0: "smallest weight of the grid", 199: "largest weight of the grid"}
-    assert said.get(best, "smallest error of configurations held out") in chosen.note
 
 
 def test_selectors_that_are_a_decade_apart_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,10 +323,10 @@ def test_frames_tell_nothing_of_how_large_deviations_are() -> None:
     assert pair[0] == pytest.approx(pair[1], rel=1e-3)
 
 
-def test_the_lowest_valley_goes_before_an_edge_where_edges_say_little() -> None:
-    score = np.array([-9.0, 1.0, 0.5, 2.0, 0.1, 0.1, 3.0, -8.0])
-    assert _lowest(score, local=True) == 5  # the end of a flat one
-    assert _lowest(score, local=False) == 0
-    assert _lowest(score[::-1], local=True) == 3
-    assert _lowest(np.arange(5.0), local=True) == 0
-    assert _lowest(-np.arange(5.0), local=True) == 4
+def test_a_corner_by_sections_is_found_to_a_hundredth() -> None:
+    """Of ln weight: both neighbours of the corner that were solved are as near."""
+    chosen = ro.corner(PROGRAM)
+    t = np.log(chosen.weights)
+    k = int(np.argmin(np.abs(t - np.log(chosen.weight))))
+    assert 0 < k < len(t) - 1
+    assert t[k + 1] - t[k - 1] <= 0.01 * (1 + 1e-9)

@@ -173,7 +173,7 @@ def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray]
 
 def _left_out_error(program: Program) -> Score:
     """Return what gives `held_out_error` of configurations left out one by one, with little solving."""
-    if program.closed_form and program.squared_rows:
+    if program.closed_form and program.squared is program.model:
         squares = _of_squares(Squared(program.squared, penalty_of(program), program.ridge))
         return lambda weights: np.sqrt(squares(weights) / len(program.model.b))
     if _approximates(program):

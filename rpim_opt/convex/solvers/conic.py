@@ -67,7 +67,9 @@ class Canonical:
         self.linear = int(dims.zero + dims.nonneg)
         self.offset = float(self._inverse[-1].get("offset", 0.0)) if isinstance(self._inverse[-1], dict) else 0.0
         A = sparse.coo_array(data["A"])
-        self.cone_sizes = _cone_sizes(dims, len(data["b"]))
+        sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
+        rest = len(data["b"]) - self.linear - sum(sizes)
+        self.cone_sizes = sizes + ([3] * (rest // 3) if rest % 3 == 0 else [rest])  # exponential and power cones
         self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
         self.A: Any = sparse.csr_array(
             (A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape
@@ -185,15 +187,6 @@ class Canonical:
         made.cones = [clarabel.NonnegativeConeT(inequalities) if "Nonneg" in str(cone) else cone for cone in self.cones]
         made.at = np.searchsorted(columns, self.at[kept])
         return made
-
-
-def _cone_sizes(dims: Any, m: int) -> list[int]:
-    """Return the numbers of rows of the cones behind equations and inequalities."""
-    sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
-    rest = m - int(dims.zero + dims.nonneg) - sum(sizes)
-    if rest % 3 == 0:  # exponential and power cones
-        return sizes + [3] * (rest // 3)
-    return [*sizes, rest]
 
 
 def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int]) -> tuple[Array, Array]:
