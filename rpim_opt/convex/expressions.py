@@ -28,8 +28,7 @@ else:
 
     cp = _Late("cvxpy")
 
-OPTIMAL, INFEASIBLE, UNBOUNDED = "optimal", "infeasible", "unbounded"
-INFEASIBLE_INACCURATE = "infeasible_inaccurate"
+OPTIMAL = "optimal"
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,9 @@ from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
-from rpim_opt.convex.solvers.conic import Damping, Squares, Unsolved, box_sides, nearest
+from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box_sides, nearest
 from rpim_opt.convex.solvers.separable import Rows
-from rpim_opt.convex.solvers.solve import Minimum, Warm, minimum
+from rpim_opt.convex.solvers.solve import Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.convex.trust import Trusted, kept_equations, outlying
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
@@ -244,8 +244,7 @@ class Program(Brief):
         form = self.structure.quadratic_of_r
         if form is None:
             return None
-        R, n = (self.squared if self.loss_form is not None else _squared(self.model, form)).triangle, self.structure.n
-        return Squares(R[:, :n], R[:, n], np.zeros(n))
+        return Squares.of_factor((_squared(self.model, form) if self.loss_form is None else self.squared).triangle)
 
     @property
     def _warm(self) -> Warm:
@@ -501,12 +500,11 @@ class Program(Brief):
         if slope is not None and self.structure.order is not None:
             slope = np.empty_like(slope)
             slope[self.structure.order] = found.slope
-        return self._at(found.z, weight), slope
+        return self._at(found.x[self.structure.canonical.at], weight), slope
 
     def derivative(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e."""
-        R, n = self.squared.triangle, self.structure.n
-        squares = Squares(R[:, :n], R[:, n], np.zeros(n))
+        squares, n = Squares.of_factor(self.squared.triangle), self.structure.n
         _, s, V = np.linalg.svd(squares.R)
         seen = s > RANK_TOLERANCE * s[0]
         s, V = s[seen], V[: len(s)][seen]
@@ -596,12 +594,13 @@ class Program(Brief):
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        if weight == 0 and damping is None and not self.constrained:
-            _, s, V = self.model.svd  # nothing says anything of directions that the data do not see: they stay nominal
-            found = replace(found, z=found.z - V[s == 0].T @ (V[s == 0] @ found.z))
-        return self._at(found.z, weight, self._duals(found, weight), found.iterations)
+        z = found.x[self.structure.canonical.at]
+        if weight == 0 and damping is None and not self.constrained:  # what the data do not see stays nominal
+            _, s, V = self.model.svd
+            z = z - V[s == 0].T @ (V[s == 0] @ z)
+        return self._at(z, weight, self._duals(found), found.iterations)
 
-    def _duals(self, found: Minimum, weight: float) -> tuple[Array, ...]:
+    def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
         canonical = self.structure.canonical
         if not self.formulation.constraints:

@@ -275,8 +275,12 @@ class Squares:
         """Return the squares of rows (m, n) and (m,), reduced by QR."""
         n = A.shape[1]
         T = np.linalg.qr(np.column_stack([A, b]), mode="r")
-        T = np.vstack([T, np.zeros((n + 1 - len(T), n + 1))])
-        return cls(T[:, :n], T[:, n], np.zeros(n) if g is None else g)
+        return cls.of_factor(np.vstack([T, np.zeros((n + 1 - len(T), n + 1))]), g)
+
+    @classmethod
+    def of_factor(cls, T: Array, g: Array | None = None) -> Squares:
+        """Return the squares of a QR factor (n + 1, n + 1) of [A b]."""
+        return cls(T[:, :-1], T[:, -1], np.zeros(len(T) - 1) if g is None else g)
 
     def damped(self, damping: Damping | None) -> Squares:
         """Return the squares with damping added."""

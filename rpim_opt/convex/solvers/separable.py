@@ -77,8 +77,7 @@ class Rows:
     @cached_property
     def squares(self) -> Squares:
         """|A z - b|^2, reduced."""
-        n = self.A.shape[1]
-        return Squares(self.triangle[:, :n], self.triangle[:, n], np.zeros(n))
+        return Squares.of_factor(self.triangle)
 
     @cached_property
     def whitened(self) -> tuple[Array, Array]:
@@ -92,15 +91,11 @@ class Rows:
 
     def spread(self, v: Array) -> Array:
         """Return numbers of entries (N,) by equation (m,)."""
-        if self.sizes is None:
-            return v
-        return np.repeat(v, self.sizes)
+        return v if self.sizes is None else np.repeat(v, self.sizes)
 
     def entries(self, r: Array) -> Array:
         """Return what the loss gets of a residual (m,): itself, or the norms of the configurations (N,)."""
-        if self.sizes is None:
-            return r
-        return np.sqrt(np.add.reduceat(r * r, self.starts))
+        return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
     def places(self, which: np.ndarray) -> np.ndarray:
         """Return the places of the equations of some entries."""

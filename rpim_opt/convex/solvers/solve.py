@@ -63,17 +63,6 @@ class Warm:
         return other
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """A minimum z (n,), x (N,) of the penalty's form, multipliers of its rows, the loss's slopes where known."""
-
-    z: Array
-    x: Array
-    dual: Array
-    iterations: int
-    slope: Array | None = None
-
-
 def minimum(
     loss: Loss | None,
     rows: Rows,
@@ -82,7 +71,7 @@ def minimum(
     squares: Squares | None = None,
     damping: Damping | None = None,
     accuracy: float = 0.0,
-) -> Minimum:
+) -> Point:
     """Return the minimum of a convex program; what solves it is told by the structure of the loss.
 
     ========================== =====================================================
@@ -108,9 +97,8 @@ def minimum(
                 point = _separable(loss, loss.summands, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
                 point = _all_rows(loss, rows, warm, weight, None, damping)
-        z = point.x[warm.penalty.at]
-        warm.z, warm.x = z, point.x
-        return Minimum(z, point.x, point.dual, point.iterations, point.slope)
+        warm.z, warm.x = point.x[warm.penalty.at], point.x
+        return point
 
 
 def _separable(
