@@ -29,18 +29,9 @@ LOOKS = 4
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was estimated, ready for a fit at weight 1.
+    """What was estimated, ready for a fit at weight 1 from x (n,) [SI].
 
-    Parameters
-    ----------
-    problem
-        With local scales, noise and model extensions, without outliers.
-    learned
-        The hyperparameters.
-    stated
-        The prior, in units of those scales.
-    x
-        (n,) where to begin [SI].
+    The problem has local scales, noise and model extensions, without outliers; ``stated`` is the prior in its units.
     """
 
     problem: Source
@@ -52,16 +43,8 @@ class Found:
 def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
     """Return hyperparameters, model extensions and outliers of a problem, laid into it.
 
-    Parameters
-    ----------
-    problem
-        With stated scales.
-    estimator
-        With the prior, and the parts of the noise to estimate.
-    model
-        ``"geometry"``, or ``"auto"`` for the model extensions that the marginal likelihood selects.
-    start
-        (n,) where to begin [SI], or None.
+    ``model`` is ``"geometry"``, or ``"auto"`` for the extensions that the marginal likelihood selects; ``start`` (n,)
+    [SI] or None.
     """
     try:
         return _found(problem, estimator, model, start)
@@ -114,7 +97,7 @@ def _first(every: CalibrationProblem, estimator: Estimator, x: Array) -> tuple[E
     whole = estimator.fit(every, x, None, ROUNDS)
     if not estimator.prior.doubted:
         return estimator, whole, ()
-    plain = replace(estimator, prior=estimator.prior.without_centre())
+    plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, doubted=False))
     without = plain.fit(every, x, None, ROUNDS)
     fall = without.point.value - whole.point.value
     if fall >= ASKED:

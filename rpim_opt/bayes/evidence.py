@@ -28,12 +28,11 @@ few data do not identify each scale alone."""
 FARTHEST = 7.0
 """Logarithms of hyperparameters farther from their prior medians are implausible."""
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
-"""Largest change of the logarithms of local variances at their fixed point, and on the way to an optimum; iterations
-that they may take."""
+"""Largest change of logarithms of local variances at their fixed point, and on the way to an optimum; iterations."""
 STEEPEST = 0.8
 """Bound on the slope of the fixed-point map of one local variance: its steps are at most five times the map's."""
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
-"""Changes of the logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
+"""Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
 BASIN = 0.3
 """Logarithms of hyperparameters within which of a known optimum no other is looked for."""
 FIRST_RADIUS, LARGEST_RADIUS = 2.0, 3.0
@@ -69,10 +68,9 @@ class Spectrum(NamedTuple):
 class Hierarchy:
     """Hierarchical prior of p deviations, in units of their scales.
 
-    ``group`` (p,) numbers the groups ``names`` whose scale multiplies a deviation's, -1 without one; deviations are
-    normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom; those ``replaced`` (p,) have no prior of
-    their own. rows z - values ~ N(0, I) besides. The last deviations may have the variances of a ``spectrum``.
-    ``covariance`` (g, g) is that of the logarithms of the groups' scales before the data.
+    Normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom, those ``replaced`` (p,) without a prior
+    of their own. The scale of a group ``names[group]`` (p,) multiplies a deviation's, none at -1; ``covariance`` (g, g)
+    is that of the scales' logarithms. The last deviations may have a ``spectrum``. rows z - values ~ N(0, I) besides.
     """
 
     group: np.ndarray
@@ -186,22 +184,12 @@ def noise_share(stack: Stack, kind: str) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """The marginal likelihood at some hyperparameters, with derivatives by their s logarithms, q of them of noise.
+    """The marginal likelihood at logarithms of hyperparameters (s,): scales of deviations, then q of noise.
 
-    Parameters
-    ----------
-    logs
-        (s,) logarithms of the hyperparameters: scales of deviations, then noise.
-    value, gradient, curvature
-        -2 ln of the restricted likelihood and of the hyperprior, with first (s,) and second derivatives (s, s).
-    z, C
-        (p,) and (p, p): posterior mean and covariance of the deviations, in units of the scales.
-    v
-        (p,) local variances: the prior's that a Tikhonov program has at these hyperparameters.
-    slopes
-        (p, s) of z.
-    own, noise
-        (p, s) and (q, p, p): the deviations' information C^-1 falls by diag(own), and by the latter for noise.
+    ``value`` is -2 ln of the restricted likelihood and of the hyperprior, with ``gradient`` (s,) and ``curvature``
+    (s, s). ``z`` (p,), ``C`` (p, p) are posterior mean and covariance of the deviations, ``v`` (p,) the variances of a
+    Tikhonov program with these, ``slopes`` (p, s) those of z. The information C^-1 falls by diag(``own`` (p, s)),
+    and by ``noise`` (q, p, p).
     """
 
     logs: Array
@@ -252,16 +240,7 @@ class Evidence:
 
         2 u'R_a P R_b u - tr(P R_a P R_b) + tr(P R_ab) - u'R_ab u - sum (de^2 / da at constant v) (dln v / db) / v
 
-    Parameters
-    ----------
-    data
-        The equations.
-    prior
-        Of the deviations.
-    noise
-        Which parts of the noise are estimated: names of `CENTRES`.
-    fixed
-        The other parts.
+    ``noise`` names the parts of the noise that are estimated (`CENTRES`), ``fixed`` has the others.
     """
 
     data: Linearized
@@ -575,17 +554,14 @@ def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.
 
 
 def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, tails: float) -> Array:
-    """Return by what deviations move (p, h): D, with D D' what tails add to their covariance C.
+    """Return D (p, h), with D D' what tails of deviations (h,) with scales tau (h,) add to the covariance C.
 
-    The normal of variance v_j that stands for the t_nu of a deviation j has its curvature at the mean, not its width:
-    where nothing decides z_j, v_j is tau^2, and a t_3's variance is three times as much. What the data say of z_j,
-    apart from that normal, has the precision p = 1 / C_jj - 1 / v_j and the mean z_j / (C_jj p). V_j is the variance
-    of that times t_nu, and w_j = 1 / V_j - p the precision that a normal in the place of the tails needs to agree::
+    The normal of variance v_j that stands for the t_nu of a deviation j has its curvature at the mean, not its width.
+    What the data say of z_j, apart from that normal, has the precision p = 1 / C_jj - 1 / v_j and the mean
+    z_j / (C_jj p). V_j is the variance of that times t_nu, and w_j = 1 / V_j - p the precision that a normal in the
+    place of the tails needs to agree (one step of expectation propagation; means stay)::
 
         C + D D' = (C^-1 - diag(1 / v - w))^-1        D = C B L^-T,    B B' = diag(1 / v - w),    L L' = I - B'C B
-
-    Means stay (one step of expectation propagation). ``heavy`` (h,) numbers the deviations with tails, ``size`` (h,)
-    are the scales tau of their groups.
     """
     c = C.diagonal()[heavy]
     local = v[heavy]

@@ -27,15 +27,29 @@ from rpim_opt.robot.parameters import Parameters
 
 OTHERS = "others"
 """What the parameters are called that no group names: their weight is 1."""
+Objective = Callable[[Array], tuple[float, Array]]
+"""From logarithms of weights (G,) to a score and its gradient (G,)."""
+EXACT = 1e-15
+"""Relative accuracy of a likelihood: its logarithm is large beside what decides."""
+EDGE = 1e-3
+"""Logarithms this close to a bound are at it."""
+APART = np.log(100.0)
+"""By how much a start leaves the best common weight in one group."""
+BEYOND = 1e6
+"""Factor by which the weight of a group may leave the range in which a single one changes the estimate."""
+COMMON = 41
+"""Common weights that are tried first, for the valleys to start from."""
+AROUND = 1e2
+"""Factors from the corner of the L-curve within which that of several weights is sought: rules of one weight differ
+by no more, and further out a deviation's logarithm falls without end."""
+SIDES = ("the data want no penalty", "the data want no deviation")
+"""What it means that a group is at the lower or at the upper bound."""
+FACTORS = np.geomspace(1e-3, 1e3, 61)
+"""By which all weights together are multiplied, to show how sharp a choice is."""
 
 
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """The minimum of the objective at some weights.
-
-    ``z`` (n,), ``inverse`` (n, n) of half the Hessian, ``misfit`` |A z - b|^2 with the statements, ``sizes`` (G,) the
-    squared deviations of the groups.
-    """
+class Minimum(NamedTuple):
+    """z (n,) and the inverse of half the Hessian at some weights, the misfit |A z - b|^2, |z_g|^2 of groups (G,)."""
 
     z: Array
     inverse: Array
@@ -47,35 +61,9 @@ class Minimum:
 class Grouped:
     """Minimize |A z - b|^2 + sum_j w_j own_j (z_j - centre_j)^2 + |rows z - values|^2, with a weight w_g a group.
 
-    Parameters
-    ----------
-    model
-        The equations, in units of the scales without weights.
-    own
-        (n,) 1 for parameters that are penalized, 0 for those that only statements hold.
-    centre
-        (n,) about which.
-    rows, values
-        (k, n) and (k,) of statements.
-    names
-        Of the G groups whose weights are to be chosen.
-    member
-        (n,) the number of a parameter's group; -1: its weight is given.
-    given
-        (n,) weights of the others.
-    told
-        Given weights by the keys that they were given under.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> model = problem.linearize(np.zeros(34))
-    >>> from rpim_opt.bayes.group_weights import Grouped
-    >>> kinds = Grouped.of(model, {"alpha theta": None, "a d": None, "tool": 2.0})
-    >>> kinds.names, kinds.penalty(np.log([0.1, 10.0])).round(1)[:5], kinds.at(np.zeros(2)).z.shape
-    (('alpha theta', 'a d'), array([ 0.1, 10. ,  0.1, 10. ,  0.1]), (34,))
+    The equations of ``model`` are in units of the scales without weights; ``own`` (n,) is 0 for parameters that only
+    statements ``rows`` (k, n), ``values`` (k,) hold. The weights of the G groups ``names`` are to be chosen: ``member``
+    (n,) is the number of a parameter's group, -1 where its weight is ``given`` (n,), ``told`` by its key.
     """
 
     model: LinearModel
@@ -112,8 +100,7 @@ class Grouped:
         """Return the minimum at logarithms t (G,) of the weights."""
         R, r = self.triangle
         z, inverse = minimum(R, r, self.penalty(t), self.centre)
-        away = self.own * (z - self.centre) ** 2
-        return Minimum(z, inverse, float(np.sum((R @ z - r) ** 2)), self.sums(away))
+        return Minimum(z, inverse, float(np.sum((R @ z - r) ** 2)), self.sums(self.own * (z - self.centre) ** 2))
 
     def sums(self, each: Array) -> Array:
         """Return the sums (G,) over the groups of numbers (n,)."""
@@ -124,15 +111,14 @@ class Grouped:
     def slopes(self, t: Array, minimum: Minimum) -> Array:
         """Return dz / dt (n, G) at a minimum."""
         pull = self.penalty(t) * (minimum.z - self.centre)
-        columns = np.zeros((len(pull), len(self.names)))
-        chosen = np.flatnonzero(self.member >= 0)
-        columns[chosen, self.member[chosen]] = pull[chosen]
+        columns = pull[:, None] * (self.member[:, None] == np.arange(len(self.names)))
         return -minimum.inverse @ columns
 
-    def robot(self) -> Reduced:
-        """Return the same without its fixed effects: frames that no group of frames alone has, and what is not held.
+    def robot(self) -> tuple[Grouped, Array, Array, int]:
+        """Return the penalty of the robot alone, |R z - r|^2 of its rows R (k, n'), and how many equations these are.
 
-        How far a tripod stands says nothing about a gear. The rows are projected off their columns.
+        Frames are fixed effects unless a group is theirs alone, as is what has no penalty: how far a tripod stands says
+        nothing about a gear. The rows are projected off their columns.
         """
         frames = self.model.parameters.placed
         alone = [g for g in range(len(self.names)) if frames[self.member == g].all()]
@@ -143,26 +129,10 @@ class Grouped:
         U, s, _ = np.linalg.svd(columns / np.where(norms > 0, norms, 1.0), full_matrices=False)
         U = U[:, s > RANK_TOLERANCE * np.max(s, initial=0.0)]
         kept = np.flatnonzero(~free)
-        rest = replace(
-            self,
-            own=self.own[kept],
-            centre=self.centre[kept],
-            member=self.member[kept],
-            given=self.given[kept],
-        )
+        parts = {key: getattr(self, key)[kept] for key in ("own", "centre", "member", "given")}
         left = R[:, kept] - U @ (U.T @ R[:, kept])
         equations = self.model.equations + len(self.values) - U.shape[1]
-        return Reduced(rest, left, r - U @ (U.T @ r), equations)
-
-
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """What is left without the fixed effects: |R z - r|^2 of R (k, n'), and how many equations that stands for."""
-
-    grouped: Grouped
-    R: Array
-    r: Array
-    equations: int
+        return replace(self, **parts), left, r - U @ (U.T @ r), equations
 
 
 def minimum(R: Array, r: Array, penalty: Array, centre: Array) -> tuple[Array, Array]:
@@ -172,7 +142,6 @@ def minimum(R: Array, r: Array, penalty: Array, centre: Array) -> tuple[Array, A
     """
     root = np.sqrt(penalty)
     stacked = np.vstack([R, np.diag(root)])
-    right = np.append(r, root * centre)
     size = np.linalg.norm(stacked, axis=0)
     size[size == 0] = 1.0
     Q, T = np.linalg.qr(stacked / size)
@@ -181,7 +150,7 @@ def minimum(R: Array, r: Array, penalty: Array, centre: Array) -> tuple[Array, A
     else:
         inverse = solve_triangular(T, np.eye(len(size)))
     scaled = inverse / size[:, None]
-    return scaled @ (Q.T @ right), scaled @ scaled.T
+    return scaled @ (Q.T @ np.append(r, root * centre)), scaled @ scaled.T
 
 
 # --- which parameters a group has ------------------------------------------------------------------------------
@@ -199,55 +168,43 @@ class Members(NamedTuple):
 def members(free: Parameters, weights: Mapping[str, Any]) -> Members:
     """Return which group every identified parameter is in, and which weights are given.
 
-    Parameters
-    ----------
-    free
-        The identified parameters.
-    weights
-        By patterns, names, or kinds (``"alpha"``, ``"tool"``, ``"length"``), several with a space between; a number is
-        a given weight. ``"by_kind"`` and ``"by_link"`` stand for a group each.
-
-    Raises
-    ------
-    InputError
-        For a key that names nothing, a parameter in two groups, and weights that are not above zero.
+    Keys are patterns, names, or kinds (``"alpha"``, ``"tool"``, ``"length"``), several with a space between, and
+    ``"by_kind"`` and ``"by_link"`` stand for a group each; a number is a given weight. InputError for a key that names
+    nothing, a parameter in two groups, and weights that are not above zero.
     """
+    if not weights:
+        raise InputError("weight", "an empty mapping", "patterns of parameters with their weights")
+    every = {"by_kind": _kind, "by_link": _link}
+    written: dict[str, Any] = {}
+    for key, weight in weights.items():
+        keys = dict.fromkeys(map(every[key], free.names)) if key in every else [key]
+        written |= dict.fromkeys(keys, weight)
     member = np.full(len(free), -1)
     given = np.ones(len(free))
     taken: dict[int, str] = {}
     names: list[str] = []
     told: dict[str, float] = {}
-    for key, weight in _written_out(free, weights).items():
+    for key, weight in written.items():
         places = _places(key, free)
         for i in places:
             if i in taken:
                 found = f"'{free.names[i]}' in '{taken[i]}' and in '{key}'"
                 raise InputError("weight", found, "every parameter in one group")
             taken[i] = key
-        if isinstance(weight, int | float | np.number) and not isinstance(weight, bool):
-            if not (np.isfinite(weight) and weight > 0):
-                raise InputError("weight", f"{weight} for '{key}'", "a finite number above zero, or a selector")
-            given[places] = told[key] = float(weight)
-        else:
+        if not _is_number(weight):
             member[places] = len(names)
             names.append(key)
+        elif np.isfinite(weight) and weight > 0:
+            given[places] = told[key] = float(weight)
+        else:
+            raise InputError("weight", f"{weight} for '{key}'", "a finite number above zero, or a selector")
     if len(taken) < len(free):
         told[OTHERS] = 1.0
     return Members(tuple(names), member, given, told)
 
 
-def _written_out(free: Parameters, weights: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the mapping with every kind, or every link, in the place of ``by_kind`` and ``by_link``."""
-    if not weights:
-        raise InputError("weight", "an empty mapping", "patterns of parameters with their weights")
-    every = {"by_kind": _kind, "by_link": _link}
-    written: dict[str, Any] = {}
-    for key, weight in weights.items():
-        if key in every:
-            written |= dict.fromkeys(dict.fromkeys(map(every[key], free.names)), weight)
-        else:
-            written[key] = weight
-    return written
+def _is_number(weight: Any) -> bool:
+    return isinstance(weight, int | float | np.number) and not isinstance(weight, bool)
 
 
 def _kind(name: str) -> str:
@@ -270,9 +227,9 @@ def _places(key: Any, free: Parameters) -> list[int]:
     if not isinstance(key, str) or not key.split():
         raise InputError("weight", f"key {key!r}", "patterns of parameters, 'a? d?'")
     places: list[int] = []
-    groups = free.groups
+    kinds = [(_kind(name), _link(name), group) for name, group in zip(free.names, free.groups, strict=True)]
     for token in key.split():
-        met = [i for i, name in enumerate(free.names) if _meant(token, name, groups[i])]
+        met = [i for i, name in enumerate(free.names) if fits(name, token) or token in kinds[i]]
         if not met:
             known = [*dict.fromkeys(map(_kind, free.names)), *free.names]
             raise InputError("weight", f"'{token}'", "kinds, names or patterns: " + choices(token, known))
@@ -280,59 +237,14 @@ def _places(key: Any, free: Parameters) -> list[int]:
     return places
 
 
-def _meant(token: str, name: str, group: str) -> bool:
-    return fits(name, token) or token in (_kind(name), _link(name), group)
-
-
-Objective = Callable[[Array], tuple[float, Array]]
-"""From logarithms of weights (G,) to a score and its gradient (G,)."""
-GroupSelector = Callable[[Grouped], Selection]
-EXACT = 1e-15
-"""Accuracy of a likelihood: its logarithm is large beside what decides."""
-EDGE = 1e-3
-"""Logarithms this close to a bound are at it."""
-APART = np.log(100.0)
-"""By how much a start leaves the best common weight in one group."""
-BEYOND = 1e6
-"""Factor by which the weight of a group may leave the range in which a single one changes the estimate."""
-COMMON = 41
-"""Common weights that are tried first, for the valleys to start from."""
-AROUND = 1e2
-"""Factors from the corner of the L-curve within which that of several weights is sought: rules of one weight differ
-by no more, and further out a deviation's logarithm falls without end."""
-SIDES = ("the data want no penalty", "the data want no deviation")
-"""What it means that a group is at the lower or at the upper bound."""
-FACTORS = np.geomspace(1e-3, 1e3, 61)
-"""By which all weights together are multiplied, to show how sharp a choice is."""
+# --- rules -----------------------------------------------------------------------------------------------------
 
 
 def reml_groups(grouped: Grouped) -> Selection:
     """Choose the most likely weights: restricted maximum likelihood with a variance a group (Patterson, Thompson 1971).
 
-    With the noise level profiled out and frames as fixed effects, as `reml` has them; H = A'A + diag(w), and Q the
-    least objective::
-
-        m ln Q + ln det H - sum_j ln w_j,      gradient    m w_g |z_g|^2 / Q + w_g tr_g(H^-1) - n_g
-
-    Minimized from several starts. The optimum where all is noise counts only if there is no other, and then the
-    weights are 1.
-
-    Parameters
-    ----------
-    grouped
-        The equations, and which parameters share a weight.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.bayes.group_weights import Grouped
-    >>> from rpim_opt.bayes.group_weights import reml_groups
-    >>> model = ro.load("position").problem.linearize(np.zeros(34))
-    >>> alone = reml_groups(Grouped.of(model, {"*": None})).groups["*"]
-    >>> single = ro.reml(ro.convex.pose(ro.tikhonov, model)).weight
-    >>> bool(abs(np.log(alone / single)) < 1e-5)
-    True
+    With the noise level profiled out and frames as fixed effects, as `reml` has them. Minimized from several starts.
+    The optimum where all is noise counts only if there is no other, and then the weights are 1.
     """
     if grouped.model.constrained:
         note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
@@ -348,46 +260,32 @@ def reml_groups(grouped: Grouped) -> Selection:
 
 
 def restricted_likelihood(grouped: Grouped) -> Objective:
-    """Return -2 ln(restricted likelihood) of logarithms of weights (G,), up to a constant, with its gradient."""
-    reduced = grouped.robot()
-    rest = reduced.grouped
+    """Return -2 ln(restricted likelihood) of logarithms of weights (G,), up to a constant, with its gradient.
+
+    H = A'A + diag(w), and Q the least objective::
+
+        m ln Q + ln det H - sum_j ln w_j,      gradient    m w_g |z_g|^2 / Q + w_g tr_g(H^-1) - n_g
+    """
+    rest, R, r, equations = grouped.robot()
     counts = rest.sums(rest.own)
-    tiny = np.finfo(float).tiny
 
     def objective(t: Array) -> tuple[float, Array]:
         weights = rest.penalty(t)
-        z, inverse = minimum(reduced.R, reduced.r, weights, rest.centre)
+        z, inverse = minimum(R, r, weights, rest.centre)
         away = weights * (z - rest.centre) ** 2
-        Q = max(float(np.sum((reduced.R @ z - reduced.r) ** 2) + np.sum(away)), tiny)
-        value = reduced.equations * np.log(Q) - np.linalg.slogdet(_unit(inverse, weights))[1]
-        slope = reduced.equations * rest.sums(away) / Q + rest.sums(weights * np.diag(inverse)) - counts
-        return float(value), slope
+        Q = max(float(np.sum((R @ z - r) ** 2) + np.sum(away)), np.finfo(float).tiny)
+        root = np.sqrt(weights)
+        value = equations * np.log(Q) - np.linalg.slogdet(inverse * np.outer(root, root))[1]
+        return float(value), equations * rest.sums(away) / Q + rest.sums(weights * np.diag(inverse)) - counts
 
     return objective
-
-
-def _unit(inverse: Array, weights: Array) -> Array:
-    """Return W^1/2 H^-1 W^1/2, whose determinant is that of the prior's part in the likelihood."""
-    root = np.sqrt(weights)
-    return inverse * np.outer(root, root)
 
 
 def k_fold_groups(grouped: Grouped, folds: int = 10, seed: int = 0) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974).
 
     The squared residuals of configurations held out, predicted from all others; minimized from several starts.
-
-    Parameters
-    ----------
-    grouped
-        The equations, and which parameters share a weight.
-    folds, seed
-        Into how many parts the configurations are divided, and of the division.
-
-    Raises
-    ------
-    InputError
-        For fewer configurations than folds, and where only the triangle of the equations is kept.
+    InputError for fewer configurations than folds, and where only the triangle of the equations is kept.
     """
     model = grouped.model
     if model.stands_for is not None:
@@ -406,7 +304,9 @@ def k_fold_groups(grouped: Grouped, folds: int = 10, seed: int = 0) -> Selection
 def held_out(grouped: Grouped, out: list[np.ndarray]) -> Objective:
     """Return the sum of squared residuals of rows held out, of logarithms of weights (G,), with its gradient."""
     model = grouped.model
-    parts = [(_without(grouped, rows), model.A[rows], model.b[rows]) for rows in out]
+    parts = [
+        (replace(grouped, model=model.scaled(np.where(rows, 0.0, 1.0))), model.A[rows], model.b[rows]) for rows in out
+    ]
 
     def objective(t: Array) -> tuple[float, Array]:
         value, slope = 0.0, np.zeros(len(t))
@@ -420,33 +320,21 @@ def held_out(grouped: Grouped, out: list[np.ndarray]) -> Objective:
     return objective
 
 
-def _without(grouped: Grouped, rows: np.ndarray) -> Grouped:
-    return replace(grouped, model=grouped.model.scaled(np.where(rows, 0.0, 1.0)))
-
-
 def minimum_distance(grouped: Grouped) -> Selection:
     """Choose the point of the L-hypersurface that is nearest to its origin (Belge, Kilmer and Miller 2002).
 
     The L-curve of several weights is a surface over the logarithms of residual and deviations,
     (ln |A z - b|^2, ln |z_1|^2, ..., ln |z_G|^2). Its corner is taken for the point nearest to where all of them are
     least: the residual at small weights, the deviations at large ones (Inverse Problems 18:1161), a hundredth and a
-    hundredfold of the weight at the corner of the L-curve of one. It holds back more than `reml_groups` does.
-
-    Parameters
-    ----------
-    grouped
-        The equations, and which parameters share a weight.
+    hundredfold of the weight at the corner of the L-curve of one. It penalizes more than `reml_groups` does.
     """
     centre = np.log(l_curve(pose(tikhonov, grouped.model)).weight)
-    low, high = centre - np.log(AROUND), centre + np.log(AROUND)
-    count = len(grouped.names)
-    least = grouped.at(np.full(count, low))
-    most = grouped.at(np.full(count, high))
+    bounds = (centre - np.log(AROUND), centre + np.log(AROUND))
+    least, most = (grouped.at(np.full(len(grouped.names), bound)) for bound in bounds)
     objective = distance(grouped, np.log(least.misfit), np.log(most.sizes))
-    t = _least(objective, (low, high), count)
+    t = _least(objective, bounds, len(grouped.names))
     sides = ("at the least weight", "at the largest weight")
-    note = "nearest to the origin of the L-hypersurface"
-    return _selection(grouped, "l_curve", objective, t, (low, high), note, sides)
+    return _selection(grouped, "l_curve", objective, t, bounds, "nearest to the origin of the L-hypersurface", sides)
 
 
 def distance(grouped: Grouped, misfit: float, sizes: Array) -> Objective:
@@ -467,6 +355,7 @@ def distance(grouped: Grouped, misfit: float, sizes: Array) -> Objective:
     return objective
 
 
+GroupSelector = Callable[[Grouped], Selection]
 RULES: dict[str, Callable[..., Selection]] = {
     "reml": reml_groups,
     "k_fold": k_fold_groups,
@@ -480,14 +369,9 @@ _INSTEAD: dict[Any, str] = {reml: "reml", k_fold: "k_fold", l_curve: "l_curve"}
 def rule_of(weights: Mapping[str, Any]) -> GroupSelector | None:
     """Return the selector that a mapping of weights asks for; None where all are numbers.
 
-    Raises
-    ------
-    InputError
-        For two different ones, and for what serves a single weight only.
+    InputError for two different ones, and for what serves a single weight only.
     """
-    asked = [
-        each for each in weights.values() if isinstance(each, bool) or not isinstance(each, int | float | np.number)
-    ]
+    asked = [each for each in weights.values() if not _is_number(each)]
     if not asked:
         return None
     first = asked[0]
@@ -529,20 +413,17 @@ def _least(objective: Objective, bounds: tuple[float, float], count: int, accura
     if count > 1:
         sides = [common[best] + sign * APART * one for one in np.eye(count) for sign in (-1, 1)]
         starts += [np.clip(side, low, high) for side in sides]
-    how: dict[str, Any] = {
-        "jac": True,
-        "method": "L-BFGS-B",
-        "bounds": [bounds] * count,
-        "options": {"ftol": accuracy, "gtol": 1e-9, "maxiter": 500},
-    }
-    found = [scipy.optimize.minimize(objective, start, **how) for start in starts]
+    options = {"ftol": accuracy, "gtol": 1e-9, "maxiter": 500}
+    found = [
+        scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[bounds] * count, options=options)
+        for start in starts
+    ]
     least = min(found, key=lambda each: (bool(_at_edges(each.x, bounds).all()), float(each.fun)))
     return np.asarray(least.x, dtype=float)
 
 
 def _at_edges(t: Array, bounds: tuple[float, float]) -> np.ndarray:
-    low, high = bounds
-    return (t <= low + EDGE) | (t >= high - EDGE)
+    return (t <= bounds[0] + EDGE) | (t >= bounds[1] - EDGE)
 
 
 def _selection(

@@ -12,15 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
 from rpim_opt.basics.threads import phase
-from rpim_opt.bayes.evidence import (
-    FARTHEST,
-    Evidence,
-    Hierarchy,
-    Linearized,
-    Point,
-    Spectrum,
-    scale_covariance,
-)
+from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, Spectrum, scale_covariance
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
@@ -110,10 +102,9 @@ class Learned(Brief):
     stated
         (n,) the scales that were stated for what is identified [SI].
     drift
-        (n, s + h) by what the deviations move with the hyperparameters, and with their tails [SI]: D, with D D' what
-        that adds to the covariance that ordinary Tikhonov has at the estimated scales. Deviations are the same.
+        (n, k) D, with D D' what the uncertainty of hyperparameters and heavy tails add to the covariance [SI].
     added
-        Parameters of model extensions that were added to those that were to be identified.
+        Parameters of model extensions that were added.
     notes
         Sentences on how far the marginal likelihood decides.
     curves
@@ -213,18 +204,10 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """How the hyperparameters of problems are estimated.
+    """How the hyperparameters of problems are estimated: with which prior, and which parts of the noise.
 
-    Parameters
-    ----------
-    prior
-        Of the deviations.
-    noise
-        Parts of the noise that are estimated, where the data have such equations.
-    refit
-        How a Tikhonov fit at weight 1 goes on from one linearization; without it the posterior mean stands for one.
-    curves
-        Transmission errors of joints, whose coefficients are the last parameters of a problem.
+    ``refit`` continues a Tikhonov fit at weight 1 from one linearization; without it the posterior mean stands for one.
+    The coefficients of ``curves``, transmission errors of joints, are the last parameters of a problem.
     """
 
     prior: Prior
@@ -273,18 +256,9 @@ class Estimator:
         return tuple(kind for kind in self.noise if kind in have)
 
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
-        """Return hyperparameters and deviations that agree with each other.
+        """Return hyperparameters and deviations that agree with each other, after some linearizations at most.
 
-        Parameters
-        ----------
-        problem
-            Without what is to be estimated.
-        x
-            (n,) where to begin [SI].
-        before
-            Logarithms of hyperparameters to begin with, or None.
-        rounds
-            Linearizations at most.
+        From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known.
         """
         fit = self._once(problem, x, before, before is None, ITERATIONS)
         for k in range(1, rounds):
@@ -314,7 +288,7 @@ class Estimator:
         fit = Fit(problem, stated, evidence, point, others, laid, mean)
         if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
             return fit
-        return replace(fit, x=self.refit(laid, self.prior.penalized(tikhonov, fit.inside), x, iterations))
+        return replace(fit, x=self.refit(laid, fit.inside.penalized(tikhonov), x, iterations))
 
 
 def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
@@ -403,7 +377,6 @@ def _growth(evidence: Evidence, point: Point) -> Array:
     scatter = evidence.scatter(point.logs)
 
     def read(scatter: Scatter) -> float:
-        """Return the variance of what is read, summed over those equations."""
         variances = [np.einsum("nkk->nk", stack.covariance(scatter)) for stack in evidence.data.stacks]
         return sum(float(np.sum(v[_read(stack)])) for v, stack in zip(variances, evidence.data.stacks, strict=True))
 

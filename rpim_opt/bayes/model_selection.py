@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -57,6 +57,8 @@ OWNED = {
     WARMTH: ("expansion",),
 }
 """Extensions whose evidence is asked for at a result, and the terms that stand for them."""
+NOISE = ("position", "orientation", "joint")
+"""Parts of the noise of a comparison at a result."""
 KNOWN = Prior(joint_offset=1.0, frames=1.0)
 """The prior once scales were estimated: they are as the problem says."""
 
@@ -73,37 +75,31 @@ class Candidate(NamedTuple):
 
 
 def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
-    """Return the parameters of every extension that these data may identify and that are not identified yet."""
-    found: dict[str, tuple[str, ...]] = {}
+    """Return the parameters of every extension that these data may identify and that are not identified yet.
+
+    Of harmonics those of joints that turned far enough.
+    """
+    found: dict[str, list[str]] = {}
     known = set(problem.parameters.free.names)
-    for robot in problem.arms:
-        for family, names in _of_robot(problem, robot).items():
-            found[family] = tuple(dict.fromkeys((*found.get(family, ()), *(n for n in names if n not in known))))
+    for robot, arm in problem.arms.items():
+        travel = np.ptp(problem.alone(robot).joint_values, axis=0)
+        for family, names in families(arm).items():
+            if family in TURNED:
+                turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[family]}
+                names = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
+            found.setdefault(family, []).extend(problem.parameters.called(robot, name) for name in names)
     prefixes = {session_prefix(name) for name in problem.data.sessions}
     if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
-        found[SESSIONS] = tuple(n for n in problem.parameters.names if frame_of(n) in prefixes and n not in known)
-    grows = tuple(n for n in problem.parameters.names if own_name(n) == EXPANSION and n not in known)
+        found[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
+    grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
         found[WARMTH] = grows
-    return {family: names for family, names in found.items() if names}
+    new = {family: tuple(dict.fromkeys(n for n in names if n not in known)) for family, names in found.items()}
+    return {family: names for family, names in new.items() if names}
 
 
-def _of_robot(problem: CalibrationProblem, robot: str) -> dict[str, list[str]]:
-    """Return the parameters of the extensions of one robot, of harmonics those of joints that turned far enough."""
-    q = problem.alone(robot).joint_values
-    travel = np.ptp(q, axis=0)
-    found = {}
-    for family, names in families(problem.arms[robot]).items():
-        left = names
-        if family in TURNED:
-            turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[family]}
-            left = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
-        found[family] = [problem.parameters.called(robot, name) for name in left]
-    return found
-
-
-def extended(problem: CalibrationProblem, x: Array, names: Sequence[str]) -> tuple[CalibrationProblem, Array]:
-    """Return the problem that identifies more parameters, at the scales that their effects suggest, with x (n,)."""
+def extended(problem: CalibrationProblem, names: Sequence[str]) -> CalibrationProblem:
+    """Return the problem that identifies more parameters, at the scales that their effects suggest."""
     p = problem.parameters
     index = [p.names.index(name) for name in names]
     identified = p.identified.copy()
@@ -113,71 +109,92 @@ def extended(problem: CalibrationProblem, x: Array, names: Sequence[str]) -> tup
         own = [i for i in p.places_of(name) if i in index]
         mine = [i for i in own if not of_session(p.names[i]) and own_name(p.names[i]) != EXPANSION]
         scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
-    whole = problem.with_parameters(replace(p, identified=identified, scale=scale))
-    known = dict(zip(p.free.names, x, strict=True))
-    return whole, np.array([known.get(name, 0.0) for name in whole.parameters.free.names])
+    return problem.with_parameters(replace(p, identified=identified, scale=scale))
+
+
+def named(problem: Source, x: Array) -> dict[str, float]:
+    """Return deviations (n,) by the names of the parameters."""
+    return dict(zip(problem.parameters.free.names, x.tolist(), strict=True))
+
+
+def deviations(problem: Source, known: Mapping[str, float]) -> Array:
+    """Return deviations (n,) from some by name; zero for others."""
+    return np.array([known.get(name, 0.0) for name in problem.parameters.free.names])
 
 
 # --- which of them are selected ---------------------------------------------------------------------------------
 
 
-def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
-    """Return the fit of the model with the largest marginal likelihood, and the models compared, that one first.
+class Models:
+    """Models of a problem with and without extensions, all at one linearization: the effects of extensions are small.
 
-    All models are compared at one linearization: the effects of extensions are small.
+    ``own`` are the parameters that the problem identifies, ``names`` (p,) those of all models, the ``columns`` of the
+    marginal likelihood; ``known`` are deviations by name.
     """
-    extensions = identifiable(fit.problem)
-    every = [name for names in extensions.values() for name in names]
-    whole, x = extended(fit.problem, fit.x, every)
-    columns = estimator.evidence(whole, x)
-    names = whole.parameters.free.names
-    own = set(fit.problem.parameters.free.names)
-    before = _named(fit.evidence, fit.point)
+
+    def __init__(
+        self, problem: CalibrationProblem, estimator: Estimator, known: Mapping[str, float], skip: Sequence[str] = ()
+    ) -> None:
+        self.problem = problem
+        self.own = problem.parameters.free.names
+        self.extensions = {family: names for family, names in identifiable(problem).items() if family not in skip}
+        self.whole = extended(problem, self.added(self.extensions))
+        self.names = np.array(self.whole.parameters.free.names)
+        self.x = deviations(self.whole, known)
+        self.columns = estimator.evidence(self.whole, self.x)
+
+    def added(self, families: Iterable[str]) -> list[str]:
+        """Return the parameters of some extensions."""
+        return [name for family in families for name in self.extensions[family]]
+
+    def members(self, families: Iterable[str]) -> np.ndarray:
+        """Return which parameters (p,) the model with some extensions has."""
+        return np.isin(self.names, [*self.own, *self.added(families)])
+
+    def compared(self, price: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
+        """Return the models that were compared, by what ``price`` says of each.
+
+        Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of
+        the best one each condition is asked for.
+        """
+        conditions = tuple(condition for condition in CONDITIONS if condition in self.extensions)
+        possible = [tuple(family for family in candidate if family in self.extensions) for candidate in CANDIDATES]
+        found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+        best = min(found, key=lambda each: each.price)
+        further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}
+        for family, beside in further.items():
+            if family in self.extensions:
+                more = (*best.families, beside, family)
+                arm = [each for each in ARM if each in more and each in self.extensions]
+                found.append(price((*arm, *conditions)))
+                best = min(best, found[-1], key=lambda each: each.price)
+        kept = tuple(family for family in best.families if family not in conditions)
+        for count in range(len(conditions)):
+            found += [price((*kept, *some)) for some in combinations(conditions, count)]
+        return found
+
+
+def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
+    """Return the fit of the model with the largest marginal likelihood, and the models compared, that one first."""
+    deviation = named(fit.problem, fit.x)
+    models = Models(fit.problem, estimator, deviation)
+    before = _hyperparameters(fit.evidence, fit.point)
     known: dict[frozenset[str], dict[str, float]] = {}
 
     def price(candidate: tuple[str, ...]) -> Candidate:
-        used = own.union(*(extensions[family] for family in candidate))
-        evidence = columns.restricted(np.array([name in used for name in names]))
+        evidence = models.columns.restricted(models.members(candidate))
         conditions = frozenset(candidate).intersection(CONDITIONS)
         point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
-            known[conditions] = _named(evidence, point)
+            known[conditions] = _hyperparameters(evidence, point)
         return Candidate(point.value + GAIN * questions(candidate), candidate, point)
 
-    found = sorted(compare_models(fit.problem, extensions, price), key=lambda each: each.price)
+    found = sorted(models.compared(price), key=lambda each: each.price)
     trials = tuple(Trial(each.families, each.found.value) for each in found)
-    added = [name for family in found[0].families for name in extensions[family]]
-    if not added:
+    if not found[0].families:
         return fit, trials
-    whole, x = extended(fit.problem, fit.x, added)
-    return estimator.fit(whole, x, found[0].found.logs, ROUNDS), trials
-
-
-def compare_models(
-    problem: CalibrationProblem,
-    extensions: Mapping[str, tuple[str, ...]],
-    price: Callable[[tuple[str, ...]], Candidate],
-) -> list[Candidate]:
-    """Return the models that were compared, by what ``price`` says of each.
-
-    Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of the
-    best one each condition is asked for.
-    """
-    conditions = tuple(condition for condition in CONDITIONS if condition in extensions)
-    possible = [tuple(family for family in candidate if family in extensions) for candidate in CANDIDATES]
-    found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
-    best = min(found, key=lambda each: each.price)
-    further = FURTHER if _many(problem) else {}
-    for family, beside in further.items():
-        if family in extensions:
-            more = dict.fromkeys((*best.families, beside, family))
-            arm = [each for each in ARM if each in more and each in extensions]
-            found.append(price((*arm, *conditions)))
-            best = min(best, found[-1], key=lambda each: each.price)
-    kept = tuple(family for family in best.families if family not in conditions)
-    for count in range(len(conditions)):
-        found += [price((*kept, *some)) for some in combinations(conditions, count)]
-    return found
+    whole = extended(fit.problem, models.added(found[0].families))
+    return estimator.fit(whole, deviations(whole, deviation), found[0].found.logs, ROUNDS), trials
 
 
 def questions(families: Sequence[str]) -> int:
@@ -186,11 +203,7 @@ def questions(families: Sequence[str]) -> int:
     return others + (len(families) > others)
 
 
-def _many(problem: CalibrationProblem) -> bool:
-    return len(np.unique(problem.data.configuration)) >= MANY
-
-
-def _named(evidence: Evidence, point: Point) -> dict[str, float]:
+def _hyperparameters(evidence: Evidence, point: Point) -> dict[str, float]:
     return dict(zip(evidence.names, point.logs.tolist(), strict=True))
 
 
@@ -208,15 +221,6 @@ def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
 # --- at a result ------------------------------------------------------------------------------------------------
 
 
-class Flagged(Protocol):
-    """A row that a fit distrusts."""
-
-    @property
-    def label(self) -> str:
-        """Of the row."""
-        ...
-
-
 class Outcome(Protocol):
     """What is asked of a result: a `Calibration` has it."""
 
@@ -227,7 +231,7 @@ class Outcome(Protocol):
 
     @property
     def x(self) -> Array:
-        """(n,) deviations [SI]."""
+        """Deviations (n,) [SI]."""
         ...
 
     @property
@@ -236,8 +240,8 @@ class Outcome(Protocol):
         ...
 
     @cached_property
-    def flagged(self) -> Sequence[Flagged]:
-        """Rows that the fit distrusts."""
+    def flagged(self) -> Sequence[Any]:
+        """Outliers and downweighted rows, each with a ``label``."""
         ...
 
 
@@ -257,51 +261,26 @@ class Judged:
         return data.y - data.X @ self.point.z
 
 
-class Comparison:
+class Comparison(Models):
     """Models with and without extensions, all at the linearization of one result, whatever its weight.
 
-    Parameters
-    ----------
-    result
-        Any calibration; of large data `hyperparameters.MOST` configurations are looked at.
+    Of large data `hyperparameters.MOST` configurations are used.
     """
 
     def __init__(self, result: Outcome) -> None:
         self.result = result
-        self.problem = _trusted(result)
-        self.own = self.problem.parameters.free.names
-        self.extensions = identifiable(self.problem)
-        every = [name for names in self.extensions.values() for name in names]
-        whole, x = extended(self.problem, result.x, every)
-        self.names = whole.parameters.free.names
-        self.columns = _estimator(result.learned).evidence(whole, x)
-
-    @cached_property
-    def configurations(self) -> int:
-        """How many configurations are looked at."""
-        return len(np.unique(self.problem.data.configuration))
-
-    @cached_property
-    def dimension(self) -> str:
-        """``length``; ``angle`` where none was measured, ``pixel`` where a camera alone has seen."""
+        estimator = Estimator(Prior(), NOISE)
+        if result.learned is not None:
+            more = ("instrument",) if "instrument" in result.learned.noise else ()
+            estimator = Estimator(KNOWN, NOISE + more)
+        super().__init__(_without_outliers(result), estimator, named(result.problem, result.x))
         stacks = self.columns.data.stacks
-        return next(d for d in ("length", "angle", "pixel") if any(stack.of(d).any() for stack in stacks))
-
-    @cached_property
-    def equations(self) -> np.ndarray:
-        """The numbers of the equations of that dimension."""
-        stacks = self.columns.data.stacks
-        return np.sort(np.concatenate([stack.index[stack.of(self.dimension)] for stack in stacks]))
-
-    @cached_property
-    def row(self) -> np.ndarray:
-        """The row (m,) of every equation."""
-        return self.problem.owners
-
-    @cached_property
-    def rows(self) -> int:
-        """How many rows have such equations."""
-        return len(np.unique(self.row[self.equations]))
+        self.configurations = len(np.unique(self.problem.data.configuration))
+        # angles where no length was measured, pixels where a camera alone has seen
+        self.dimension = next(d for d in ("length", "angle", "pixel") if any(stack.of(d).any() for stack in stacks))
+        self.equations = np.sort(np.concatenate([stack.index[stack.of(self.dimension)] for stack in stacks]))
+        self.row = self.problem.owners
+        self.rows = len(np.unique(self.row[self.equations]))
 
     @cached_property
     def spare(self) -> float:
@@ -312,7 +291,7 @@ class Comparison:
     @cached_property
     def plain(self) -> Judged:
         """The model that the result has."""
-        evidence = self.columns.restricted(np.isin(self.names, self.own))
+        evidence = self.columns.restricted(self.members(()))
         starts = sides(self.problem, evidence)
         if self.result.learned is not None:
             noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
@@ -323,17 +302,15 @@ class Comparison:
     def best(self) -> Judged:
         """The model that the data select, at a price of `SPEAK` an extension."""
         learned = self.result.learned
-        if learned is not None and learned.trials:  # the evidence has spoken
+        if learned is not None and learned.trials:  # it was selected then
             return self.plain
-        found = [self._price(()), *compare_models(self.problem, self.extensions, self._price)]
-        judged: Judged = min(found, key=lambda each: each.price).found
-        return judged
+        found = [self._price(()), *self.compared(self._price)]
+        return min(found, key=lambda each: each.price).found
 
     def _price(self, families: tuple[str, ...]) -> Candidate:
         model = self.plain
         if families:
-            used = set(self.own).union(*(self.extensions[family] for family in families))
-            model = self._fitted(families, np.isin(self.names, list(used)))
+            model = self._fitted(families, self.members(families))
         return Candidate(model.point.value + SPEAK * len(families), families, model)
 
     @cached_property
@@ -352,17 +329,17 @@ class Comparison:
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""
-        keep = np.isin(self.names, [name for name, out in zip(self.own, members, strict=True) if not out])
+        keep = np.isin(self.names, np.array(self.own)[~members])
         return self._fitted((), keep).point.value - self.plain.point.value
 
     def _fitted(self, families: tuple[str, ...], keep: np.ndarray) -> Judged:
         """Return a model at its hyperparameters, looked for from those of the result's."""
         evidence = self.columns.restricted(keep)
-        start = _starts(evidence, _named(self.plain.evidence, self.plain.point))[:1]
-        return Judged(families, tuple(np.array(self.names)[keep].tolist()), evidence, evidence.optima(start)[0])
+        start = _starts(evidence, _hyperparameters(self.plain.evidence, self.plain.point))[:1]
+        return Judged(families, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
 
 
-def _trusted(result: Outcome) -> CalibrationProblem:
+def _without_outliers(result: Outcome) -> CalibrationProblem:
     """Return the problem in memory without noise estimates, and without flagged rows unless their neighbours are."""
     problem = sampled(result.problem.scattered(None))
     labels = {label: i for i, label in enumerate(problem.labels)}
@@ -373,13 +350,3 @@ def _trusted(result: Outcome) -> CalibrationProblem:
     if not len(alone):
         return problem
     return problem.without({problem.labels[i] for i in alone})
-
-
-def _estimator(learned: Learned | None) -> Estimator:
-    """Return how the marginal likelihood is asked: scales that were estimated are taken at their word."""
-    kinds: tuple[str, ...] = ("position", "orientation", "joint")
-    if learned is None:
-        return Estimator(Prior(), kinds)
-    if "instrument" in learned.noise:
-        kinds += ("instrument",)
-    return Estimator(KNOWN, kinds)

@@ -12,8 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.bayes.statements import FAR, Result, of_data
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.bayes.statements import FAR, Result, equation_variance, marginal, triangle_of
 
 PRIOR_ROBOTS = 3.0
 """Degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for."""
@@ -22,15 +21,12 @@ PRIOR_RATIO, PRIOR_PARAMETERS = 1.0, 2.0
 ITERATIONS, SETTLED = 1000, 1e-6
 """Of expectation and maximization; relative change of the variances that ends them."""
 SIZES = np.geomspace(0.03, 30.0, 41)
-"""By which a prior may be too narrow or too wide, when robots are held against it."""
+"""Factors on a prior's width, of which the most likely one counts where robots are compared with it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What the data of one robot say: ``rows u - values ~ N(0, I)`` of deviations u in generic widths.
-
-    ``rows`` (p, p), ``values`` (p,).
-    """
+    """Data of one robot: rows (p, p) u - values (p,) ~ N(0, I), of deviations u in generic widths."""
 
     label: str
     rows: Array
@@ -97,18 +93,16 @@ class PopulationPrior:
 
         u_kj = m_j + d_kj,    d_kj ~ N(0, s_j^2),    m_j ~ N(0, rho s_j^2),    s_j^2 ~ scaled inverse chi^2 (3, tau^2)
 
-    rho, tau and s are estimated by expectation and maximization from what the data of each robot say, without the prior
-    that it was calibrated with, and with its frames integrated out (Efron and Morris 1975, JASA 70:311; Dempster,
-    Laird and Rubin 1977, JRSS B 39:1). With few robots, or with data that say little, every s_j is nearly tau.
+    rho, tau and s are estimated by expectation and maximization from the data of each robot, without the prior that it
+    was calibrated with, and with its frames integrated out (Efron and Morris 1975, JASA 70:311; Dempster, Laird and
+    Rubin 1977, JRSS B 39:1). With few robots, or with data that say little, every s_j is nearly tau.
 
     Parameters
     ----------
     names, dimensions
         The p parameters of the robot.
-    nominal
-        (p,) from which deviations count [SI].
-    generic
-        (p,) generic widths [SI].
+    nominal, generic
+        (p,) from which deviations count, and their generic widths [SI].
     arms
         What the data of each robot say.
 
@@ -143,13 +137,6 @@ class PopulationPrior:
         ------
         InputError
             For fewer than two, and for robots of other nominal parameters.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> print(str(ro.bayes.PopulationPrior.of({"left": result, "right": result})).splitlines()[0])
-        2 arms share 100 % of their mean square deviation.
         """
         if isinstance(results, Mapping):
             named = dict(results)
@@ -157,10 +144,10 @@ class PopulationPrior:
             named = {f"arm {i}": result for i, result in enumerate(results, start=1)}
         if len(named) < 2:
             raise InputError("Prior.from_population", f"{len(named)} results", "those of two arms or more")
-        first = next(iter(named.values())).problem.parameters
-        every = [name for each in named.values() for name in _of_robot(each.problem.parameters.free)]
+        tables = [each.problem.parameters for each in named.values()]
+        every = [name for p in tables for name, frame in zip(p.free.names, p.free.of_frames, strict=True) if not frame]
         names = tuple(dict.fromkeys(every))
-        table = first.take(_places(first.names, names))
+        table = tables[0].take(_places(tables[0].names, names))
         empty = cls(names, table.dimensions, table.nominal, default_widths(table), ())
         return replace(empty, arms=tuple(empty._seen(label, result) for label, result in named.items()))
 
@@ -185,9 +172,9 @@ class PopulationPrior:
 
     @cached_property
     def gain(self) -> Array:
-        """(K,) by how much each robot is more likely with what the others tell than with generic widths, 2 ln ratio.
+        """(K,) 2 ln likelihood ratio of each robot, prior from the others over generic widths, each at its best size.
 
-        Both priors with the size that fits the robot best. A negative one: it is different from the others.
+        A negative one: it is different from the others.
         """
         p = len(self.generic)
         found = []
@@ -212,14 +199,7 @@ class PopulationPrior:
         return Arm(label, full, values + rows @ apart)
 
     def tables(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Return centre and width of every parameter by its name with a unit, as `Prior` has them.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> centre, width = ro.bayes.PopulationPrior.of([result, result]).tables()
-        >>> list(centre)[:2], centre.keys() == width.keys()
-        (['alpha1_rad', 'a1_m'], True)
-        """
+        """Return centre and width of every parameter by its name with a unit, as `Prior` has them."""
         units = [accepted_units(dimension)[0] for dimension in self.dimensions]
         keys = [f"{name}_{unit}" for name, unit in zip(self.names, units, strict=True)]
         si = [UNITS[unit].si for unit in units]
@@ -235,13 +215,25 @@ class PopulationPrior:
         return "\n".join(lines)
 
 
+def of_data(result: Result, widths: Array) -> tuple[tuple[str, ...], Array, Array]:
+    """Return names (p), rows (k, p) [1/SI] and values (k,) of what a result's data alone say of the robot.
+
+    Frames have prior standard deviations ``widths`` (n,) [SI] and are integrated out.
+    """
+    free = result.problem.parameters.free
+    R = result.linear.triangle / np.sqrt(equation_variance(result))
+    n = len(free)
+    own = np.eye(n)[free.of_frames] * (free.scale / widths)[free.of_frames, None]
+    robot = np.flatnonzero(~free.of_frames)
+    rows, values = marginal(np.vstack([R[:, :n], own]), np.append(R[:, n], np.zeros(len(own))), robot)
+    both = triangle_of(np.column_stack([rows, values]))
+    p = len(robot)
+    return tuple(free.names[i] for i in robot), both[:p, :p] / free.scale[robot], both[:p, p]
+
+
 def _places(names: Sequence[str], some: Sequence[str]) -> np.ndarray:
     """Return where some parameters stand in a table."""
     for name in some:
         if name not in names:
             raise InputError("Prior.from_population", f"parameter '{name}' that not all have", "arms of one type")
     return np.array([names.index(name) for name in some])
-
-
-def _of_robot(free: Parameters) -> list[str]:
-    return [name for name, frame in zip(free.names, free.of_frames, strict=True) if not frame]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,8 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import statements
-from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths, penalized
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths
 from rpim_opt.bayes.statements import Result, Statement, posterior
-from rpim_opt.convex.formulation import Formulation
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
 from rpim_opt.robot.parameters import Parameters, overlay
@@ -22,11 +21,11 @@ from rpim_opt.robot.parameters import Parameters, overlay
 OFFSETS = "joint offsets"
 """The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
 SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}
-"""Groups of what the readings of a session have in common."""
+"""Groups of session offsets."""
 BASE = "base"
-"""The group of the base, which is expected where the drawing's robot puts it: as far from there as its deviations lead.
+"""The group of the base, which is registered with the nominal robot: as far off as its deviations lead.
 
-Tools and other places are stated by hand, or nobody measured them: they have no size.
+Tools and other frames are stated by hand or unknown: their scale is not estimated.
 """
 _FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
@@ -36,34 +35,30 @@ _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 class Prior:
     """The prior of the deviations, before the data are seen.
 
-    By default deviations are about as large as the scales of the parameters say, some of them much larger (Student's
-    t), joint offsets three times as large, because they are set at assembly, and frames may be anywhere within ten of
-    their scales. How large a group of them is altogether, the data may tell: lengths, angles and joint offsets have a
-    size each, which are alike a priori, and the base has one. `stated` says it of a problem in numbers.
+    By default deviations have the scales of the parameters and Student's t, joint offsets three times those scales,
+    because they are set at assembly, and frames ten times. The data estimate a factor on them for each group: lengths,
+    angles and joint offsets, which are alike a priori, and the base. `stated` returns it for a problem in numbers.
 
     Parameters
     ----------
     centre
-        Deviations that are expected, by name, pattern or group with a unit as in `Parameters.scaled`:
-        ``{"theta5_mrad": 4.0}``. Zero where nothing is said.
+        Prior means of deviations, by name, pattern or group with a unit as in `Parameters.scaled`:
+        ``{"theta5_mrad": 4.0}``. Zero for all others.
     scale
-        How far they lie from it, keys as for ``centre``: ``{"theta?_mrad": 10.0, "tool_mm": 2.0}``. What stands here
-        is taken at its word: neither ``joint_offset`` nor ``frames`` multiplies it, nor the size of the base.
+        Prior standard deviations, keys as for ``centre``: ``{"theta?_mrad": 10.0, "tool_mm": 2.0}``. Neither
+        ``joint_offset`` nor ``frames`` nor the estimated scale of the base multiplies them.
     tails
-        Degrees of freedom of the Student's t of the robot's own geometry; infinity: a normal distribution.
+        Degrees of freedom of the Student's t of the robot's geometry; infinity: a normal distribution.
     groups
-        Parameters of the robot that share a size of their own, as patterns: ``(("a?", "d?"), ("alpha?",))``. Of what
-        they leave out of its geometry the lengths, the angles and the joint offsets share one each, and so does every
-        family of other terms (compliance, eccentricity, ...); the shifts of sessions share one, their turns another.
-    joint_offset
-        By how much the scale of a joint's theta is multiplied.
-    frames
-        By how much the scales of frames (base, reflectors, anchors) are multiplied. Of the base
-        that is what is expected before the data.
+        Parameters of the robot that share an estimated scale of their own, as patterns: ``(("a?", "d?"),
+        ("alpha?",))``. Of the others, lengths, angles and joint offsets share one each, and so does every model
+        extension (compliance, eccentricity, ...); session offsets have one for shifts and one for turns.
+    joint_offset, frames
+        Factors on the scales of joint offsets, and of frames (base, reflectors, anchors).
     statements
-        What is known of linear combinations: `known`, `gaussian`, `from_result`.
+        Of linear combinations: `known`, `gaussian`, `from_result`.
     doubted
-        Whether centre and scale are left out where the evidence of the data is against them: `from_population`.
+        Whether centre and scale are left out where the marginal likelihood is against them: `from_population`.
 
     Raises
     ------
@@ -109,22 +104,13 @@ class Prior:
         text
             ``"a2 + a3 = 612.3 +- 0.05 mm"``, of the parameters' values; ``"a2 + a3 +- 0.05 mm"``, nominal to that
             standard deviation; ``"a2 + a3 = nominal + 0.2 +- 0.05 mm"``; or the combination alone.
-        value
-            Of the combination of the parameters' values [SI]; nominal by default.
-        sd
-            Standard deviation [SI].
+        value, sd
+            Of the combination of the parameters' values [SI], nominal by default, and its standard deviation [SI].
 
         Raises
         ------
         InputError
             For a text that is no such statement, or an sd that is not above zero.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> one = ro.bayes.Prior.known("a2 + a3 = nominal +- 0.05 mm")
-        >>> float(one.stated(ro.load("position").problem.parameters).rows.max())  # scale 0.5 mm
-        10.0
         """
         return cls(statements=(statements.known(text, value, sd),))
 
@@ -152,14 +138,6 @@ class Prior:
         ------
         InputError
             For a matrix that is no covariance or precision, and if not one of the three is given.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> prior = ro.bayes.Prior.gaussian({"a2_mm": 0.3, "a3_mm": 0.0}, [[0.04, 0.03], [0.03, 0.04]])
-        >>> stated = prior.stated(ro.load("position").problem.parameters)
-        >>> int(stated.replaced.sum()), stated.rows.shape
-        (2, (2, 34))
         """
         return cls(statements=(statements.gaussian(dict(mean), covariance, precision, sd),))
 
@@ -175,8 +153,8 @@ class Prior:
         """Return the posterior of an earlier calibration as the prior of the next, in the place of its own scales.
 
         Where the model is linear, calibrating with it at weight 1 equals calibrating with the data of both. It holds
-        the earlier penalty already: of several results of one arm only the last one is to be taken. Where sizes were
-        learned it is as wide as `Calibration.covariance`, which knows of them and of heavy tails.
+        the earlier penalty already: of several results of one robot only the last one is to be taken. With estimated
+        hyperparameters it is as wide as `Calibration.covariance`.
 
         Parameters
         ----------
@@ -185,8 +163,7 @@ class Prior:
         inflate
             Factor on its standard deviations: above 1 where the robot may have changed.
         without
-            Patterns of parameters that were set up anew, ``("base_*", "tool_*")``: the others are taken whatever
-            those were.
+            Patterns of parameters that were set up anew, ``("base_*", "tool_*")``: the prior of the others is marginal.
         noise
             Standard deviation of its equations in units of the declared noise; what it found by default.
 
@@ -200,7 +177,7 @@ class Prior:
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
-        >>> first, second = (problem.on(problem.data.take(rows)) for rows in (np.arange(30), np.arange(30, 40)))
+        >>> first = problem.on(problem.data.take(np.arange(30)))
         >>> prior = ro.bayes.Prior.from_result(ro.calibrate(first, ro.tikhonov, ro.reml), without=("base_*",))
         >>> stated = prior.stated(problem.parameters)
         >>> int(stated.replaced.sum()), stated.rows.shape
@@ -210,30 +187,20 @@ class Prior:
 
     @classmethod
     def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
-        """Return the prior of another arm of the type of several that were calibrated: their centre and spread.
+        """Return the prior of another robot of the type of several that were calibrated: their centre and spread.
 
-        Both are estimated by empirical Bayes, and are shrunken towards the generic widths where arms or data are few
-        (`PopulationPrior` has the evidence). Tails stay heavy, and where the marginal likelihood of another arm's data
-        is against it, this prior is left out (``doubted``).
+        By empirical Bayes (`PopulationPrior`), shrunken towards the generic scales where robots or data are few. Where
+        the marginal likelihood of another robot's data is against it, this prior is left out (``doubted``).
 
         Parameters
         ----------
         results
-            Two or more, of the same nominal robot; squared losses, or what a robust one trusts.
+            Two or more, of the same nominal robot.
 
         Raises
         ------
         InputError
-            For fewer than two, and for arms of another nominal robot.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, ro.reml)
-        >>> prior = ro.bayes.Prior.from_population([result, result, result])
-        >>> stated = prior.stated(result.problem.parameters)
-        >>> bool(stated.centre.any()), bool(stated.heavy.any()), len(stated.rows)
-        (True, True, 0)
+            For fewer than two, and for robots with other nominal parameters.
         """
         from rpim_opt.bayes.population import PopulationPrior
 
@@ -251,25 +218,19 @@ class Prior:
             if key == "statements":
                 both[key] = mine + theirs
             elif isinstance(mine, dict):
-                both[key] = _merged(mine, theirs, key)
+                for name in mine.keys() & theirs.keys():
+                    if mine[name] != theirs[name]:
+                        found = f"'{name}' as {mine[name]:g} and {theirs[name]:g}"
+                        raise InputError(f"prior, table {key}", found, "one of them")
+                both[key] = {**mine, **theirs}
             elif mine not in (default, theirs) and theirs != default:
                 raise InputError(f"prior, key {key}", f"{mine} and {theirs}", "one of them")
             else:
                 both[key] = theirs if mine == default else mine
         return Prior(**both)
 
-    def without_centre(self) -> Prior:
-        """Return the same without centre and scale.
-
-        >>> import rpim_opt as ro
-        >>> prior = ro.bayes.Prior(centre={"d5_mm": 0.5}, tails=5.0)
-        >>> prior.without_centre() == ro.bayes.Prior(tails=5.0)
-        True
-        """
-        return replace(self, centre={}, scale={}, doubted=False)
-
     def stated(self, parameters: Parameters, *, widened: bool = True) -> Stated:
-        """Return what it says of the identified parameters of a problem, in units of their scales.
+        """Return the prior of the identified parameters of a problem, in units of their scales.
 
         Parameters
         ----------
@@ -283,30 +244,23 @@ class Prior:
         ------
         InputError
             For names or patterns that the table has not, units that do not fit, values far from nominal.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> parameters = ro.load("position").problem.parameters
-        >>> stated = ro.bayes.Prior(centre={"d5_mm": 0.5}).stated(parameters)
-        >>> stated.centre[stated.centre != 0], sorted(set(stated.scale.tolist()))  # joints, joint offsets, frames
-        (array([1.]), [1.0, 3.0, 10.0])
         """
         free = parameters.free
         identified = parameters.identified
         centre = overlay(parameters, np.zeros(len(parameters)), self.centre, "prior, table centre", signed=True)
+        own = overlay(parameters, np.full(len(parameters), np.nan), self.scale, "prior, table scale")
         widths = parameters.scale
         if widened:
             widths = default_widths(parameters, self.joint_offset, self.frames)
-        width = overlay(parameters, widths, self.scale, "prior, table scale")
+        width = np.where(np.isfinite(own), own, widths)
         rows, values, replaced = [np.zeros((0, len(free)))], [np.zeros(0)], np.zeros(len(free), dtype=bool)
         for each in self.statements:
             more, right, whole = each.on(parameters)
             rows.append(more)
             values.append(right)
             replaced |= whole
-        group, names = self._grouped(parameters)
+        group, names = self._grouped(parameters, np.isfinite(own))
+        geometry = np.array([_GEOMETRY.fullmatch(own_name(name)) is not None for name in free.names])
         return Stated(
             parameters=free,
             centre=centre[identified] / free.scale,
@@ -315,66 +269,29 @@ class Prior:
             values=np.concatenate(values),
             replaced=replaced,
             group=group,
-            heavy=self._heavy(free),
+            heavy=geometry & bool(np.isfinite(self.tails)),
             names=names,
             tails=self.tails,
         )
 
-    def penalized(self, formulation: Formulation, stated: Stated) -> Formulation:
-        """Return the formulation whose penalty is that of the prior; itself, where nothing is stated.
-
-        The penalty becomes, with zero in the place of what the statements replace::
-
-            penalty((z - centre) / scale) + |rows z - values|^2
-
-        Parameters
-        ----------
-        formulation
-            Any: its penalty sees the deviations from the centre; without a penalty the statements alone are one.
-        stated
-            What `stated` says of the problem.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> prior = ro.bayes.Prior.known("a2 + a3 = nominal + 0.3 +- 0.001 mm")
-        >>> mine = prior.penalized(ro.tikhonov, prior.stated(problem.parameters))
-        >>> result = ro.calibrate(problem, mine, weight=1.0)
-        >>> names = problem.parameters.free.names
-        >>> round(1e3 * float(result.x[names.index("a2")] + result.x[names.index("a3")]), 2)  # [mm]
-        0.3
-        """
-        return penalized(formulation, stated)
-
     # --- groups and tails where nothing is stated ----------------------------------------------------------------
 
-    def _heavy(self, free: Parameters) -> np.ndarray:
-        geometry = np.array([_GEOMETRY.fullmatch(own_name(name)) is not None for name in free.names])
-        return geometry & bool(np.isfinite(self.tails))
-
-    def _grouped(self, parameters: Parameters) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return the number of every identified parameter's group, and the groups' names."""
+    def _grouped(self, parameters: Parameters, known: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return every identified parameter's group by number, and the names; some scales (P,) are known."""
         for group in self.groups:
             for pattern in group:
                 if not any(fits(name, pattern) for name in parameters.names):
                     raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
         free = parameters.free
         keys = [self._group_of(name, dimension) for name, dimension in zip(free.names, free.dimensions, strict=True)]
-        fixed = self._fixed(parameters)
-        names = tuple(dict.fromkeys(k for k, alone in zip(keys, fixed, strict=True) if not alone))
-        number = {name: i for i, name in enumerate(names)}
-        found = [FIXED if alone else number[key] for key, alone in zip(keys, fixed, strict=True)]
-        return np.array(found, dtype=int), names
-
-    def _fixed(self, parameters: Parameters) -> np.ndarray:
-        """Return which identified parameters have a width that is no part of any size: tools, and what is stated."""
-        stated = np.isfinite(overlay(parameters, np.full(len(parameters), np.nan), self.scale, "prior, table scale"))
-        of_base = np.array([_of_base(name) for name in parameters.names])
-        return (parameters.placed & (stated | ~of_base))[parameters.identified]
+        of_base = np.array([own_name(name).startswith(f"{BASE}_") for name in parameters.names])
+        fixed = (parameters.placed & (known | ~of_base))[parameters.identified]
+        names = tuple(dict.fromkeys(key for key, alone in zip(keys, fixed, strict=True) if not alone))
+        numbers = [FIXED if alone else names.index(key) for key, alone in zip(keys, fixed, strict=True)]
+        return np.array(numbers, dtype=int), names
 
     def _group_of(self, name: str, dimension: str) -> str:
-        if _of_base(name):
+        if own_name(name).startswith(f"{BASE}_"):
             return BASE
         for group in self.groups:
             if any(fits(name, pattern) for pattern in group):
@@ -390,32 +307,15 @@ class Prior:
 
 
 def family_of(name: str) -> str:
-    """Return the family of a term of a joint that is not its geometry: ``ecc`` of ``ecc_cos3``.
-
-    >>> from rpim_opt.bayes.prior import family_of
-    >>> [family_of(name) for name in ("compliance2", "ecc_sin3", "ecc2_cos1", "ratio6")]
-    ['compliance', 'ecc', 'ecc2', 'ratio']
-    """
+    """Return the model extension of a parameter that is not geometry: ``ecc`` of ``ecc_cos3``."""
     found = _FAMILY.match(own_name(name))
     if found is None:
         return own_name(name)
     return found[1]
 
 
-def _of_base(name: str) -> bool:
-    return own_name(name).startswith(f"{BASE}_")
-
-
 def _patterns(group: str | Iterable[str]) -> tuple[str, ...]:
-    """Return the patterns of a group, which may stand in one text: ``"a? d?"``."""
     patterns = tuple(group.split() if isinstance(group, str) else group)
     if not patterns or not all(isinstance(pattern, str) and pattern for pattern in patterns):
         raise InputError("prior, key groups", f"{group!r}", 'names or patterns of parameters, "a? d?"')
     return patterns
-
-
-def _merged(mine: Mapping[str, float], theirs: Mapping[str, float], key: str) -> dict[str, float]:
-    for name in mine.keys() & theirs.keys():
-        if mine[name] != theirs[name]:
-            raise InputError(f"prior, table {key}", f"'{name}' as {mine[name]:g} and {theirs[name]:g}", "one of them")
-    return {**mine, **theirs}

@@ -19,14 +19,14 @@ from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
 FIXED = -1
-"""The group of a parameter whose width is no part of any size: of what is placed, but for the base."""
+"""The group of a parameter whose prior scale is not estimated: of frames, but for the base."""
 
 JOINT_OFFSET, FRAMES = 3.0, 10.0
-"""By how much the scales of joint offsets, which are set at assembly, and of frames are multiplied."""
+"""Factors on the scales of joint offsets, which are set at assembly, and of frames."""
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:
-    """Return the widths (P,) [SI] of deviations of which nothing but their scales is known."""
+    """Return the prior standard deviations (P,) [SI] where nothing but the scales is stated."""
     offsets = np.array([is_joint_offset(name) for name in parameters.names])
     factor = np.where(offsets, joint_offset, 1.0)
     factor[parameters.placed] = frames
@@ -37,28 +37,26 @@ def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, f
 class Stated:
     """A prior of the n identified parameters of a problem, in units of their scales.
 
-    Independently of each other, with a size tau_g a group, unless a statement replaces it::
+    Independently of each other, with an estimated scale tau_g a group, unless a statement replaces it::
 
         z_j ~ centre_j + tau_g scale_j t_nu     (heavy)        z_j ~ N(centre_j, (tau_g scale_j)^2)     (others)
 
-    (tau is 1 where there is no group), and together rows z - values ~ N(0, I).
+    (tau is 1 without a group), and together rows z - values ~ N(0, I).
 
     Parameters
     ----------
     parameters
         The identified ones.
-    centre
-        (n,) where deviations are expected.
-    scale
-        (n,) their widths, which multiply ``parameters.scale``.
+    centre, scale
+        (n,) prior means and standard deviations, the latter times ``parameters.scale``.
     rows, values
         (k, n) and (k,) of the statements.
     replaced
-        (n,) for which parameters a statement stands in the place of their own width.
+        (n,) which parameters have a statement in the place of a prior of their own.
     group
-        (n,) the number of the group whose size a parameter has; -1 where there is none.
+        (n,) the number of the group whose scale a parameter has; -1 without one.
     heavy
-        (n,) whose tails are Student's.
+        (n,) which have Student's t.
     names
         Of the groups, in the order of their numbers.
     tails
@@ -71,11 +69,6 @@ class Stated:
     >>> stated = ro.bayes.Prior.known("a2 + a3 +- 0.05 mm").stated(parameters)  # scales of 0.5 mm
     >>> stated.names, stated.rows.shape, stated.rows[stated.rows != 0]
     (('angles', 'lengths', 'joint offsets', 'base'), (1, 34), array([10., 10.]))
-    >>> for name, width, group in list(zip(stated.parameters.names, stated.scale, stated.group))[-11:-8]:
-    ...     print(name, width, group)
-    theta6 3.0 2
-    d6 1.0 1
-    base_x 10.0 3
     """
 
     parameters: Parameters
@@ -91,31 +84,41 @@ class Stated:
 
     @property
     def plain(self) -> bool:
-        """Whether it says no more than that deviations are about as large as their scales.
-
-        >>> import rpim_opt as ro
-        >>> prior = ro.bayes.Prior(joint_offset=1.0, frames=1.0)
-        >>> prior.stated(ro.load("position").problem.parameters).plain
-        True
-        """
+        """Whether it says no more than the parameters' scales."""
         said = self.centre.any() or len(self.rows) or self.replaced.any()
         return not said and bool((self.scale == 1).all())
 
     def inside(self, size: Array) -> Stated:
-        """Return the same for parameters whose scales have been multiplied by ``size`` (n,): their widths are 1 there.
-
-        Learned widths become the scales of an ordinary problem in this way.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> stated = ro.bayes.Prior(centre={"d5_mm": 2.0}).stated(ro.load("position").problem.parameters)
-        >>> tenfold = stated.inside(np.full(34, 10.0))
-        >>> float(stated.centre.max()), float(tenfold.centre.max()), set(tenfold.scale.tolist())
-        (4.0, 0.4, {1.0})
-        """
+        """Return the same for parameters whose scales have been multiplied by ``size`` (n,): ``scale`` is 1 there."""
         larger = replace(self.parameters, scale=self.parameters.scale * size)
         ones = np.ones_like(self.scale)
         return replace(self, parameters=larger, centre=self.centre / size, scale=ones, rows=self.rows * size)
+
+    def penalized(self, formulation: Formulation) -> Formulation:
+        """Return the formulation whose penalty is that of the prior; itself, where nothing is stated.
+
+        The penalty becomes, with zero in the place of what the statements replace::
+
+            penalty((z - centre) / scale) + |rows z - values|^2
+
+        Examples
+        --------
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("position").problem
+        >>> stated = ro.bayes.Prior.known("a2 + a3 = nominal + 0.3 +- 0.001 mm").stated(problem.parameters)
+        >>> result = ro.calibrate(problem, stated.penalized(ro.tikhonov), weight=1.0)
+        >>> names = problem.parameters.free.names
+        >>> round(1e3 * float(result.x[names.index("a2")] + result.x[names.index("a3")]), 2)  # [mm]
+        0.3
+        """
+        if self.plain or (formulation.penalty is None and not len(self.rows)):
+            return formulation
+        keep = np.where(self.replaced, 0.0, 1 / self.scale)
+        groups = None
+        if formulation.penalty is not None and formulation.penalty_over is not None:
+            groups = [listed(np.asarray(D, dtype=float)) for D in formulation.penalty_over(self.parameters)]
+        parts = (keep.tolist(), self.centre.tolist(), listed(self.rows), self.values.tolist(), groups)
+        return replace(formulation, penalty=believed(formulation.penalty, *parts), penalty_over=None)
 
 
 Vector = tuple[float, ...]
@@ -123,7 +126,7 @@ Matrix = tuple[Vector, ...]
 
 
 @dataclass(frozen=True)
-class _Believed:
+class _Penalty:
     """penalty(keep (z - centre)) + |rows z - values|^2; of norms |D_k keep (z - centre)| where groups D_k are given.
 
     ``keep`` is 1 / scale, and zero for what the statements replace.
@@ -137,7 +140,6 @@ class _Believed:
     groups: tuple[Matrix, ...] | None = None
 
     def __call__(self, z: Any) -> Any:
-        """Return the CVXPY expression."""
         terms = []
         if self.penalty is not None:
             terms.append(self._own(cp.multiply(np.array(self.keep), z - np.array(self.centre))))
@@ -146,8 +148,7 @@ class _Believed:
         return sum(terms[1:], terms[0])
 
     def __reduce__(self) -> Any:
-        arguments = [getattr(self, each.name) for each in fields(self)]
-        return believed, tuple(arguments)
+        return believed, tuple(getattr(self, each.name) for each in fields(self))
 
     def _own(self, y: Any) -> Any:
         penalty: Any = self.penalty
@@ -160,7 +161,7 @@ class _Believed:
 
 
 @dataclass(frozen=True)
-class _ReadyBelieved(_Believed, Ready):
+class _ReadyPenalty(_Penalty, Ready):
     """The same of a ready penalty: equal in content is equal in meaning, and a file holds it."""
 
     maker = "believed"
@@ -170,13 +171,9 @@ class _ReadyBelieved(_Believed, Ready):
         """The maker's name and its arguments, the penalty by its own name."""
         return [self.maker, self.penalty, self.keep, self.centre, self.rows, self.values, self.groups]
 
-    @property
-    def quadratic(self) -> Quadratic | None:
-        """The quadratic that it declares to be, without squared numbers in between; None where it is something else."""
-        return self._quadratic
-
     @cached_property
-    def _quadratic(self) -> Quadratic | None:
+    def quadratic(self) -> Quadratic | None:  # type: ignore[override]
+        """The quadratic that it declares to be, without squared numbers in between; None where it is something else."""
         if self.penalty not in (None, SQUARES) or (self.penalty is None and not self.rows):
             return None
         n = len(self.centre)
@@ -210,28 +207,9 @@ def believed(
 ) -> Callable[[Any], Any]:
     """Return the penalty of a prior."""
     penalty = named(penalty)
-    parts: list[Any] = [penalty, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), None]
     if groups is not None:
-        parts[-1] = tuple(tuple(map(tuple, D)) for D in groups)
-    if penalty is None or penalty in NAMED or isinstance(penalty, Ready):
-        return _ReadyBelieved(*parts)
-    return _Believed(*parts)
-
-
-def penalized(formulation: Formulation, stated: Stated) -> Formulation:
-    """Return the formulation whose penalty is that of a prior; arguments as for `Prior.penalized`."""
-    if stated.plain or (formulation.penalty is None and not len(stated.rows)):
-        return formulation
-    keep = np.where(stated.replaced, 0.0, 1 / stated.scale)
-    groups = None
-    if formulation.penalty is not None and formulation.penalty_over is not None:
-        groups = [listed(np.asarray(D, dtype=float)) for D in formulation.penalty_over(stated.parameters)]
-    penalty = believed(
-        formulation.penalty,
-        keep.tolist(),
-        stated.centre.tolist(),
-        listed(stated.rows),
-        stated.values.tolist(),
-        groups,
-    )
-    return replace(formulation, penalty=penalty, penalty_over=None)
+        groups = tuple(tuple(map(tuple, D)) for D in groups)
+    kept: Any = penalty
+    ready = penalty is None or penalty in NAMED or isinstance(penalty, Ready)
+    kind = _ReadyPenalty if ready else _Penalty
+    return kind(kept, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), groups)

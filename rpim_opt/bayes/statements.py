@@ -19,7 +19,7 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
 FAR = 100.0
-"""Expected sizes by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
+"""Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,14 @@ class Statement:
     Parameters
     ----------
     names, dimensions
-        (p) parameters that it speaks of, and what they are.
-    rows
-        (k, p) whitened [1 / SI].
-    values
-        (k,) whitened.
+        (p) parameters that it is about, and what they are.
+    rows, values
+        (k, p) [1 / SI] and (k,), whitened.
     reference
         (p,) [SI] from which the parameters' values count; None: from nominal, whatever that is.
     whole
-        Whether it is the whole prior of these parameters: it stands in the place of their own scales, and says
-        what it says of some of them where others are not identified. Otherwise those that are not identified are
-        nominal.
+        Whether it stands in the place of the parameters' own scales, and is marginal where some of them are not
+        identified. Otherwise those are nominal.
     text
         As a person wrote it.
     """
@@ -58,47 +55,32 @@ class Statement:
         return f"prior '{self.text}'"
 
     def on(self, parameters: Parameters) -> tuple[Array, Array, np.ndarray]:
-        """Return rows (k, n) and values (k,) in units of the scales of the n identified parameters, and whom it serves.
+        """Return rows (k, n) and values (k,) in units of the scales of the n identified parameters of a whole table.
 
-        Parameters
-        ----------
-        parameters
-            The whole table of a problem.
-
-        Raises
-        ------
-        InputError
-            For a name that the table has not, another dimension, a value far from nominal.
+        And (n,) for which of them they stand in the place of their own scales. InputError for a name that the table has
+        not, another dimension, a value far from nominal.
         """
         here = self._here(parameters)
         known = [name for name in self.names if name in here]
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
         offset = self._offset(parameters, place, own)
-        free = parameters.identified[place]
+        identified = parameters.identified[place]
         rows = np.array(self.rows, dtype=float).reshape(len(self.values), len(self.names))
         values = np.array(self.values, dtype=float)
         if self.whole:
-            rows, values = marginal(rows, values, own[free])
+            rows, values = marginal(rows, values, own[identified])
+            values = values - rows @ offset[identified]
         else:
             values = values - rows[:, own] @ offset
-            rows = rows[:, own[free]]
-        return self._placed(parameters, rows, values, place[free], offset[free])
-
-    def _placed(
-        self, parameters: Parameters, rows: Array, values: Array, place: np.ndarray, offset: Array
-    ) -> tuple[Array, Array, np.ndarray]:
-        """Return rows of the places of a table as rows of the identified ones, in units of their scales."""
-        if self.whole:
-            values = values - rows @ offset
-        column = np.cumsum(parameters.identified) - 1
-        n = len(parameters.free)
-        full = np.zeros((len(rows), n))
-        full[:, column[place]] = rows * parameters.scale[place]
-        served = np.zeros(n, dtype=bool)
-        served[column[place]] = True
+            rows = rows[:, own[identified]]
+        column = (np.cumsum(parameters.identified) - 1)[place[identified]]
+        full = np.zeros((len(rows), len(parameters.free)))
+        full[:, column] = rows * parameters.scale[place[identified]]
+        replaced = np.zeros(full.shape[1], dtype=bool)
+        replaced[column] = self.whole
         says = full.any(axis=1)
-        return full[says], values[says], served & self.whole
+        return full[says], values[says], replaced
 
     def _here(self, parameters: Parameters) -> dict[str, int]:
         """Return the places of a table, names and dimensions checked."""
@@ -106,13 +88,16 @@ class Statement:
         missing = [name for name in self.names if name not in here]
         if missing and (not self.whole or len(missing) == len(self.names)):
             raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
-        stated = [each for each in zip(self.names, self.dimensions, strict=True) if each[0] in here]
-        have = [parameters.dimensions[here[name]] for name, _ in stated]
-        for (name, said), dimension in zip(stated, have, strict=True):
-            if said not in (dimension, ""):
-                raise InputError(self.where, f"a unit of {said} for '{name}'", f"one of {dimension}")
-        if len(set(have)) > 1 and any(said == "" for _, said in stated):
-            raise InputError(self.where, f"a sum of {' and '.join(sorted(set(have)))}", "parameters of one dimension")
+        dimensions = set()
+        for name, said in zip(self.names, self.dimensions, strict=True):
+            if name in here:
+                dimensions.add(parameters.dimensions[here[name]])
+                if said not in (parameters.dimensions[here[name]], ""):
+                    accepted = f"one of {parameters.dimensions[here[name]]}"
+                    raise InputError(self.where, f"a unit of {said} for '{name}'", accepted)
+        if len(dimensions) > 1 and "" in self.dimensions:
+            found = f"a sum of {' and '.join(sorted(dimensions))}"
+            raise InputError(self.where, found, "parameters of one dimension")
         return here
 
     def _offset(self, parameters: Parameters, place: np.ndarray, own: np.ndarray) -> Array:
@@ -121,33 +106,27 @@ class Statement:
             return np.zeros(len(place))
         offset = parameters.nominal[place] - np.array(self.reference)[own]
         if self.whole:
-            self._turned(parameters.take(place), offset)
+            some = parameters.take(place)
+            turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
+            if len(turned):  # angles of frames do not add up
+                found = f"'{some.names[turned[0]]}' that counts from another orientation"
+                raise InputError(self.where, found, "the same start of the frame; or leave out what was set up anew")
             return offset
         rows = np.array(self.rows)[:, own]
-        far = np.array(self.values) - rows @ offset
-        room = FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))
-        if (np.abs(far) > room).any():
+        apart = np.abs(np.array(self.values) - rows @ offset)
+        if (apart > FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))).any():
             norms = np.linalg.norm(rows, axis=1)
-            size = float(np.max(np.abs(far) / np.where(norms > 0, norms, 1.0)))
+            size = float(np.max(apart / np.where(norms > 0, norms, 1.0)))
             unit, si = display(parameters.dimensions[place[0]])
             found = f"a value {size / si:.4g} {unit} off nominal"
-            raise InputError(self.where, found, "one near it; '= nominal +- ...' where the drawing's value is meant")
+            raise InputError(self.where, found, "one near it; '= nominal +- ...' where the nominal value is meant")
         return offset
-
-    def _turned(self, parameters: Parameters, offset: Array) -> None:
-        """Refuse angles of frames that count from another orientation: they do not add up."""
-        for name, frame, angle, off in zip(
-            parameters.names, parameters.of_frames, parameters.periodic, offset, strict=True
-        ):
-            if frame and angle and off != 0:
-                found = f"'{name}' that counts from another orientation"
-                raise InputError(self.where, found, "the same start of the frame; or leave out what was set up anew")
 
 
 def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
     """Return rows (k', p') and values (k',) of what a statement says of some parameters, whatever the others are.
 
-    With the others first in a triangle, what is below their rows does not know them.
+    Projected off the columns of the others.
     """
     if len(kept) == rows.shape[1] and (kept == np.arange(len(kept))).all():
         return rows, values
@@ -176,45 +155,43 @@ def known(text: str, value: float | None = None, sd: float | None = None) -> Sta
         raise InputError(f"prior '{text}'", f"value {value}", "a finite number [SI]")
     row = tuple(factor / sd for factor in said.factors)
     dimensions = (said.dimension,) * len(row)
+    reference = None
     if value is None:
-        return Statement(said.names, dimensions, (row,), (said.deviation / sd,), text=text.strip())
-    return Statement(said.names, dimensions, (row,), (value / sd,), (0.0,) * len(row), text=text.strip())
+        value = said.deviation
+    else:
+        reference = (0.0,) * len(row)
+    return Statement(said.names, dimensions, (row,), (value / sd,), reference, text=text.strip())
 
 
 def gaussian(mean: dict[str, float], covariance: Any, precision: Any, sd: Any) -> Statement:
     """Return the statement that deviations have a mean and a covariance; arguments as for `Prior.gaussian`."""
-    given = [each is not None for each in (covariance, precision, sd)]
-    if sum(given) != 1:
-        raise InputError("Prior.gaussian", f"{sum(given)} of covariance, precision and sd", "one of them")
-    keys = [_key(key) for key in mean]
-    if not keys:
+    given = sum(each is not None for each in (covariance, precision, sd))
+    if given != 1:
+        raise InputError("Prior.gaussian", f"{given} of covariance, precision and sd", "one of them")
+    if not mean:
         raise InputError("Prior.gaussian", "no parameter", "mean={'a2_mm': 0.0, ...}")
+    names, units = [], []
+    for key in mean:
+        name, unit = split_unit(key)
+        if unit is None:
+            raise InputError(f"Prior.gaussian, key {key}", "no unit", f"{key}_mm, {key}_mrad, ...")
+        names.append(name)
+        units.append(UNITS[key.removeprefix(name + "_")])
     centre = np.array([float(value) for value in mean.values()])
     if not np.isfinite(centre).all():
         raise InputError("Prior.gaussian", "a mean that is not finite", "finite numbers")
     if sd is not None:
-        covariance = np.diag(_vector(sd, len(keys)) ** 2)
-    if precision is None:
-        rows = _whitened(_square(covariance, len(keys), "covariance"))
-    else:
-        rows = _root(_square(precision, len(keys), "precision"))
+        covariance = np.diag(_vector(sd, len(mean)) ** 2)
+    rows = _root(precision, covariance, len(mean))
     values = rows @ centre
-    rows = rows / np.array([UNITS[unit].si for _, unit in keys])
-    names = tuple(name for name, _ in keys)
-    dimensions = tuple(UNITS[unit].dimension for _, unit in keys)
-    return Statement(names, dimensions, listed(rows), tuple(values.tolist()), None, True, "mean and covariance")
+    rows = rows / np.array([unit.si for unit in units])
+    dimensions = tuple(unit.dimension for unit in units)
+    return Statement(tuple(names), dimensions, listed(rows), tuple(values.tolist()), None, True, "mean and covariance")
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
     """Return a matrix (k, p) as tuples, which are equal where their content is."""
     return tuple(tuple(row) for row in matrix.tolist())
-
-
-def _key(key: str) -> tuple[str, str]:
-    name, unit = split_unit(key)
-    if unit is None:
-        raise InputError(f"Prior.gaussian, key {key}", "no unit", f"{key}_mm, {key}_mrad, ...")
-    return name, key.removeprefix(name + "_")
 
 
 def _vector(sd: float | Sequence[float], count: int) -> Array:
@@ -226,51 +203,29 @@ def _vector(sd: float | Sequence[float], count: int) -> Array:
     return np.broadcast_to(values.ravel(), (count,))
 
 
-def _square(matrix: Any, count: int, what: str) -> Array:
-    found = np.asarray(matrix, dtype=float)
-    if found.shape != (count, count):
-        raise InputError("Prior.gaussian", f"{what} of shape {found.shape}", f"({count}, {count})")
-    if not np.isfinite(found).all() or not np.allclose(found, found.T, rtol=1e-9, atol=0):
+def _root(precision: Any, covariance: Any, count: int) -> Array:
+    """Return W (k, p) with W'W the precision or inverse covariance; k < p where it leaves directions open."""
+    what = "covariance" if precision is None else "precision"
+    matrix = np.asarray(covariance if precision is None else precision, dtype=float)
+    if matrix.shape != (count, count):
+        raise InputError("Prior.gaussian", f"{what} of shape {matrix.shape}", f"({count}, {count})")
+    if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
         raise InputError("Prior.gaussian", f"a {what} that is not finite and symmetric", "one that is")
-    return found
-
-
-def _whitened(covariance: Array) -> Array:
-    """Return W (p, p) with W C W' = I."""
-    size = np.sqrt(np.maximum(np.diag(covariance), 0))
-    try:
-        if not (size > 0).all():
-            raise np.linalg.LinAlgError
-        factor = np.linalg.cholesky(covariance / np.outer(size, size))
-    except np.linalg.LinAlgError:
-        accepted = "one that is; [constraints] for what is known exactly, precision for what is not known at all"
-        raise InputError("Prior.gaussian", "a covariance that is not positive definite", accepted) from None
-    return np.linalg.inv(factor) / size
-
-
-def _root(precision: Array) -> Array:
-    """Return W (k, p) with W'W = P; k is less than p where nothing is known of some direction."""
-    size = np.sqrt(np.maximum(np.diag(precision), 0))
+    size = np.sqrt(np.maximum(np.diag(matrix), 0))
     unit = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(precision / np.outer(unit, unit))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    if precision is None:
+        if np.min(values) <= 1e-15:
+            accepted = "one that is; [constraints] for what is known exactly, precision for what is not known at all"
+            raise InputError("Prior.gaussian", "a covariance that is not positive definite", accepted)
+        return (vectors / np.sqrt(values)).T / unit
     if np.min(values) < -1e-10 * max(np.max(values), 1e-300):
         raise InputError("Prior.gaussian", "a precision with negative eigenvalues", "one that is positive semidefinite")
     kept = values > 1e-13 * np.max(values, initial=0.0)
     return (vectors[:, kept] * np.sqrt(values[kept])).T * unit
 
 
-class Spread(Protocol):
-    """What the covariance of a result has besides its equations and its penalty."""
-
-    @property
-    def factor(self) -> float:
-        """How a robust loss weighs the equations, against squared residuals in sigmas; 1 for a squared loss."""
-        ...
-
-    @property
-    def drift(self) -> Array | None:
-        """(n, k) D with D D' what learned sizes and heavy tails add to the covariance [SI], or None."""
-        ...
+# --- an earlier result -----------------------------------------------------------------------------------------------
 
 
 class Result(Protocol):
@@ -283,7 +238,7 @@ class Result(Protocol):
 
     @property
     def x(self) -> Array:
-        """(n,) deviations [SI]."""
+        """Deviations (n,) [SI]."""
         ...
 
     @property
@@ -293,12 +248,12 @@ class Result(Protocol):
 
     @property
     def penalty_weight(self) -> float:
-        """The weight of the penalty, zero where there is none."""
+        """Zero without a penalty."""
         ...
 
     @cached_property
     def linear(self) -> LinearModel:
-        """The equations that the fit rests on."""
+        """The equations of the fit."""
         ...
 
     @cached_property
@@ -307,8 +262,8 @@ class Result(Protocol):
         ...
 
     @cached_property
-    def spread(self) -> Spread:
-        """What the covariance rests on; InputError where there is none."""
+    def spread(self) -> Any:
+        """``factor`` of a robust loss on squares, and ``drift`` (n, k) [SI], or InputError without covariance."""
         ...
 
 
@@ -318,18 +273,24 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"Prior.from_result, {name}", f"{value}", "a number above zero")
     free = result.problem.parameters.free
-    A = result.linear.triangle[:, : len(free)]
     form = result.program.penalty_form
-    weight = result.penalty_weight
-    parts = [A / np.sqrt(_variance(result, noise))]
-    if form is not None and weight > 0:
-        parts.append(np.sqrt(weight / _variance(result, noise)) * form.matrix)
-    kept = _kept(free, without)
-    R = _triangle(np.vstack(parts))
-    if result.spread.drift is not None:
-        R = _widened(R, result.spread.drift / free.scale[:, None])
+    variance = equation_variance(result) if noise is None else noise**2 * result.spread.factor
+    parts = [result.linear.triangle[:, : len(free)] / np.sqrt(variance)]
+    if form is not None and result.penalty_weight > 0:
+        parts.append(np.sqrt(result.penalty_weight / variance) * form.matrix)
+    if isinstance(without, str):
+        without = without.split()
+    kept = np.arange(len(free))
+    if without:
+        kept = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
+    if not len(kept):
+        raise InputError("Prior.from_result, without", "every parameter", "patterns that leave some")
+    R = triangle_of(np.vstack(parts))
+    if result.spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
+        moved = R @ (result.spread.drift / free.scale[:, None])
+        R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
     rows, _ = marginal(R, np.zeros(len(free)), kept)
-    rows = _triangle(rows) / (free.scale[kept] * inflate)
+    rows = triangle_of(rows) / (free.scale[kept] * inflate)
     return Statement(
         names=tuple(free.names[i] for i in kept),
         dimensions=tuple(free.dimensions[i] for i in kept),
@@ -341,61 +302,12 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     )
 
 
-def of_data(result: Result, widths: Array) -> tuple[tuple[str, ...], Array, Array]:
-    """Return names (p), rows (k, p) [1/SI] and values (k,) of what a result's data alone say of the robot.
-
-    Parameters
-    ----------
-    result
-        The calibration.
-    widths
-        (n,) [SI] of its parameters' deviations: those of frames count, which are integrated out.
-    """
-    free = result.problem.parameters.free
-    sigma = np.sqrt(_variance(result, None))
-    model = result.linear
-    R = model.triangle / sigma
-    frames = free.of_frames
-    n = len(free)
-    own = np.eye(n)[frames] * (free.scale / widths)[frames, None]
-    rows = np.vstack([R[:, :n], own])
-    values = np.concatenate([R[:, n], np.zeros(len(own))])
-    robot = np.flatnonzero(~frames)
-    rows, values = marginal(rows, values, robot)
-    both = _triangle(np.column_stack([rows, values]))
-    names = tuple(free.names[i] for i in robot)
-    p = len(robot)
-    return names, both[:p, :p] / free.scale[robot], both[:p, p]
-
-
-def _variance(result: Result, noise: float | None) -> float:
+def equation_variance(result: Result) -> float:
     """Return the variance of the equations' noise, in units of the declared one, as the loss weighs them."""
-    factor = result.spread.factor
-    if noise is not None:
-        return noise**2 * factor
-    return result.noise_variance * factor
+    return result.noise_variance * result.spread.factor
 
 
-def _widened(R: Array, D: Array) -> Array:
-    """Return rows (n, n) of the precision that belongs to (R'R)^-1 + D D'."""
-    moved = R @ D
-    L = np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T)
-    return np.asarray(np.linalg.solve(L, R), dtype=float)
-
-
-def _kept(free: Parameters, without: Sequence[str]) -> np.ndarray:
-    if isinstance(without, str):
-        without = without.split()
-    if not without:
-        return np.arange(len(free))
-    kept = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
-    if not len(kept):
-        raise InputError("Prior.from_result, without", "every parameter", "patterns that leave some")
-    return kept
-
-
-def _triangle(rows: Array) -> Array:
+def triangle_of(rows: Array) -> Array:
     """Return R with R'R = rows' rows, square."""
     n = rows.shape[1]
-    R: Any = np.linalg.qr(np.vstack([rows, np.zeros((max(n - len(rows), 0), n))]), mode="r")
-    return R
+    return np.asarray(np.linalg.qr(np.vstack([rows, np.zeros((max(n - len(rows), 0), n))]), mode="r"), dtype=float)

@@ -16,7 +16,7 @@ from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as FAMILY_GAIN
-from rpim_opt.bayes.model_selection import SECOND, Candidate, compare_models, extended, identifiable, questions
+from rpim_opt.bayes.model_selection import SECOND, Candidate, Models, deviations, extended, named, questions
 from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Scatter, Stack
 from rpim_opt.problem.problem import CalibrationProblem
@@ -77,59 +77,39 @@ def admitted(
     """Return the fit with curves, the models compared, and by how much -2 ln L falls; None where that is too little.
 
     Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model.
-
-    Parameters
-    ----------
-    estimator
-        With the prior, and the parts of the noise to estimate.
-    fit
-        Of the model without curves that was selected.
-    stated
-        Names of the parameters that were to be identified.
-    trials
-        The models that it was selected from, that one first.
+    ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
+    the parameters that were to be identified.
     """
     p = fit.problem.parameters
     bare = fit.problem.with_parameters(replace(p, identified=np.isin(p.names, stated)))
-    extensions = identifiable(bare)
-    extensions.pop(SECOND, None)
-    known = dict(zip(p.free.names, fit.x, strict=True))
-    x = np.array([known[name] for name in bare.parameters.free.names])
-    whole, _ = extended(bare, x, [name for names in extensions.values() for name in names])
-    names = np.array(whole.parameters.free.names)
-    x = np.array([known.get(name, 0.0) for name in names])
-    evidence = estimator.evidence(whole, x)
-    used = np.isin(names, p.free.names)
-    before = dict(zip(p.free.names, fit.point.v, strict=True))
+    deviation = named(fit.problem, fit.x)
+    models = Models(bare, estimator, deviation, skip=(SECOND,))
+    used = np.isin(models.names, p.free.names)
+    before = named(fit.problem, fit.point.v)
     with phase("selection"):
-        given = _at_variances(evidence, used, np.array([before[name] for name in names[used]]))
-        start = np.log([max(getattr(fit.laid.scatter, kind), LEAST) for kind in evidence.noise])
+        given = _at_variances(models.columns, used, np.array([before[name] for name in models.names[used]]))
+        start = np.log([max(getattr(fit.laid.scatter, kind), LEAST) for kind in given.noise])
         plain = given.optima([start], ACCURACY)[0]
-        found = _most_likely(given, whole, x, plain.logs)
+        found = _most_likely(given, models.whole, plain.logs)
         if found is None or plain.value - found[0].value <= GAIN:
             return None
         point, curves, columns = found
-        geometry = _integrated(evidence, columns, point)
+        geometry = _integrated(models.columns, columns, point)
 
         def price(families: tuple[str, ...]) -> Candidate:
-            own = {*stated, *(name for family in families for name in extensions[family])}
-            model = geometry.restricted(np.isin(names, list(own)))
+            model = geometry.restricted(models.members(families))
             best = model.optima(model.starts()[:1])[0]
-            scales = dict(zip(model.names, best.logs, strict=True))
-            return Candidate(best.value + FAMILY_GAIN * questions(families), families, (best.value, own, scales))
+            return Candidate(best.value + FAMILY_GAIN * questions(families), families, best)
 
-        compared = sorted(compare_models(bare, extensions, price), key=lambda each: each.price)
-    value, own, scales = compared[0].found
-    q = whole.parameters
-    kept = np.isin(names, list(own))
-    curved = whole.with_parameters(replace(q, identified=np.isin(q.names, list(own)))).with_transmission(curves)
-    coefficients = point.z[len(point.z) - columns.shape[1] :]
-    logs = np.concatenate([list(scales.values()), point.logs])
-    joint = replace(estimator, curves=curves).fit(curved, np.append(x[kept], coefficients), logs, ROUNDS)
+        compared = sorted(models.compared(price), key=lambda each: each.price)
+    best = compared[0]
+    problem = extended(bare, models.added(best.families))
+    x = np.append(deviations(problem, deviation), point.z[len(point.z) - columns.shape[1] :])
+    logs = np.append(best.found.logs, point.logs)
+    joint = replace(estimator, curves=curves).fit(problem.with_transmission(curves), x, logs, ROUNDS)
     gain = plain.value - point.value
-    with_curves = tuple(
-        Trial((*each.families, TRANSMISSION), trials[0].value - gain + each.found[0] - value) for each in compared
-    )
+    shift = trials[0].value - gain - best.found.value
+    with_curves = [Trial((*each.families, TRANSMISSION), each.found.value + shift) for each in compared]
     return joint, (*with_curves, *trials), gain
 
 
@@ -149,7 +129,7 @@ def _at_variances(evidence: Evidence, keep: np.ndarray, v: Array) -> Evidence:
 
 
 def _most_likely(
-    given: Evidence, problem: CalibrationProblem, x: Array, noise: Array
+    given: Evidence, problem: CalibrationProblem, noise: Array
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
     """Return the optimum of curves and noise, those curves and their columns (m, c); None where no joint turned."""
     slopes = np.zeros((len(given.data.y), problem.robot.dof))

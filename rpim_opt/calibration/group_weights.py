@@ -52,7 +52,7 @@ class Weighing:
         scale = table.scale.copy()
         scale[table.identified] *= size
         weighted = problem.with_parameters(replace(table, scale=scale))
-        formulation = Prior().penalized(self.formulation, self.stated.inside(size))
+        formulation = self.stated.inside(size).penalized(self.formulation)
         return calibrated(weighted, formulation, 1.0, start=start, options=self.options)
 
     def groups(self, linear: LinearModel, t: Array) -> Grouped:

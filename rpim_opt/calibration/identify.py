@@ -156,14 +156,14 @@ def calibrate(
     estimator = Estimator(prior or Prior(), kinds, nearby)
     if weight is None:
         found = estimate(problem, estimator, model, start)
-        formulation = estimator.prior.penalized(formulation, found.stated)
+        formulation = found.stated.penalized(formulation)
         result = calibrated(found.problem, formulation, 1.0, start=found.x, options=options)
         result = replace(result, learned=found.learned)
     else:
         if model == "auto":
             problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
-            formulation = prior.penalized(formulation, prior.stated(problem.parameters, widened=False))
+            formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
         result = calibrated(problem, formulation, weight, start=start, options=options)
     message = " ".join(
         filter(None, [result.message, ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""])

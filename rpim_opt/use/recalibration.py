@@ -365,7 +365,7 @@ def posterior_as_prior(
         # in units of the declared noise, as the new readings are: weight 1 then joins both
         prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
     plain = replace(result.formulation, penalty=SQUARES, penalty_over=None)
-    return prior.penalized(plain, prior.stated(problem.parameters, widened=False))
+    return prior.stated(problem.parameters, widened=False).penalized(plain)
 
 
 def _widths(result: Calibration, problem: Source) -> Array:

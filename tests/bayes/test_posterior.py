@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
-from rpim_opt.bayes.statements import of_data
+from rpim_opt.bayes.population import of_data
 from rpim_opt.problem.linear import LinearModel
 
 PROBLEM = ro.load("position").problem
@@ -42,7 +42,7 @@ def result_of(formulation: ro.Formulation, linear: LinearModel, weight: float, n
 
 
 def then(prior: Prior, linear: LinearModel) -> np.ndarray:
-    mine = prior.penalized(ro.tikhonov, prior.stated(PROBLEM.parameters))
+    mine = prior.stated(PROBLEM.parameters).penalized(ro.tikhonov)
     return ro.convex.pose(mine, linear).solve(1.0).z
 
 
@@ -58,7 +58,7 @@ def test_three_in_turn_are_three_at_once() -> None:
     result = result_of(ro.tikhonov, parts[0], WEIGHT)
     for part in parts[1:]:
         prior = Prior.from_result(result)
-        mine = prior.penalized(ro.tikhonov, prior.stated(PROBLEM.parameters))
+        mine = prior.stated(PROBLEM.parameters).penalized(ro.tikhonov)
         result = result_of(mine, part, 1.0)
     everything = both(both(parts[0], parts[1]), parts[2])
     wanted = ro.convex.pose(ro.tikhonov, everything).solve(WEIGHT).z
@@ -146,7 +146,7 @@ def test_two_campaigns_of_one_arm_end_where_one_with_all_rows_does() -> None:
     rows = np.arange(len(PROBLEM.data))
     first, second = (PROBLEM.on(PROBLEM.data.take(part)) for part in (rows[:25], rows[25:]))
     prior = Prior.from_result(ro.calibrate(first, ro.tikhonov, weight=1.0), noise=1.0)
-    mine = prior.penalized(ro.tikhonov, prior.stated(PROBLEM.parameters))
+    mine = prior.stated(PROBLEM.parameters).penalized(ro.tikhonov)
     result = ro.calibrate(second, mine, weight=1.0)
     wanted = ro.calibrate(PROBLEM, ro.tikhonov, weight=1.0)
     sd = np.sqrt(np.diag(wanted.covariance))

@@ -46,7 +46,7 @@ def density(prior: Prior, x: np.ndarray) -> float:
 
 def test_a_penalty_is_the_density_that_the_prior_states() -> None:
     prior = some_prior()
-    mine = prior.penalized(ro.tikhonov, prior.stated(PROBLEM.parameters))
+    mine = prior.stated(PROBLEM.parameters).penalized(ro.tikhonov)
     program = ro.convex.pose(mine, PROBLEM.linearize(np.zeros(n)))
     rng = np.random.default_rng(1)
     for _ in range(5):
@@ -61,7 +61,7 @@ def test_a_penalty_is_the_density_that_the_prior_states() -> None:
 )
 def test_the_declared_quadratic_is_what_the_canonicalization_finds(formulation: ro.Formulation) -> None:
     prior = some_prior()
-    penalty = prior.penalized(formulation, prior.stated(PROBLEM.parameters)).penalty
+    penalty = prior.stated(PROBLEM.parameters).penalized(formulation).penalty
     z = cp.Variable(n)
     found = quadratic(penalty(z), z)
     declared = penalty.quadratic
@@ -69,9 +69,7 @@ def test_the_declared_quadratic_is_what_the_canonicalization_finds(formulation: 
     for _ in range(5):
         v = rng.standard_normal(n)
         assert declared.value(v) == pytest.approx(found.value(v), rel=1e-8)
-    program = ro.convex.pose(
-        prior.penalized(formulation, prior.stated(PROBLEM.parameters)), PROBLEM.linearize(np.zeros(n))
-    )
+    program = ro.convex.pose(prior.stated(PROBLEM.parameters).penalized(formulation), PROBLEM.linearize(np.zeros(n)))
     at_v = ro.convex.pose(ro.Formulation("asked", penalty=lambda y: penalty(y)), PROBLEM.linearize(np.zeros(n)))
     assert program.value(v) == pytest.approx(at_v.value(v), rel=1e-10)
     assert program.gradient(v, 0.7) == pytest.approx(at_v.gradient(v, 0.7), rel=1e-8, abs=1e-8)
@@ -81,9 +79,9 @@ def test_nothing_stated_is_the_formulation_itself() -> None:
     prior = Prior(joint_offset=1.0, frames=1.0)
     stated = prior.stated(PROBLEM.parameters)
     assert stated.plain
-    assert prior.penalized(ro.lasso, stated) is ro.lasso
+    assert stated.penalized(ro.lasso) is ro.lasso
     default = Prior().stated(PROBLEM.parameters)
-    assert Prior().penalized(ro.least_squares, default) is ro.least_squares
+    assert default.penalized(ro.least_squares) is ro.least_squares
 
 
 def test_learned_widths_in_the_place_of_the_scales_say_the_same() -> None:
@@ -108,19 +106,20 @@ def test_any_penalty_sees_what_is_not_replaced() -> None:
         (ro.group_lasso, sum(np.linalg.norm(D @ y) for D in ro.constraints.by_link(FREE))),
         (ro.Formulation("mine", penalty=lambda v: cp.sum(cp.huber(v))), float(cp.sum(cp.huber(y)).value)),
     ):
-        mine = prior.penalized(formulation, stated)
+        mine = stated.penalized(formulation)
         assert float(mine.penalty(cp.Constant(z)).value) == pytest.approx(wanted + rest, rel=1e-12)
 
 
 def test_equal_content_is_an_equal_formulation_and_travels() -> None:
-    one, other = (p.penalized(ro.tikhonov, p.stated(PROBLEM.parameters)) for p in (some_prior(), some_prior()))
+    one, other = (p.stated(PROBLEM.parameters).penalized(ro.tikhonov) for p in (some_prior(), some_prior()))
     assert one == other
     assert one.ready
     assert hash(one) == hash(other)
     assert pickle.loads(pickle.dumps(one)) == one
     assert (
         not some_prior()
-        .penalized(ro.Formulation("mine", penalty=lambda z: cp.norm1(z)), some_prior().stated(PROBLEM.parameters))
+        .stated(PROBLEM.parameters)
+        .penalized(ro.Formulation("mine", penalty=lambda z: cp.norm1(z)))
         .ready
     )
 

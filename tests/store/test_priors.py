@@ -34,7 +34,7 @@ def with_prior(folder: Path, text: str, scale: str = "") -> ro.store.Instance:
 def solved(
     problem: ro.CalibrationProblem, prior: Prior, formulation: ro.Formulation = ro.tikhonov
 ) -> ro.calibration.Calibration:
-    mine = prior.penalized(formulation, prior.stated(problem.parameters))
+    mine = prior.stated(problem.parameters).penalized(formulation)
     return ro.calibrate(problem, mine, weight=1.0)
 
 
