@@ -337,11 +337,6 @@ class Evidence:
             noise=S,
         )
 
-    def widening(self, point: Point) -> Array:
-        """Return by what deviations move (p, h) beside `Point.C`: D, with D D' what Student's tails add to it."""
-        size = np.sqrt(self.prior.variances(point.logs)[0][self._heavy])
-        return tail_widening(point.z, point.C, point.v, self._heavy, size, self.prior.tails)
-
     def optima(self, starts: Sequence[Array], accuracy: float = 1e-3) -> list[Point]:
         """Return the optima that are reached from some starts (s,), the best first.
 

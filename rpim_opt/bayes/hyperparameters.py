@@ -12,7 +12,16 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
 from rpim_opt.basics.threads import phase
-from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, Spectrum, scale_covariance
+from rpim_opt.bayes.evidence import (
+    FARTHEST,
+    Evidence,
+    Hierarchy,
+    Linearized,
+    Point,
+    Spectrum,
+    scale_covariance,
+    tail_widening,
+)
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
@@ -244,16 +253,13 @@ class Estimator:
             known = np.arange(len(unit)) < len(unit) - len(spectrum.w2)
             own = replace(hierarchy, group=np.where(known, stated.group, FIXED), spectrum=spectrum)
             hierarchy = own.of(np.ones(len(unit), dtype=bool))
-        return Evidence(data, hierarchy, self._kinds(data), problem.scatter or Scatter())
-
-    def _kinds(self, data: Linearized) -> tuple[str, ...]:
-        """Return the parts of the noise that the equations have."""
         have = {"instrument"}
-        if any(stack.positional for stack in data.stacks):
+        if any(stack.positional for stack in stacks):
             have |= {"position", "joint"}
-        if any(stack.angle.any() for stack in data.stacks):
+        if any(stack.angle.any() for stack in stacks):
             have.add("orientation")
-        return tuple(kind for kind in self.noise if kind in have)
+        noise = tuple(kind for kind in self.noise if kind in have)
+        return Evidence(data, hierarchy, noise, problem.scatter or Scatter())
 
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
         """Return hyperparameters and deviations that agree with each other, after some linearizations at most.
@@ -301,10 +307,8 @@ def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
 
 def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
     """Return where the optimum is looked for: from several sides where configurations are few."""
-    starts = evidence.starts()
-    if len(np.unique(problem.data.configuration)) <= FEW:
-        return starts
-    return starts[:1]
+    few = len(np.unique(problem.data.configuration)) <= FEW
+    return evidence.starts()[: None if few else 1]
 
 
 def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
@@ -317,9 +321,8 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
 
 
 def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
-    if len(np.unique(problem.data.configuration)) <= most:
-        return problem
-    return problem.on(problem.data.configurations(most, seed=0))
+    few = len(np.unique(problem.data.configuration)) <= most
+    return problem if few else problem.on(problem.data.configurations(most, seed=0))
 
 
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
@@ -356,6 +359,9 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'
     size = np.append(np.exp(point.logs[:sizes]), np.nan)[prior.group]
     local = np.sqrt(point.v) / size
+    heavy = np.flatnonzero(prior.heavy & ~prior.replaced)
+    scales = np.sqrt(prior.variances(point.logs)[0][heavy])
+    widening = tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)
     return Learned(
         sizes=dict(zip(prior.names, values[:sizes], strict=True)),
         noise=dict(zip(evidence.noise, values[noise:], strict=True)),
@@ -364,7 +370,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
         covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
-        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, evidence.widening(point)]),
+        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening]),
         notes=tuple(_doubts(fit, spread)),
         curves=None if prior.spectrum is None else Transmitted(values[sizes], values[sizes + 1], gain),
         **more,
