@@ -177,21 +177,14 @@ class Outcome:
         ----------
         q
             (N, dof) joint values of the controller [rad or m].
-        marker
-            The reflector; the only one by default.
+        marker, robot
+            The reflector and the robot; the only ones by default.
         torque
-            (N, dof) joint torques [Nm], where the compliance of joints was identified from measured ones.
+            (N, dof) joint torques [Nm], where compliances of joints were identified from measured ones.
         payload
             Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
         columns
             What terms of your own see, by name, (N,) each [SI].
-        robot
-            Which of several robots.
-
-        Raises
-        ------
-        InputError
-            For torques and columns that are missing, torques given where compliances multiply the torques of gravity.
 
         Examples
         --------
@@ -215,20 +208,9 @@ class Outcome:
         """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
 
         Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u
-        (`Uncertainty.predict` takes the coverage factor of a confidence instead).
-
-        Parameters
-        ----------
-        q, marker, torque, payload, columns, robot
-            As for `forward`.
-        of
-            ``"mean"``: of what the model says, J C J'. ``"reached"``: of the position that the robot will reach, with
-            its own scatter. ``"reading"``: of what the instrument will read there.
-
-        Raises
-        ------
-        InputError
-            For a penalty without covariance (lasso), and another ``of``.
+        (`Uncertainty.predict` takes the coverage factor of a confidence instead): with ``of`` ``"mean"`` of what the
+        model says, J C J'; ``"reached"`` of the position that the robot will reach, with its repeatability;
+        ``"reading"`` of what the instrument will read there. A penalty without covariance (lasso) is refused.
 
         Examples
         --------
@@ -273,7 +255,7 @@ class Outcome:
         q: Array,
         measurement: Measurement,
         marker: str,
-        torque: Array | None,
+        torque: Array | None = None,
         payload: float | Array | None = None,
         columns: Mapping[str, Array] = MappingProxyType({}),
         robot: str = "",
@@ -291,20 +273,7 @@ class Outcome:
     def error_vectors(self, data: Dataset | None = None, nominal: bool = False) -> Array:
         """Return measured minus modelled position of every row, (N, 3) [m]; NaN where no position was measured.
 
-        Parameters
-        ----------
-        data
-            The rows; of the identification data by default.
-        nominal
-            Of the model before calibration, as in `nominal_errors`.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> instance = ro.load("paper_arm")
-        >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1e-3)
-        >>> (1e3 * result.error_vectors(instance.validation, nominal=True)[0]).round(2)  # [mm]
-        array([-2.13, -0.71, -2.93])
+        Of the identification data by default; ``nominal``: of the nominal robot, as in `nominal_errors`.
         """
         source, x = self.problem, self.x
         if nominal:
@@ -334,17 +303,10 @@ class Outcome:
         return points
 
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
-        """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
+        """Return the norm of every row's residual, (N,) [m], of the identification data by default.
 
-        Parameters
-        ----------
-        data
-            The rows; the identification data by default.
-        dimension
-            ``"length"``, or ``"angle"`` for the orientation error [rad], NaN for rows that are no poses.
+        With the dimension ``"angle"`` the orientation error [rad], NaN for rows that are no poses; or ``"pixel"``.
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> instance = ro.load("pose")
         >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1.0)
@@ -588,15 +550,8 @@ class Outcome:
         """The parameters at an active bound, the costliest first.
 
         ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
-        the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong
-        data, or a drawing that does not describe this robot.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> tight = problem.parameters.toleranced({"length_mm": 0.5})
-        >>> result = ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), ro.bounded, weight=1e-3)
-        >>> [f"{held.name} at {1e3 * held.bound:+.1f} mm, gain {held.gain:.2g}" for held in result.held[:2]]
-        ['d6 at +0.5 mm, gain 0.085', 'a3 at -0.5 mm, gain 0.032']
+        the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
+        drawing that does not describe this robot.
         """
         if self.kept is not None:
             return self.kept.held
