@@ -244,8 +244,12 @@ def calibrate(
     ] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[
-        bool, Option("--use-validation", help="Once validated, calibrate from all rows.")
-    ] = False,
+        bool | None,
+        Option(
+            "--use-validation/--no-use-validation",
+            help="Once validated, calibrate from all rows; by default those that --hold-out drew.",
+        ),
+    ] = None,
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,
@@ -273,7 +277,7 @@ def calibrate(
         if without:
             say("calibrating without outliers")
             result = result.without_flagged()
-        if use_validation:
+        if use_validation or (use_validation is None and instance.held_out and result.verdict.delivered):
             from rpim_opt.calibration.held_out import refit_all
 
             say("calibrating from all rows")

@@ -204,6 +204,16 @@ def test_held_out_rows_are_whole_configurations_drawn_by_the_seed(monkeypatch, c
     assert split[0] == split[1] != split[2]
 
 
+def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, made, tmp_path) -> None:
+    """The result has both figures: of the fit that did not see them, and of the one that did."""
+    whole = json.loads((made / "results" / "result.json").read_text())
+    assert run(monkeypatch, "calibrate", str(made), "--no-use-validation", "--out", str(tmp_path)) == 0
+    apart = json.loads((tmp_path / "result.json").read_text())
+    assert [each["identification"]["count"] for each in (whole, apart)] == [40, 32]
+    assert whole["validation"] == apart["validation"] == whole["held_out"]["identified"]
+    assert apart["held_out"] is None
+
+
 def test_every_guess_is_what_auto_means(cell, made) -> None:
     stated, text = ro.load(made), (made / "problem.toml").read_text()
     auto = made.parent / "auto"

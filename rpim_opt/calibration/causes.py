@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, cast
 
@@ -10,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import NOISY, kept_rows, noise_ratio, rms
+from rpim_opt.calibration.verdict import BAD, NOISY, kept_rows, noise_ratio, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import (
     copied_rows,
@@ -23,10 +24,9 @@ from rpim_opt.problem.diagnosis import (
     shared_rows,
     transmission,
 )
-from rpim_opt.problem.misreadings import EXACT, Better, better_reading
+from rpim_opt.problem.misreadings import EXACT, Better, better_reading, lost_row
 from rpim_opt.problem.problem import CalibrationProblem
 
-BAD = "The fit is bad"
 HOPELESS = 20.0
 """Residuals over the stated noise from which something is said even if nothing explains them."""
 SCALES = 10.0
@@ -89,17 +89,16 @@ def likely_causes(result: Outcome) -> list[str]:
     ratios = noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")
     figures = f"{three_digits(1e3 * rms(errors))} mm", f"{three_digits(rms(pixels))} px"
     signs = [
-        f"its errors have an RMS of {figure}, {three_digits(ratio)} times the stated noise"
+        f"residual RMS {figure}, {three_digits(ratio)} times the stated noise"
         for figure, ratio in zip(figures, ratios, strict=True)
         if ratio > NOISY
     ]
-    if not result.converged:
-        signs.append("it did not converge")
     signs += _large(result, problem)
     head: list[str] = []
     causes: tuple[Cause, ...] = ()
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
+    if signs or not result.converged:
         causes = find_causes(result)
     elif not kept.all():
         causes = tuple(map(Cause, _of_rows(problem)))
@@ -121,7 +120,7 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
     problem = cast(CalibrationProblem, result.problem)
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return tuple(map(Cause, _of_rows(problem)))
-    better = better_reading(problem)
+    better = better_reading(problem) or lost_row(_in_table_order(result, problem))
     if better is not None:
         factor = better.stated / max(better.left, EXACT)
         return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, factor))
@@ -131,6 +130,18 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
     if not found:
         found += rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)]))
     return tuple(map(Cause, found))
+
+
+def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
+    """Return the problem with held-out rows at their places in the table, where labels have numbers."""
+    apart = result.record.validation
+    if apart is None:
+        return problem
+    numbers = [re.search(r"\d+$", label) for label in (*problem.data.label, *apart.label)]
+    if not all(numbers):
+        return problem
+    order = np.argsort([int(found[0]) for found in numbers if found], kind="stable")
+    return problem.on(Dataset.together([problem.data, apart], ["identification", "validation"]).take(order))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
@@ -161,7 +172,7 @@ def misread(result: Outcome, data: Dataset) -> str:
 
 
 def mistakes(causes: Sequence[str]) -> list[str]:
-    """Return the mistakes among `likely_causes`, without how a fit is bad."""
+    """Return the mistakes among `likely_causes`."""
     return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
 
 

@@ -109,4 +109,8 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     errors = result.nominal_errors(apart), result.errors(apart)
     held_out = HeldOut(whole.label[used:], used, *errors, *judged(result, apart))
     record = replace(result.record, validation=None, held_out=held_out)
-    return replace(result.asked(stated.on(whole)), record=record)
+    found = result.asked(stated.on(whole))
+    if found.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
+        left_out = (*result.learned.left_out, *found.learned.left_out)
+        found = replace(found, learned=replace(found.learned, left_out=left_out))
+    return replace(found, record=record)

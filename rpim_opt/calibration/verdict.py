@@ -14,6 +14,8 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
 from rpim_opt.robot.parameter_names import own_name
 
+BAD = "Larger than expected"
+"""Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
 NOISY = 3.0
 """Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
 REACH = 0.003
@@ -66,6 +68,10 @@ class Verdict:
     def __str__(self) -> str:
         """Return the verdict with its reasons."""
         return " ".join(["Delivered." if self.delivered else "Not delivered.", *self.reasons])
+
+    def beside(self, causes: Sequence[str]) -> list[str]:
+        """Return the likely causes that the reasons do not say already."""
+        return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(BAD))]
 
     def require(self, forced: bool = False) -> str:
         """Return the note that goes with a robot that is used in spite of its verdict; empty where it is delivered.

@@ -92,7 +92,7 @@ class HeldOut:
     Parameters
     ----------
     label
-        N labels of the rows that were kept apart.
+        N labels of the held-out rows.
     used
         How many rows the parameters that were judged came from.
     nominal, error
@@ -125,7 +125,7 @@ class HeldOut:
         """Say what validated, and what the parameters come from: so many rows."""
         missed = f"{1e3 * np.nanmean(self.error):.4f} mm"
         return (
-            f"Validated on {len(self.label)} rows that were kept apart: parameters from the {self.used} others missed "
+            f"Validated on {len(self.label)} held-out rows: parameters from the {self.used} others missed "
             f"them by {missed} in the mean. The parameters given here come from all {rows}."
         )
 
@@ -150,7 +150,7 @@ class Earlier(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Where a calibration's data come from, and what was kept apart.
+    """Where a calibration's data come from, and what was held out.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class Record:
     requirement
         What the robot is accepted by; None where nobody demanded anything.
     held_out
-        Rows that were kept apart and judged before they were used; None where validation data are still unused.
+        Rows that were held out and judged before they were used; None where validation data are still unused.
     earlier
         The calibrations that this one carries on (`use.update`), the last one last.
     digest

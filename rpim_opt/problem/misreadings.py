@@ -106,6 +106,9 @@ BEAM = 8
 """First mistakes behind which a second one is looked for."""
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
 """How much of another joint a joint may count, of a neighbour and of others."""
+LEAST_ROWS, SOME_ROWS, STARTS, ROW_WRONG = 12, 60, 17, 10.0
+"""Of a lost reading: rows below which none is sought, rows of a try, places that are tried, and the error over the
+median of a row that has a neighbour's value."""
 LENGTHS = {
     1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m"),
     1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm"),
@@ -269,6 +272,48 @@ def _of_rows(count: int) -> Iterator[Reading]:
 
 
 # Which of these fits
+
+
+def lost_row(problem: CalibrationProblem) -> Better | None:
+    """Return from which row on the measured values stand beside a neighbour's joint values, or None; rows in order."""
+    points = points_of(problem, len(problem.data))
+    if points is None or points.seen or len(points.row) < LEAST_ROWS:
+        return None
+    robot = problem.robot
+    points = points.take(np.argsort(points.row))
+    stated = misfit(robot, points.evenly(SOME_ROWS))
+    if stated <= WRONG:
+        return None
+    rows = np.arange(len(points.row))
+
+    def moved(start: int, by: int) -> Points:
+        joints = np.where(rows < start, rows, rows + by)
+        values = np.flatnonzero(joints < len(rows))
+        return replace(points.take(values), q=points.q[joints[values]])
+
+    starts = np.unique(np.linspace(2, len(rows) - 2, STARTS).round().astype(int)).tolist()
+    tries = [(start, by) for by in (1, -1) for start in starts]
+    size = misfits(robot, [moved(*each).evenly(SOME_ROWS) for each in tries])
+    start, by = tries[int(np.argmin(size))]
+    if not size.min() < BETTER * stated:
+        return None
+    fit = fit_arms(robot, Candidates.of(robot, [moved(start, by)]), ZERO_STEPS, zeros=True, robust=True)
+    error = fit.error[0, :: 1 if points.turns is None else 4]
+    wrong = np.append(error > ROW_WRONG * np.median(error), False)
+    first = start
+    while wrong[start]:  # rows before the right start fit as they stand
+        start += 1
+    while start == first > 0 and wrong[first - 1]:
+        first -= 1
+        start = first
+    label = problem.labels[points.row[min(start, len(rows) - 1)]]
+    way, remedy = ("down", "a reading was lost there") if by > 0 else ("up", "there is a reading too many there")
+    return Better(
+        f"the measured values from row {label} on moved {way} by one row",
+        remedy,
+        stated * points.extent,
+        float(size.min()) * points.extent,
+    )
 
 
 def better_reading(problem: CalibrationProblem) -> Better | None:

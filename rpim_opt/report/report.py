@@ -114,7 +114,7 @@ def _headline(content: Content) -> Iterator[Block]:
         text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
         yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
-    yield "notes", list(dict.fromkeys([*result.verdict.reasons, *result.causes]))
+    yield "notes", [*result.verdict.reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = summary.headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:

@@ -261,7 +261,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "errors": errors,
         "orientation": orientation_rows(result),
         "prices": [price._asdict() for price in result.prices],
-        "remarks": [*remarks, *(text for text in result.causes if text not in result.verdict.reasons)],
+        "remarks": [*remarks, *result.verdict.beside(result.causes)],
         "likely_causes": list(result.causes),
         "lack_of_fit": lacking and lacking.content(),
         "details": dict(record.details),

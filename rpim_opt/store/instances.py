@@ -94,6 +94,8 @@ class Instance(Tabled):
         Rows that the folder leaves out, label to reason.
     reading
         How the tables that it was made from were read.
+    held_out
+        Whether the validation data were drawn from the same table: once they have validated, all rows are used.
 
     Examples
     --------
@@ -121,6 +123,7 @@ class Instance(Tabled):
     details: Mapping[str, str] = field(default_factory=dict)
     requirement: Requirement | None = None
     reading: Mapping[str, str] = field(default_factory=dict)
+    held_out: bool = False
 
     def _short(self) -> str:
         return f"'{shortened(self.title)}' {self.problem._short()}"
@@ -230,6 +233,7 @@ def load(
         details=details,
         requirement=requirement,
         reading=table.reading,
+        held_out=table.held_out,
     )
 
 

@@ -143,7 +143,7 @@ def new_problem(
         held = _held_out(rows, hold_out, seed)
         tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}
         rows = rows.take(np.flatnonzero(~held))
-        said = f'validation = "{VALIDATION}"\n# configurations drawn with seed {seed}; no choice sees them'
+        said = f'validation = "{VALIDATION}"\nheld_out = true  # drawn with seed {seed}; used once they have validated'
     if board.table:
         tables[TARGET] = board.table
     context = {

@@ -187,6 +187,8 @@ class ProblemTable(Table):
     """Table of the identification data."""
     validation: str | None = None
     """Table of the validation data."""
+    held_out: bool = False
+    """Validation data were drawn from the same table: once they have validated, all rows are used."""
     observation: list[Observation] = Field(default_factory=list)
     """Several measurement types, a table each."""
     target: str | dict[str, Any] | None = None

@@ -299,15 +299,17 @@ def content(result: Calibration) -> dict[str, Any]:
 
 def figures(result: Calibration) -> dict[str, Any]:
     """Return what a reader looks for first: errors [mm], the weight and where it came from, the parameters."""
-    validation = result.record.validation
+    validation = None
+    if result.record.validation is not None:
+        validation = statistics(result.errors(result.record.validation))
     held_out = result.record.held_out
     if held_out is not None:
-        before, after = statistics(held_out.nominal), statistics(held_out.error)
-        held_out = {"nominal": before, "identified": after, "used": held_out.used}
+        before, validation = statistics(held_out.nominal), statistics(held_out.error)
+        held_out = {"nominal": before, "identified": validation, "used": held_out.used}
     return {
         "verdict": {"delivered": result.verdict.delivered, "reasons": list(result.verdict.reasons)},
         "identification": statistics(result.errors()),
-        "validation": None if validation is None else statistics(result.errors(validation)),
+        "validation": validation,
         "held_out": held_out,
         "weight": result.weight,
         "selector": result.selector,

@@ -9,7 +9,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
+from rpim_opt.calibration.causes import _in_table_order
 from rpim_opt.problem import inspect
+from rpim_opt.problem.misreadings import lost_row
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
@@ -198,6 +200,25 @@ def test_rows_that_were_left_out_together_are_an_instrument_that_moved() -> None
     last = np.arange(COUNT)[:, None] >= COUNT - 5
     causes = likely_causes(ro.calibrate(values(lambda y: y + last * [0.03, -0.02, 0.01])(problem)))
     assert any("did the instrument or the robot's foot move" in text for text in causes), causes
+
+
+def test_a_lost_reading_is_named_also_where_rows_are_held_out() -> None:
+    problem = values(lambda y: np.concatenate([y[:17], y[18:], y[-1:]]))(simulated_arm("irb120"))
+    assert "values from row P18 on moved down by one row" in lost_row(problem).sentence
+    held = np.isin(np.arange(COUNT), [3, 9, 17, 18, 25, 33])
+    rows = [problem.data.take(np.flatnonzero(part)) for part in (~held, held)]
+    wrong = calibrated(problem.on(rows[0]))
+    whole = _in_table_order(validated(wrong, rows[1]), wrong.problem)
+    assert whole.labels == problem.labels
+    assert lost_row(whole).what == lost_row(problem).what
+
+
+def test_an_outlier_among_few_rows_is_excluded_and_named() -> None:
+    problem = simulated_arm("ur5e", count=15)
+    far = values(lambda y: y + 0.003 * (np.arange(15) == 11)[:, None])(problem)
+    result = ro.calibrate(far)
+    assert [row.label for row in result.learned.left_out] == ["P12"]
+    assert result.errors(problem.data).max() < 2e-4
 
 
 def test_a_table_in_the_standard_convention_is_named() -> None:
