@@ -21,6 +21,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.select import Selector, weight_of
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.multi_robot import require_affordable
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
 
@@ -103,7 +104,8 @@ def calibrate(
     Raises
     ------
     InputError
-        For fewer equations than unknowns without a penalty, a start that does not fit, unknown words.
+        For fewer equations than unknowns without a penalty, a start that does not fit, unknown words, and sessions by
+        the hundred, of which it says what they would cost.
     NoSolutionFound
         When a convex program fails.
 
@@ -123,6 +125,7 @@ def calibrate(
     weight = weight_of(weight)
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     kinds = _noise(noise, model)
+    require_affordable(problem)
     if isinstance(weight, Mapping):
         from rpim_opt.calibration.group_weights import grouped
 

@@ -44,29 +44,20 @@ def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Arr
     reflector; the only one, or the first, by default. ``torque``: (N, dof) joint torques [Nm], where the compliance of
     joints is identified from measured ones.
     """
-    here = _there(machine, q, marker, torque)
-    return _about(here, _at(machine))
+    return _linear(machine, _there(machine, q, marker, torque), np.ones(len(machine.parameters.free)))
 
 
 def moved(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
-    """Return by how much the robot's own parameters move a reflector; arguments as for `predicted`.
-
-    Frames stay where they are: they say where things stand, not how the robot is.
-    """
+    """Return by how much the robot's own parameters move a reflector, frames where they are; arguments as before."""
     here = _there(machine, q, marker, torque)
     own = ~machine.parameters.free.of_frames
-    about = _about(here, _at(machine) * own)
-    nominal = here.modelled(np.zeros(len(own)))[0]
-    return Predicted(about.position - nominal, about.slope * own)
+    found = _linear(machine, here, own)
+    return Predicted(found.position - here.modelled(np.zeros(len(own)))[0], found.slope * own)
 
 
-def _at(machine: Machine) -> Array:
-    if machine.at is None:
-        return np.zeros(len(machine.parameters.free))
-    return machine.at
-
-
-def _about(here: CalibrationProblem, x: Array) -> Predicted:
+def _linear(machine: Machine, here: CalibrationProblem, own: Array) -> Predicted:
+    """Return positions about where the machine is looked at, of its ``own`` deviations (n,) alone."""
+    x = own * (0.0 if machine.at is None else machine.at)
     position = here.modelled(x)[0]
     slope = here.jacobian(x).reshape(len(position), 3, -1)
     return Predicted(position - slope @ x, slope)
@@ -75,15 +66,14 @@ def _about(here: CalibrationProblem, x: Array) -> Predicted:
 def _there(machine: Machine, q: Array, marker: str | None, torque: Array | None) -> CalibrationProblem:
     """Return the problem whose measurements are the positions of a reflector."""
     q = np.atleast_2d(np.asarray(q, dtype=float))
-    if not np.isfinite(q).all() or q.shape[1] != require_robot(machine).dof:
+    robot = require_robot(machine)
+    if not np.isfinite(q).all() or q.shape[1] != robot.dof:
         found = f"joint values of shape {q.shape}"
-        raise InputError("positions", found, f"finite numbers (N, {require_robot(machine).dof}) [rad or m]")
+        raise InputError("positions", found, f"finite numbers (N, {robot.dof}) [rad or m]")
     data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
     data = bearing(data, machine.data, torque)
-    if marker is None:
-        marker = markers(machine)[0]
-    block = replace(data.blocks[0], markers=(marker,))
-    problem = CalibrationProblem(require_robot(machine), machine.parameters, machine.data)
+    block = replace(data.blocks[0], markers=(markers(machine)[0] if marker is None else marker,))
+    problem = CalibrationProblem(robot, machine.parameters, machine.data)
     return problem.on(replace(data, blocks=(block,)))
 
 
@@ -102,53 +92,44 @@ def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
 
     ``machine``: robot and parameters; ``lower``, ``upper``: (3,) corners [m].
     """
-    key = (require_robot(machine), machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
+    robot = require_robot(machine)
+    key = (robot, machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
     if key not in _FOUND:
+        inside = [np.zeros((0, robot.dof))]
+        for seed in range(16):
+            q = random_candidates(robot, DRAWN, seed)
+            at = in_base(machine, q)
+            inside.append(q[((at >= lower) & (at <= upper)).all(axis=1)])
+            if sum(map(len, inside)) >= ALL:
+                break
+        found = np.concatenate(inside)[:ALL]
+        if len(found) == 0:
+            raise InputError("box", "no configuration of the joint ranges that reaches into it", "a box within reach")
         if len(_FOUND) >= SOME:
             _FOUND.clear()
-        _FOUND[key] = _reaching(machine, lower, upper)
+        _FOUND[key] = found
     return _standing(machine, _FOUND[key])
 
 
 _FOUND: dict[Any, Array] = {}
-"""Configurations of boxes, which are asked for at every pass; a robot is the same object all the while."""
+"""Configurations of boxes, which are asked for at every iteration; a robot is the same object all the while."""
 
 
 def _standing(machine: Machine, q: Array) -> Array:
-    """Return some configurations, and those of all that move farthest where the machine is looked at.
-
-    Bounds at some alone would be kept there, and nowhere else.
-    """
+    """Return some configurations, and those of all that move farthest: bounds at some would be kept there alone."""
     if machine.farthest is None or len(q) <= 2 * SOME:
         return q[: 2 * SOME]
     own = ~machine.parameters.free.of_frames
-    rest = q[SOME:]
-    here = _there(machine, rest, None, None)
+    here = _there(machine, q[SOME:], None, None)
     movement = here.modelled(machine.farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
     farthest = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
-    return np.concatenate([q[:SOME], rest[farthest]])
-
-
-def _reaching(machine: Machine, lower: Array, upper: Array) -> Array:
-    """Draw configurations until enough reach into a box."""
-    inside = [np.zeros((0, require_robot(machine).dof))]
-    for seed in range(16):
-        q = random_candidates(require_robot(machine), DRAWN, seed)
-        at = in_base(machine, q)
-        inside.append(q[((at >= lower) & (at <= upper)).all(axis=1)])
-        if sum(map(len, inside)) >= ALL:
-            break
-    found = np.concatenate(inside)[:ALL]
-    if len(found) == 0:
-        raise InputError("box", "no configuration of the joint ranges that reaches into it", "a box within reach")
-    return found
+    return np.concatenate([q[:SOME], q[SOME:][farthest]])
 
 
 def in_base(machine: Machine, q: Array, marker: str | None = None) -> Array:
     """Return where the nominal reflector is in the robot's base frame, (N, 3) [m]; arguments as for `predicted`."""
     whole = machine.parameters
-    nominal = whole.nominal.copy()
-    nominal[[name.startswith("base_") for name in whole.names]] = 0.0
+    nominal = np.where([name.startswith("base_") for name in whole.names], 0.0, whole.nominal)
     at_base = replace(machine, parameters=replace(whole, nominal=nominal), at=None, farthest=None)
     return _there(at_base, q, marker, None).modelled(np.zeros(len(whole.free)))[0]
 
@@ -159,10 +140,8 @@ FIRST, FAR = 10, 1e-3
 """After so many draws a row is out of reach from which the nearest configuration is further [m]."""
 STEPS = 40
 """Newton steps from each: some dozen long ones until the target is near, then a few to rounding."""
-LONGEST = 0.1
-"""Largest step, in ranges of the joints: close starts stay close on their way."""
-DIFFERENCE = 1e-4
-"""Step of the central differences, in ranges: their rounding is 1e-12, and Newton's method forgives their bend."""
+LONGEST, DIFFERENCE = 0.1, 1e-4
+"""Largest step, and step of the central differences, in ranges of the joints."""
 DAMPING = 1e-9
 """Square of the slopes [m^2] at which a step is half as long: a stretched arm does not leap."""
 THERE = 1e-11
@@ -252,9 +231,8 @@ class Target(NamedTuple):
     def reached(self, count: int, rng: np.random.Generator, share: float) -> tuple[Array, int | None]:
         """Return joint values (N, dof) [rad or m] of so many rows, and the row that is out of reach, if there is one.
 
-        A configuration that does not get there is drawn again, from a share of the ranges. Rows do not depend on each
-        other. What processors differ by in rounding grows 2 times on the way in the median and 100 times at worst, to
-        a thousandth of what a table prints.
+        A configuration that does not get there is drawn again, from a share of the ranges; rows do not depend on each
+        other. What processors differ by in rounding grows 100 times at worst, to a thousandth of what a table prints.
         """
         q = np.empty((count, self.robot.dof))
         missing = np.ones(count, dtype=bool)

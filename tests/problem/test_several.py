@@ -352,3 +352,13 @@ def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     own = [left.parameters.free.names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
     apart = alone.spread.noise[np.ix_(own, own)] / alone.noise_variance
     assert np.linalg.eigvalsh(apart - C).min() > 0
+
+
+def test_sessions_by_the_hundred_are_refused_with_what_they_cost() -> None:
+    arm = ro.load("position").problem
+    q = ro.problem.random_candidates(arm.robot, 800)
+    data = ro.Dataset.of(q, np.zeros((800, 3)), 5e-5, session=[f"day {i // 2}" for i in range(800)])
+    parameters = ro.problem.starting_parameters(arm.robot, data).identify([*arm.parameters.free.names, "session_*"])
+    problem = ro.CalibrationProblem(arm.robot, parameters, data)
+    with pytest.raises(ro.InputError, match=r"session: found 400 of them and 2,434 parameters, .* about 4 minutes"):
+        ro.calibrate(problem)
