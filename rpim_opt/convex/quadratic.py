@@ -12,7 +12,7 @@ from scipy.linalg import qr
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.expressions import cp
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, svd
 
 DENSE = 2000
 """Variables up to which a quadratic with products of different variables is factored."""
@@ -242,7 +242,7 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
         A_y = A_y - Q @ (Q.T @ A_y)
         b_y = b - Q @ (Q.T @ b)
     if T is None:
-        U, s, Vt = np.linalg.svd(A_y, full_matrices=False)
+        U, s, Vt = svd(A_y)
         B = Vt.T
         least = RANK_TOLERANCE * np.max(s, initial=0.0)
     else:

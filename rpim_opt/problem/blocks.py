@@ -220,10 +220,7 @@ def _on_part(
 
 
 def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
-    """Return the measurements of a part, without what was dropped of it.
-
-    Refuse a session that the parameters lack while they have others: its rows would be taken for unshifted.
-    """
+    """Return the measurements of a part; refuse a session that the parameters lack while they have others."""
     number, read = part
     mine = f"{number}:"
     out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}

@@ -19,10 +19,7 @@ UNKNOWNS = 3
 
 
 class Moved(NamedTuple):
-    """How a point or the centre of a plane moves (3, c) [m], and how its normal turns (3, c); zero for a point.
-
-    ``across`` (2, 3, c) is how the plane's two directions turn with it; None where all that is parallel turns with it.
-    """
+    """How a centre (3, c) [m], a normal (3, c) and directions in a plane (2, 3, c), if any, move."""
 
     centre: Array
     normal: Array
@@ -124,10 +121,7 @@ class Plane:
 
     @property
     def level(self) -> Plane:
-        """The plane with its touches in it, as they were: what the nominal robot is off is no noise.
-
-        And planes that are to be parallel are.
-        """
+        """The plane with its touches in it, and parallel planes parallel: what the nominal robot is off is no noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @property
@@ -302,21 +296,14 @@ class Touches:
         return found
 
     def contrasts(self, values: Array, where: Things) -> Array:
-        """Return what m equations' values (m, c) say without points and planes, (k, c).
-
-        Values are as `centred` returns them; any places near enough serve: what is perpendicular to a plane hardly
-        depends on them.
-        """
+        """Return what m equations' values (m, c), as of `centred`, say without points and planes, (k, c)."""
         found = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
             found[index] = thing.contrasts(values[index])
         return found[self.kept(where)]
 
     def noise(self, where: Things) -> Array:
-        """Return by which noise of the m equations that of the contrasts is made, (k, m).
-
-        What a drawing states has the noise of the touches of its two things beside that of its own statement.
-        """
+        """Return by which noise of the m equations that of the contrasts is made, (k, m)."""
         eye = np.eye(self.equations)
         through = eye.copy()
         for thing, index in zip(where, self.rows, strict=True):
@@ -372,11 +359,7 @@ def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
-    """Return what divides the contrasts' noise, of what divides that of the equations, by configuration.
-
-    ``stop`` (m,) is the number of the joint values at which every equation was measured: joints stop anew at every
-    touch.
-    """
+    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops."""
     place = np.cumsum(touches.kept(where)) - 1
     of_thing = {int(index[0, 0]): i for i, index in enumerate(touches.rows)}
     of_tie = {int(tie.equations[0]): i for i, tie in enumerate(touches.ties)}
@@ -445,10 +428,7 @@ def _independent(stack: Stack) -> Iterator[Stack]:
 
 
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
-    """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of the rows by themselves.
-
-    What a drawing states counts as the instrument's part of a reading.
-    """
+    """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of rows by themselves."""
     numbers = [index[:, 0] for index in equation_numbers(data)]
     touch = np.zeros((touches.equations, 3, 3))
     for block, V, first in zip(data.blocks, each, numbers, strict=True):

@@ -262,11 +262,7 @@ def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tu
 
 
 def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:
-    """Return rows (M, 3, n + 3) of touches of one point, whose place is unknown to `ANYWHERE`.
-
-    ln det of the information with those columns is that without the point, but for a constant: the point is a fixed
-    effect.
-    """
+    """Return rows (M, 3, n + 3) of touches of one point, a fixed effect: its place is unknown to `ANYWHERE`."""
     covariance = np.median(problem.data.blocks[0].covariance, axis=0)
     place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(covariance))
     return np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)

@@ -8,6 +8,7 @@ from functools import cached_property, reduce
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
+from scipy.linalg import svd as scipy_svd
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -78,7 +79,7 @@ class LinearModel(Brief):
         """U'b (n,), s (n,), V' (n, n) of A = U diag(s) V'; s below `RANK_TOLERANCE` times the largest are zero."""
         n, R = self.A.shape[1], self.triangle
         with phase("reduction"):
-            U, s, Vt = np.linalg.svd(R[:n, :n])
+            U, s, Vt = svd(R[:n, :n])
         s = np.where(s > RANK_TOLERANCE * s[0], s, 0.0)
         return U.T @ R[:n, n], s, Vt
 
@@ -110,6 +111,14 @@ class LinearModel(Brief):
     def scaled(self, rows: Array) -> LinearModel:
         """Return the model with its equations multiplied by numbers (m,)."""
         return replace(self, A=self.A * rows[:, None], b=self.b * rows)
+
+
+def svd(A: Array) -> tuple[Array, Array, Array]:
+    """Return U, s, V' of A (m, n), of min(m, n) singular values."""
+    try:
+        return np.linalg.svd(A, full_matrices=False)
+    except np.linalg.LinAlgError:  # as LAPACK's quicker driver ends with 514 parameters of 80 sessions
+        return scipy_svd(A, full_matrices=False, lapack_driver="gesvd")
 
 
 BLOCK = 430_000
@@ -205,10 +214,7 @@ def identified_of(robot: Robot | None, parameters: Parameters, data: Dataset) ->
 
 
 def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
-    """Return a linear model whose parameters predict positions linearly about deviations x (n,) [SI], or nominal.
-
-    Positions of a region are also those that move farthest at ``farthest`` (n,) [SI], by default at x.
-    """
+    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
     known = model.parameters
     if x is None or not isinstance(known, Identified) or known.machine is None:
         return model

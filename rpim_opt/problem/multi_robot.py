@@ -182,11 +182,7 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
 
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
-    """Return what sessions that are not identified add to the covariance of a reading, block by block (N, k, k) [SI].
-
-    T diag(size^2) T' with T the slopes by the shift and the turn of a session, and as sizes the scales of those that
-    are identified; zero for rows of an identified session, and where no session is identified.
-    """
+    """Return T S^2 T' (N, k, k) [SI] of every block: sessions that are not identified, zero for those that are."""
     whole = knowing_sessions(problem)
     if whole is problem or problem.touches is not None:
         return [np.zeros((1, 1, 1)) for _ in problem.data.blocks]

@@ -122,10 +122,7 @@ def equation_numbers(data: Dataset) -> list[np.ndarray]:
 
 
 class Equations(NamedTuple):
-    """The equations (m,) of a dataset: their row, their component of it, what they are, and the row's covariance.
-
-    ``covariance`` (m, K) is with the components of the same row.
-    """
+    """The equations (m,): row, component of it, kind, and the covariance (m, K) with the components of their row."""
 
     row: np.ndarray
     component: np.ndarray
@@ -149,11 +146,7 @@ class Equations(NamedTuple):
         return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def stack(self, index: np.ndarray, slopes: Array | None = None, shifts: Array | None = None) -> Stack:
-        """Return what divides the noise of equations (N, k) that stand together.
-
-        ``slopes`` (m, dof) are by the joints' angles, ``shifts`` (m, 3) those of what cameras see by where the robot
-        is, zero for other equations; None for none.
-        """
+        """Return what divides noise of equations (N, k); slopes (m, dof) by joints, (m, 3) by where a robot is."""
         row = self.row[index]
         V = self.covariance[index[:, :, None], self.component[index][:, None, :]]
         V = V * (row[:, :, None] == row[:, None, :])

@@ -245,6 +245,8 @@ class CalibrationProblem(RobotModel):
     """
 
     data: Dataset
+    _structures: dict[Block, Structure] = field(default_factory=dict, init=False, repr=False)
+    _arguments: dict[Block, Array] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.parameters.identified.any():
@@ -345,14 +347,6 @@ class CalibrationProblem(RobotModel):
         if block not in self._structures:
             self._structures[block] = self._structure(block)
         return (self.asked or asked)(self._structures[block], block.measurement)
-
-    @cached_property
-    def _structures(self) -> dict[Block, Structure]:
-        return {}
-
-    @cached_property
-    def _arguments(self) -> dict[Block, Array]:
-        return {}
 
     def _structure(self, block: Block) -> Structure:
         """Return what the functions of a block's rows depend on, besides its measurement."""

@@ -96,11 +96,7 @@ def _restored(text: str) -> ca.Function:
 
 
 def asked(structure: Structure, measurement: Measurement) -> Functions:
-    """Return the functions of a row; InputError for another number of components than the measurement declares.
-
-    Ready measurements are pure, and built once. A user's model or term may read a variable that has changed: it is
-    asked anew, and what was built before is taken only when it answers the same expression.
-    """
+    """Return the functions of a row: of ready measurements built once, of a user's by their present answer."""
     if structure.is_pure(measurement):
         return _ready(structure, measurement)
     with SYMBOLS:
@@ -232,11 +228,7 @@ def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: S
 
 
 class Loads(NamedTuple):
-    """What the rows of a block state of their joints, which decides the functions that evaluate them.
-
-    ``gravity`` is None where no parameter asks for it; ``weighs`` tells that its torques stand for measured ones;
-    ``columns`` are those that a user's own terms and measurement see.
-    """
+    """What rows state of their joints; ``gravity`` where it is asked for, ``weighs`` where it stands for torques."""
 
     torques: bool = False
     payload: bool = False
@@ -280,10 +272,7 @@ class Loads(NamedTuple):
 
 
 class Stated(NamedTuple):
-    """The symbols of what a row states of its joints, in the order in which `loads_in` lays it side by side.
-
-    ``q``, ``torque`` and ``approach`` are (dof x points, 1), point by point; ``payload`` (1, 1), ``columns`` (c, 1).
-    """
+    """The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
 
     q: ca.SX
     torque: ca.SX
@@ -374,10 +363,7 @@ def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:
-    """Refuse torques of another kind than those of a problem's data, ``measured`` or not, where compliances need them.
-
-    Without measured torques a compliance multiplies those of gravity, on masses that may be a guess.
-    """
+    """Refuse other torques than a problem's data have where compliances need them: gravity's are on guessed masses."""
     if not Needs.of(robot, parameters).torques or measured_torques(data) == measured:
         return
     if measured:

@@ -38,12 +38,7 @@ class Predicted(NamedTuple):
 
 
 def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
-    """Return where a reflector is in the instrument's frame, to first order about where the machine is looked at.
-
-    ``machine``: robot and parameters. ``q``: (N, dof) joint values of the controller [rad or m]. ``marker``: the
-    reflector; the only one, or the first, by default. ``torque``: (N, dof) joint torques [Nm], where the compliance of
-    joints is identified from measured ones.
-    """
+    """Return where a reflector is at q (N, dof) [rad or m] to first order; ``torque`` (N, dof) [Nm]."""
     return _linear(machine, _there(machine, q, marker, torque), np.ones(len(machine.parameters.free)))
 
 
@@ -88,10 +83,7 @@ def within_ranges(machine: Machine) -> Array:
 
 
 def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
-    """Return configurations (N, dof) whose nominal reflector is in a box of the robot's base frame, and stand for it.
-
-    ``machine``: robot and parameters; ``lower``, ``upper``: (3,) corners [m].
-    """
+    """Return configurations (N, dof) with the nominal reflector between corners (3,) [m] of the base frame."""
     robot = require_robot(machine)
     key = (robot, machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
     if key not in _FOUND:
@@ -281,13 +273,7 @@ class Target(NamedTuple):
 
 
 def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Array:
-    """Return a point (3,) [m] in the robot's base frame: as stated, ``"400,0,200"`` [mm], or the middle of the data's.
-
-    Raises
-    ------
-    InputError
-        For a text that is not three numbers, and data that touch nothing.
-    """
+    """Return a point (3,) [m] in the base frame: as stated, ``"400,0,200"`` [mm], or the middle of the data's."""
     if stated is not None:
         try:
             numbers = [float(part) for part in stated.split(",")]
