@@ -7,10 +7,10 @@ import atexit
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +19,7 @@ from typer import Argument, Option
 from typer.core import TyperGroup
 
 from rpim_opt import __version__
-from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
 from rpim_opt.report import console
 
 if TYPE_CHECKING:
@@ -71,33 +71,33 @@ def _common(
     """Take what stands before a command."""
 
 
-def _shipped(incomplete: str) -> list[str]:
-    """Complete a problem: the names that come with the package; folders are the shell's own."""
+def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
+
+
+def _shipped() -> Iterable[str]:
+    """Return the problems that come with the package; folders are the shell's own."""
     from rpim_opt.store.problem_file import problems_folder
 
-    return sorted(path.parent.name for path in problems_folder().glob(f"{incomplete}*/problem.toml"))
+    return sorted(path.parent.name for path in problems_folder().glob("*/problem.toml"))
 
 
-def _formulations(incomplete: str) -> list[str]:
+def _formulations() -> Iterable[str]:
     from rpim_opt.convex.formulation import FORMULATIONS
 
-    return [name for name in FORMULATIONS if name.startswith(incomplete)]
+    return FORMULATIONS
 
 
-def _selectors(incomplete: str) -> list[str]:
+def _selectors() -> Iterable[str]:
     from rpim_opt.convex.select import SELECTORS
 
-    return [name for name in ("learned", *SELECTORS) if name.startswith(incomplete)]
+    return ["learned", *SELECTORS]
 
 
-def _robots(incomplete: str) -> list[str]:
+def _robots() -> Iterable[str]:
     from rpim_opt.robot.library import robots
 
-    return [name for name in robots() if name.startswith(incomplete)]
-
-
-def _one_of(*words: str) -> Callable[[str], list[str]]:
-    return lambda incomplete: [word for word in words if word.startswith(incomplete)]
+    return robots()
 
 
 Text = str | None
@@ -105,7 +105,18 @@ Number = float | None
 File = Path | None
 Choice = bool | None
 Problem = Annotated[
-    str, Argument(help="A problem folder, or the name of one that comes with rpim-opt.", autocompletion=_shipped)
+    str,
+    Argument(help="A problem folder, or the name of a shipped one.", autocompletion=_completed(_shipped)),
+]
+MODELS = _completed(lambda: ("auto", "geometry"))
+COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
+RULES = "learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
+Selector = Annotated[Text, Option(help=RULES, autocompletion=_completed(_selectors))]
+READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
+Formulation = Annotated[Text, Option(help=READY, autocompletion=_completed(_formulations))]
+Noise = Annotated[
+    Text,
+    Option(help="Variance components to estimate: robot, free, level, declared (none).", autocompletion=COMPONENTS),
 ]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
@@ -134,7 +145,8 @@ def new(
     robot: Annotated[
         str,
         Option(
-            help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.", autocompletion=_robots
+            help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.",
+            autocompletion=_completed(_robots),
         ),
     ],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
@@ -214,34 +226,10 @@ def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) ->
 def calibrate(
     problem: Problem,
     variant: Variant = None,
-    selector: Annotated[
-        Text,
-        Option(
-            help="learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number.",
-            autocompletion=_selectors,
-        ),
-    ] = None,
-    model: Annotated[
-        Text,
-        Option(
-            help="auto: extensions by evidence (gravity, gears); geometry: none.",
-            autocompletion=_one_of("auto", "geometry"),
-        ),
-    ] = None,
-    formulation: Annotated[
-        Text,
-        Option(
-            help="least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso.",
-            autocompletion=_formulations,
-        ),
-    ] = None,
-    noise: Annotated[
-        Text,
-        Option(
-            help="Variance components to estimate: robot, free, level, declared (none).",
-            autocompletion=_one_of("robot", "free", "level", "declared"),
-        ),
-    ] = None,
+    selector: Selector = None,
+    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.", autocompletion=MODELS)] = None,
+    formulation: Formulation = None,
+    noise: Noise = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[
         bool | None,
@@ -290,10 +278,7 @@ def calibrate(
     if profile:
         text = f"{text}\n\n{describe_times(times)}"
         found = {**found, "seconds": times}
-    written = _saved(result, out)
-    for file in written:
-        text += f"\n\nWritten: {file}"
-    console.show(text, {**found, "refitted_without": without, "written": written}, as_json)
+    _answer(text, {**found, "refitted_without": without}, as_json, _saved(result, out))
     if not result.verdict.delivered:
         raise typer.Exit(1)
     _end_by(found["acceptance"])
@@ -316,7 +301,7 @@ def report(
             out = inside(folder, "report.html", "the file", folder)
         with refused(out):
             write_report(loaded, out)
-    console.show(f"Written: {out}", {"written": [out]}, as_json)
+    _answer("", {}, as_json, [out])
 
 
 @app.command()
@@ -341,18 +326,10 @@ def validate(
 
         rows, left_out = read_measurements(loaded, data, measurement, units)
         found = validate(loaded, rows)
-    text = str(found) + console.left_out_line(left_out)
-    kept = None
-    if limit is not None:
-        kept = 1e3 * found.largest <= limit
-        text += "\n" + _against("error", found.largest, limit)
-    document = {
-        "left_out": left_out,
-        "limit_mm": limit,
-        "written": console.written_to(out, found.csv()),
-        "within_limit": kept,
-    }
-    console.show(text + console.written_line(out), {**found.content(), **document}, as_json)
+    text, kept = _against(limit, "error", found.largest)
+    document = {**found.content(), "limit_mm": limit, "within_limit": kept}
+    written = console.written_to(out, found.csv())
+    _answer("\n".join([str(found), *text]), document, as_json, written, left_out)
     if kept is False or found.mistake or found.worse:
         raise typer.Exit(1)
 
@@ -381,9 +358,8 @@ def accept(
             rows, left_out = read_measurements(loaded, data, measurement, units)
         say("searching for the maximum uncertainty")
         found = accept(loaded, console.required(limit, box, loaded.record.requirement), rows)
-    document = {**found.content(), "left_out": left_out}
-    console.show(str(found) + console.left_out_line(left_out), document, as_json)
-    _end_by(document)
+    _answer(found, found.content(), as_json, left_out=left_out)
+    _end_by(found.content())
 
 
 @app.command()
@@ -403,14 +379,14 @@ def iso9283(
     found = read_approaches(table, units)
     if limit is not None and found.accuracy is None:
         raise InputError("--limit", "a table without commands", "command_x_mm, command_y_mm, command_z_mm in it")
-    checks = [("AP_p", found.accuracy, limit), ("RP_l", found.repeatability, repeatability)]
-    over = [(name, value, most) for name, value, most in checks if value is not None and most is not None]
-    within = all(1e3 * value <= most for _, value, most in over)
-    document = {"limit_mm": limit, "repeatability_limit_mm": repeatability, "within_limits": within if over else None,
-                "written": console.written_to(out, found.csv())}  # fmt: skip
-    text = "\n".join([str(found), *(_against(*each) for each in over)])
-    console.show(text + console.written_line(out), {**found.content(), **document}, as_json)
-    if not within:
+    accuracy, kept = _against(limit, "AP_p", found.accuracy or 0.0)
+    repeated, also_kept = _against(repeatability, "RP_l", found.repeatability)
+    checked = [each for each in (kept, also_kept) if each is not None]
+    limits = {"limit_mm": limit, "repeatability_limit_mm": repeatability}
+    document = {**found.content(), **limits, "within_limits": all(checked) if checked else None}
+    written = console.written_to(out, found.csv())
+    _answer("\n".join([str(found), *accuracy, *repeated]), document, as_json, written)
+    if not all(checked):
         raise typer.Exit(1)
 
 
@@ -439,7 +415,7 @@ def update(
         found = update(loaded, rows, prior_inflation=prior_inflation, reset=patterns, progress=say)
         updated = found.result
         updated = replace(updated, record=replace(updated.record, files={data.name: sha256_of(data)}))
-    _tell(found, left_out, _saved(updated, out), as_json)
+    _answer(found, found.content(), as_json, _saved(updated, out), left_out)
     if not (found.explained and updated.verdict.delivered):
         raise typer.Exit(1)
 
@@ -465,7 +441,7 @@ def monitor(
         read = read_checks(loaded, checks, measurement, units)
         found = monitor(loaded, read.data, read.when, read.times)
         written = written_checks(found, out, loaded.record.title)
-    _tell(found, read.left_out, written, as_json)
+    _answer(found, found.content(), as_json, written, read.left_out)
     if found.drifts:
         raise typer.Exit(1)
 
@@ -493,40 +469,14 @@ def export(
     Exit code 1 if the robot is not delivered.
     """
     with _loaded(result) as (loaded, _):
-        from rpim_opt.robot.formats.tables import write_robodk, write_robot
-        from rpim_opt.robot.formats.universal_robots import write_ur_kinematics
-        from rpim_opt.use.export import (
-            export_ur_calibration,
-            export_urdf,
-            geometry_alone,
-            with_first_reflector,
-            write_all,
-            write_joint_corrections,
-        )
+        from rpim_opt.use.export import export_files
 
-        whole = loaded
-        loaded, without = geometry_alone(whole)
-        note = _forced(loaded, despite_verdict)
-        robot = with_first_reflector(loaded, marker).robot
-        options = {"root": urdf_base, "tip": urdf_tip, "base": base, "tool": tool, "marker": marker}
-        corrected: list[tuple[Path | None, Callable[[Path], Any]]] = [
-            (urdf, lambda target: export_urdf(loaded, urdf or "", target, **options)),
-            (ur_kinematics, lambda target: write_ur_kinematics(ur_kinematics or "", robot, target)),
-            (ur_calibration, lambda target: export_ur_calibration(loaded, ur_calibration or "", target)),
-        ]
-        plain = [
-            (mdh, partial(write_robot, robot)),
-            (robodk, partial(write_robodk, robot)),
-            (corrections, partial(write_joint_corrections, whole)),
-        ]
-        writers = [*console.corrected_files(corrected, out), *((target, write) for target, write in plain if target)]
-        if not writers:
-            accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
-            raise InputError("export", "nothing to write", accepted)
-        notes = [*filter(None, [note]), *without, *write_all(writers, note)]
-    written = [target for target, _ in writers]
-    text = "\n".join([*notes, *(f"Written: {target}" for target in written)])
-    console.show(text, {"written": written, "notes": notes}, as_json)
+        written, notes = export_files(
+            loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, mdh=mdh, robodk=robodk,
+            corrections=corrections, root=urdf_base, tip=urdf_tip, base=base, tool=tool, marker=marker,
+            despite_verdict=despite_verdict,
+        )  # fmt: skip
+    _answer("\n".join(notes), {"notes": notes}, as_json, written)
 
 
 @app.command()
@@ -552,9 +502,7 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        note = _forced(loaded, despite_verdict)
         from rpim_opt.use.compensation import compensate
-        from rpim_opt.use.export import noted
         from rpim_opt.use.reading import read_commands
 
         read, left_out = read_commands(loaded, targets, units)
@@ -562,12 +510,9 @@ def compensate(
         found = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
-            payload=read.payload if mass is None else mass, payload_centre=centre,
+            payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
         )  # fmt: skip
-    rows = noted(found.csv(), ".csv", note)
-    document = {"left_out": left_out, "limit_mm": limit, "written": console.written_to(out, rows), "note": note}
-    text = str(found) + console.left_out_line(left_out) + _written_or_shown(out, rows)
-    console.show(text, {**found.content(), **document}, as_json)
+    _answer_with_table(found, found.csv(), out, {**found.content(), "limit_mm": limit}, as_json, left_out)
     if limit is not None and 1e3 * found.position_error.max() > limit:
         raise typer.Exit(1)
 
@@ -585,7 +530,7 @@ def simulate(
 
     with refused(out or problem):
         written = write_simulation(problem, seed, out)
-    console.show("\n".join(f"Written: {path}" for path in written), {"written": written}, as_json)
+    _answer("", {}, as_json, written)
 
 
 @app.command()
@@ -619,9 +564,8 @@ def design(
         found = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[found.chosen], found.chosen)
     text = csv_text(columns, zip(*columns.values(), strict=True))
-    document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap,
-                "configurations": columns, "written": console.written_to(out, text)}  # fmt: skip
-    console.show(str(found) + _written_or_shown(out, text), document, as_json)
+    document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap}
+    _answer_with_table(found, text, out, {**document, "configurations": columns}, as_json)
 
 
 @app.command()
@@ -648,8 +592,8 @@ def study(
     worse: list[str] = []
     if gate:
         worse = regressions(name, quick, report.metrics)
-    text = f"{report.text}\n\nWritten: {folder}"
-    console.show(text, {"report": report.text, "metrics": report.metrics, "worse": worse, "written": [folder]}, as_json)
+    document = {"report": report.text, "metrics": report.metrics, "worse": worse}
+    _answer(f"{report.text}\n", document, as_json, [folder])
     if worse:
         console.fail("\n".join(f"Worse: {line}" for line in worse), 1)
 
@@ -695,10 +639,8 @@ def compare(
     if out is not None and journal is not None:
         written = [found.report(out, against=against)]
         journal.unlink()
-    text = "\n".join([repr(found), "", str(summary), *(f"\nWritten: {path}" for path in written)])
-    console.show(
-        text, {"replicates": found.rows, "made": found.made, "notes": summary.notes, "written": written}, as_json
-    )
+    document = {"replicates": found.rows, "made": found.made, "notes": summary.notes}
+    _answer(f"{found!r}\n\n{summary}", document, as_json, written)
 
 
 @app.command()
@@ -766,15 +708,6 @@ def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFoun
     return NoSolutionFound(error.formulation, error.weight, error.status, advice=" ".join(causes).rstrip("."))
 
 
-def _forced(result: "Calibration", forced: bool) -> str:
-    """Return the note on a robot that is used in spite of its verdict, or end where it is not delivered."""
-    try:
-        return result.verdict.require(forced)
-    except InputError as error:
-        console.fail(str(error), 1)
-        raise
-
-
 def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
     if out is None:
@@ -788,20 +721,36 @@ def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     return [file]
 
 
-def _tell(found: Any, left_out: Sequence[str], written: Sequence[Path], as_json: bool) -> None:
-    """Print what was found of a table, columns that were left out, and files that were written."""
-    text = str(found) + console.left_out_line(left_out) + "".join(console.written_line(file) for file in written)
-    console.show(text, {**found.content(), "left_out": left_out, "written": written}, as_json)
+def _answer(
+    text: object,
+    document: dict[str, Any],
+    as_json: bool,
+    written: Sequence[Path] | None = None,
+    left_out: Sequence[str] | None = None,
+) -> None:
+    """Print what was found, columns that were left out, and files that were written."""
+    lines = [str(text)] if str(text) else []
+    if left_out:
+        lines.append(f"Columns that were left out: {', '.join(left_out)}.")
+    lines += [f"Written: {file}" for file in written or ()]
+    more = {"left_out": left_out, "written": written}
+    console.show("\n".join(lines), {**document, **{k: v for k, v in more.items() if v is not None}}, as_json)
 
 
-def _written_or_shown(out: Path | None, text: str) -> str:
-    """Return the line that says where a table is, or the table."""
-    return console.written_line(out) or "\n" + text.rstrip("\n")
+def _answer_with_table(
+    found: object, rows: str, out: Path | None, document: dict[str, Any], as_json: bool, left_out: Sequence[str] = ()
+) -> None:
+    """Print what was found, and its table where no file takes it."""
+    text = str(found) if out else f"{found}\n{rows.rstrip()}"
+    _answer(text, document, as_json, console.written_to(out, rows), left_out)
 
 
-def _against(name: str, value: float, limit: float) -> str:
-    """Return a sentence on a figure [m] and its limit [mm]."""
-    return f"The largest {name} is {1e3 * value:.4f} mm, {'within' if 1e3 * value <= limit else 'above'} {limit:g} mm."
+def _against(limit: float | None, name: str, value: float) -> tuple[list[str], bool | None]:
+    """Return a sentence on a figure [m] and its limit [mm], and whether it is kept; nothing where there is none."""
+    if limit is None:
+        return [], None
+    kept = 1e3 * value <= limit
+    return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if kept else 'above'} {limit:g} mm."], kept
 
 
 def _end_by(acceptance: dict[str, Any] | None) -> None:
@@ -842,5 +791,7 @@ def _run() -> None:
         console.fail("Interrupted.", INTERRUPTED)
     except NoSolutionFound as error:
         console.fail(str(error), 3)
+    except NotDelivered as error:
+        console.fail(str(error), 1)
     except RpimError as error:
         console.fail(str(error), 2)

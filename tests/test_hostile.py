@@ -237,12 +237,13 @@ def test_an_output_that_knows_but_ascii() -> None:
 
 
 WAITING = """
-import sys, signal, os
+import sys, signal, os, time
 from rpim_opt import cli
 from rpim_opt.store import instances
 
 def load(*_):
     os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(60)  # another thread may have taken the signal first
 
 instances.load = load
 sys.argv = ["rpim-opt", "inspect", "paper_arm"]

@@ -67,6 +67,10 @@ def _one_line(text: str) -> str:
     return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
 
 
+class NotDelivered(InputError):
+    """A calibration whose verdict is against it is to be used; where it was forced, files say so."""
+
+
 class RowError(InputError):
     """A row of a table (from 0) is wrong, and the table's reader knows what the row is called.
 

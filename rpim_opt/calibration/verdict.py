@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import NotDelivered
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
@@ -78,14 +78,14 @@ class Verdict:
 
         Raises
         ------
-        InputError
+        NotDelivered
             With the reasons, unless ``forced``.
         """
         if self.delivered:
             return ""
         if not forced:
             found = f"not delivered: {' '.join(self.reasons)}".rstrip(".")
-            raise InputError("the calibration", found, "a delivered one, or --despite-verdict")
+            raise NotDelivered("the calibration", found, "a delivered one, or --despite-verdict (despite_verdict=True)")
         return f"Written in spite of the verdict. {self}"
 
 

@@ -538,6 +538,7 @@ class Lost(Structure):
         self.limited, self.constrained = False, True
         self.quadratic_of_r, self.penalty_form, self.box = loss_form, penalty_form, None
         self._declared = True
+        self._lock = threading.RLock()
         self.values = self.trusted = lost(formulation.name)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from math import radians
@@ -99,16 +99,6 @@ def written_to(path: Path | None, text: str) -> list[Path]:
     return [path]
 
 
-def written_line(path: Path | None) -> str:
-    """Return the line that names a written file."""
-    return f"\nWritten: {path}" if path else ""
-
-
-def left_out_line(columns: Sequence[str]) -> str:
-    """Return the line that names columns that were not read."""
-    return f"\nColumns that were left out: {', '.join(columns)}." if columns else ""
-
-
 # --- options -----------------------------------------------------------------------------------------------
 
 
@@ -116,23 +106,6 @@ def require_positive(where: str, value: float | None) -> None:
     """Raise InputError for a limit that is not positive."""
     if value is not None and not value > 0:
         raise InputError(where, f"{value:g}", "a number greater than zero [mm]")
-
-
-def corrected_files(
-    writers: Sequence[tuple[Path | None, Callable[[Path], Any]]], out: Path | None
-) -> list[tuple[Path, Callable[[Path], Any]]]:
-    """Return target and writer of every corrected file: ``--out``, or a file of the source's name in that folder."""
-    sources = [(source, write) for source, write in writers if source]
-    if not sources:
-        return []
-    if out is None:
-        raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
-    several = len(sources) > 1 or out.is_dir()
-    files = [(source, out / source.name if several else out, write) for source, write in sources]
-    for source, target, _ in files:
-        if target.resolve() == source.resolve():
-            raise InputError("--out", f"the original, {source}", "another place: the original stays")
-    return [(target, write) for _, target, write in files]
 
 
 def _numbers(option: str, text: str, counts: tuple[int, ...], accepted: str, least: float = -LARGEST) -> list[float]:

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import Any, Concatenate, NamedTuple, ParamSpec
+from typing import Any, Concatenate, ParamSpec
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import inside, sha256_of
 from rpim_opt.basics.layout import TableOptions
-from rpim_opt.basics.tables import Columns, read_columns
+from rpim_opt.basics.tables import read_columns
 from rpim_opt.basics.text import Tabled, shortened
 from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import identify
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.constraints import Box, Constraint, Parsed
+from rpim_opt.convex.constraints import Box, Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.measurements.camera import Board, on_board
+from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record, Requirement
@@ -34,7 +34,6 @@ from rpim_opt.problem.linear import identified_of
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (
@@ -52,6 +51,7 @@ from rpim_opt.store.statements import place_fixtures, stated_details, stated_req
 
 ROLES = ("identification", "validation")
 Tools = Mapping[str, tuple[float, ...]]
+Files = Mapping[str, list[str]]
 UNSTATED = 1e-5
 """Standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool."""
 RIGHT = (0.0, 90.0)
@@ -66,24 +66,12 @@ class Instance(Tabled):
     ----------
     title, source
         What it is, and where every figure comes from.
-    problem
-        Robot, parameters and identification data.
-    validation
-        Measurements that no step of the calibration may see; None when there are none.
-    formulation, weight, model
-        How the folder wants it solved; weight None where sizes are learned, model ``"auto"`` for families that the
-        evidence wants.
-    noise
-        What of the noise is learned, as `calibrate` has it.
-    details
-        Who measured, when, with which instrument, ... as the folder states it.
-    requirement
-        What the robot is accepted by; None where the folder demands nothing.
-    prior
-        What the folder believes of the deviations.
+    problem, validation
+        Robot, parameters and identification data, and measurements that no step of the calibration may see.
+    formulation, weight, prior, model, noise
+        As for `calibrate`; weight None where hyperparameters are estimated.
     published
-        Mean errors [mm] that the source prints for the same table, by role (identification,
-        validation) and method, to show beside ours.
+        Mean errors [mm] that the source prints for the same table, by role (identification, validation) and method.
     reference
         Figures that a run must reproduce, by name: (value, tolerance).
     simulation
@@ -92,6 +80,8 @@ class Instance(Tabled):
         SHA-256 of the files that were read, by name.
     excluded
         Rows that the folder leaves out, label to reason.
+    details, requirement
+        Who measured, when, with which instrument; tolerance and region of the acceptance test, or None.
     reading
         How the tables that it was made from were read.
     held_out
@@ -205,9 +195,12 @@ def load(
     stated = read_problem(name, variant, measurements, model)
     table = stated.table
     path = stated.path
-    tables = _read_tables(stated)
+    data, files, tools = _read_tables(stated)
+    validation = data.get("validation")
     try:
-        problem = _problem(stated, tables)
+        problem = _problem(stated, data["identification"], tools)
+        if validation is not None:
+            problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(stated, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         details = stated_details(table.record)
@@ -219,14 +212,14 @@ def load(
         title=table.title,
         source=table.source,
         problem=problem,
-        validation=tables.validation,
+        validation=validation,
         formulation=formulation,
         weight=named_weight(table.selector, path),
         prior=prior,
-        published=_published(table, tables, path),
+        published=_published(table, files, path),
         reference=_reference(table, path),
         simulation=table.simulation,
-        files=_hashes(stated, tables),
+        files=_hashes(stated, files),
         excluded=table.exclude,
         model=table.model,
         noise=table.scatter if isinstance(table.scatter, str) else "declared",
@@ -271,51 +264,40 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 """
 
 
-def _problem(stated: ProblemFile, tables: _Tables) -> CalibrationProblem:
-    """Return the problem, whose robot and reflectors the validation data must have, too."""
-    data = tables.identification
+def _problem(stated: ProblemFile, data: Dataset, tools: Tools) -> CalibrationProblem:
     fixtures = place_fixtures(stated.placed, data)
     temperature = None
     if stated.table.celsius is not None:
         temperature = stated.table.celsius + UNITS["degC"].zero
-    parameters = starting_parameters(stated.robot, data, stated.base, tables.tools, fixtures, temperature)
+    parameters = starting_parameters(stated.robot, data, stated.base, tools, fixtures, temperature)
     problem = CalibrationProblem(stated.robot, stated.chosen(parameters, data), data)
-    if tables.validation is not None:
-        problem.on(tables.validation)
     return problem.scattered(stated_scatter(stated.table, stated.path))
 
 
 def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
-    table, path = stated.table, stated.path
-    formulation = named_formulation(table.formulation, path)
-    demands = table.constraints.all(problem.robot, problem.data)
-    formulation = replace(formulation, constraints=(*formulation.constraints, *demands))
+    formulation = named_formulation(stated.table.formulation, stated.path)
+    own = stated.table.constraints.all(problem.robot, problem.data)
+    formulation = replace(formulation, constraints=(*formulation.constraints, *own))
     parameters = identified_of(problem.robot, problem.parameters, problem.data)
     for constraint in formulation.constraints:
         if isinstance(constraint, Box):
             constraint.bounds(parameters)
-        else:
-            _require_fit(constraint, parameters)
-    for demand in demands:
-        if isinstance(demand, Parsed):
-            demand.require_near(parameters)
+            continue
+        from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
+
+        z = Unknown(parameters.names)
+        constraint(z, given(z, parameters))
+        if isinstance(constraint, Parsed):
+            constraint.require_near(parameters)
     return formulation
 
 
-def _require_fit(constraint: Constraint, parameters: Parameters) -> None:
-    """Ask a constraint of the file for what it demands of the parameters, or raise its InputError."""
-    from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
-
-    z = Unknown(parameters.names)
-    constraint(z, given(z, parameters))
-
-
-def _published(table: ProblemTable, tables: _Tables, path: Path) -> dict[str, Mapping[str, float]]:
+def _published(table: ProblemTable, files: Files, path: Path) -> dict[str, Mapping[str, float]]:
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
-    return {role: table.published.get(files[0], {}) for role, files in tables.files.items() if files}
+    return {role: table.published.get(names[0], {}) for role, names in files.items() if names}
 
 
 def _reference(table: ProblemTable, path: Path) -> dict[str, tuple[float, float]]:
@@ -325,14 +307,14 @@ def _reference(table: ProblemTable, path: Path) -> dict[str, tuple[float, float]
     return {key: (value, spread) for key, (value, spread) in table.reference.items()}
 
 
-def _hashes(stated: ProblemFile, tables: _Tables) -> dict[str, str]:
+def _hashes(stated: ProblemFile, files: Files) -> dict[str, str]:
     folder = stated.path.parent
-    drawing = find_robot(stated.table.robot, folder)
-    used = {stated.path.name: stated.path, drawing.name: drawing}
+    robot = find_robot(stated.table.robot, folder)
+    used = {stated.path.name: stated.path, robot.name: robot}
     if isinstance(stated.table.target, str):
         used[stated.table.target] = folder / stated.table.target
-    for files in tables.files.values():
-        used |= {file: folder / file for file in files}
+    for names in files.values():
+        used |= {file: folder / file for file in names}
     used |= stated.table.prior.files(stated.path)
     return {name: sha256_of(file) for name, file in used.items()}
 
@@ -340,101 +322,72 @@ def _hashes(stated: ProblemFile, tables: _Tables) -> dict[str, str]:
 # --- the tables of a folder, without the excluded rows -----------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Tables:
-    """What the tables of a folder hold: both sets of data, the files of each role, and where the reflectors start."""
-
-    identification: Dataset
-    validation: Dataset | None
-    files: Mapping[str, Sequence[str]]
-    tools: Tools
-
-
-class _Part(NamedTuple):
-    """One table of the folder."""
-
-    role: str
-    file: str
-    data: Dataset
-
-
-def _read_tables(stated: ProblemFile) -> _Tables:
-    """Return the measurements that a problem file names."""
-    # RoboDK's export states the tools [mm] itself; the file's own go before them
+def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files, Tools]:
+    """Return the measurements and the names of their files by role, and where the reflectors start."""
+    exclude = stated.table.exclude
+    # RoboDK's export states the tools [mm] itself, in the file's order; the file's own go before them
     tcps = {marker: [1e3 * v for v in frame[:3]] for marker, frame in stated.tools.items() if stated.table.tool}
-    parts = list(_parts(stated, tcps))
-    files = {role: [part.file for part in parts if part.role == role] for role in ROLES}
-    sets = {}
-    for role in ROLES:
-        if files[role]:
-            own = [part.data for part in parts if part.role == role]
-            sets[role] = Dataset.together(own, [Path(file).stem for file in files[role]])
-    labels = {label for data in sets.values() for label in data.label}
-    for label in stated.table.exclude:
-        if label not in labels:
-            raise InputError("key exclude", f"label '{label}'", "a label of the data", stated.path)
-    for role, data in sets.items():
-        rest = data.without(stated.table.exclude)
-        if not len(rest):
-            file = stated.path.parent / files[role][0]
-            raise InputError("the table", "no row that is not excluded", "at least one", file)
-        sets[role] = _with_known(rest, stated.table, role, stated.path)
-    return _Tables(sets["identification"], sets.get("validation"), files, _tools(stated, tcps))
-
-
-def _parts(stated: ProblemFile, tcps: dict[str, list[float]]) -> Iterator[_Part]:
-    """Read the tables in the file's order, in which RoboDK's reflectors get their names."""
+    files: dict[str, list[str]] = {role: [] for role in ROLES}
+    parts: dict[str, list[Dataset]] = {role: [] for role in ROLES}
     for each in stated.observations:
         for role in ROLES:
             file = getattr(each, role)
             if file:
-                yield _Part(role, file, _read(stated, each, file, tcps))
+                files[role].append(file)
+                parts[role].append(_read(stated, each, stated.path.parent / file, tcps))
+    data = {
+        role: Dataset.together(parts[role], [Path(file).stem for file in files[role]]) for role in ROLES if files[role]
+    }
+    labels = {label for each in data.values() for label in each.label}
+    for label in exclude:
+        if label not in labels:
+            raise InputError("key exclude", f"label '{label}'", "a label of the data", stated.path)
+    for role in data:
+        rest = data[role].without(exclude)
+        if not len(rest):
+            file = stated.path.parent / files[role][0]
+            raise InputError("the table", "no row that is not excluded", "at least one", file)
+        data[role] = _with_known(rest, stated.table, role, stated.path)
+    tools = stated.tools
+    if any(each.layout == "robodk" for each in stated.observations):
+        exported = {marker: (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0) for marker, tcp in tcps.items()}
+        tools = {marker: stated.tools.get(marker, place) for marker, place in exported.items()}
+    return data, files, tools
 
 
-def _read(stated: ProblemFile, each: Observation, file: str, tcps: dict[str, list[float]]) -> Dataset:
-    path = stated.path.parent / file
+def _read(stated: ProblemFile, each: Observation, path: Path, tcps: dict[str, list[float]]) -> Dataset:
+    kind = stated.kinds[each.measurement]
     robodk = each.layout == "robodk"
+    source: Any = path
     try:
-        source: Any = robodk_columns(path, stated.robot.joint_dimensions, tcps) if robodk else path
-        if stated.board is not None and stated.kinds[each.measurement].by_camera:
-            source = _seen(path, stated.board)
-        return read_data(source, stated.robot, each.noise or stated.table.noise, stated.kinds[each.measurement])
+        if stated.board is not None and kind.by_camera:
+            try:
+                source = on_board(read_columns(path), stated.board)
+            except InputError as error:
+                raise error.within(path) from None
+        elif robodk:
+            source = robodk_columns(path, stated.robot.joint_dimensions, tcps)
+        return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
     except InputError as error:
         at_fault = path if robodk and error.where.startswith("row") else stated.path
         raise error.within(at_fault) from None
-
-
-def _seen(path: Path, board: Board) -> Columns:
-    """Return the columns of a table of corners, with where their points are on the board."""
-    try:
-        return on_board(read_columns(path), board)
-    except InputError as error:
-        raise error.within(path) from None
-
-
-def _tools(stated: ProblemFile, tcps: Mapping[str, list[float]]) -> Tools:
-    if all(each.layout != "robodk" for each in stated.observations):
-        return stated.tools
-    exported = {marker: (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0) for marker, tcp in tcps.items()}
-    return {marker: stated.tools.get(marker, place) for marker, place in exported.items()}
 
 
 # --- [[known_distance]] and [[known_angle]] between touched points and planes ------------------------------------
 
 
 def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:
-    """Return the measurements of a role with what a file knows of the points and planes that they touch."""
+    """Return the measurements of a role with the known distances and angles of what they touch."""
     known: list[Known] = []
     for number, distance in enumerate(table.known_distance, start=1):
-        where = f"key known_distance {number}"
-        pair, sigma = _pair(distance, where, path), _sigma(distance, f"{where}.sigma_mm", path)
+        pair, sigma = _relation(distance, f"key known_distance {number}", path)
         if distance.validation == (role == "validation"):
             known.append(KnownDistance(pair, distance.distance, sigma))
     for number, angle in enumerate(table.known_angle, start=1):
         where = f"key known_angle {number}"
         if angle.deg not in RIGHT:
             raise InputError(f"{where}.deg", f"{angle.deg:g}", "0 (parallel) or 90 (square)", path)
-        pair, sigma = _pair(angle, where, path), _sigma(angle, f"{where}.sigma_mrad", path)
+        pair, sigma = _relation(angle, where, path)
         if angle.validation == (role == "validation"):
             known.append(KnownAngle(pair, angle.deg == 0, sigma))
     try:
@@ -445,19 +398,17 @@ def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Da
     return whole
 
 
-def _pair(table: DistanceTable | AngleTable, where: str, path: Path) -> tuple[str, str]:
+def _relation(table: DistanceTable | AngleTable, where: str, path: Path) -> tuple[tuple[str, str], float]:
+    """Return what a known distance or angle is between, and its standard deviation."""
     if len(table.between) != 2:
         raise InputError(f"{where}.between", f"{len(table.between)} names", "two", path)
     first, second = table.between
-    return first, second
-
-
-def _sigma(table: DistanceTable | AngleTable, where: str, path: Path) -> float:
-    if table.sigma is not None:
-        return table.sigma
-    if not table.validation:
-        raise InputError(where, "nothing", "the standard deviation of what the drawing states", path)
-    return UNSTATED
+    sigma = table.sigma
+    if sigma is None:
+        if not table.validation:
+            raise InputError(where, "nothing", "the standard deviation of what the drawing states", path)
+        sigma = UNSTATED
+    return (first, second), sigma
 
 
 def _require_enough(data: Dataset) -> None:

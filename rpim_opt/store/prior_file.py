@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,6 @@ VERSION = 1
 def save_prior(prior: Prior, path: str | Path) -> None:
     """Write a prior to one JSON file, which `load_prior` and a problem file's ``[prior]`` read.
 
-    Parameters
-    ----------
-    prior
-        Any.
-    path
-        The file.
-
     Examples
     --------
     >>> import rpim_opt as ro
@@ -48,17 +42,7 @@ def save_prior(prior: Prior, path: str | Path) -> None:
 
 
 def load_prior(path: str | Path) -> Prior:
-    """Return the prior that a file holds.
-
-    Parameters
-    ----------
-    path
-        A file of `save_prior`.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the key, what was found and what is accepted.
+    """Return the prior of a file of `save_prior`; an InputError names the key that does not fit.
 
     Examples
     --------
@@ -87,26 +71,21 @@ def _prior(stored: Mapping[str, Any], path: Path) -> Prior:
         if stored.get("version") != VERSION:
             raise InputError("key version", repr(stored.get("version"))[:40], f"{VERSION}")
         prior = structured(stored, Prior)
-        _require_finite("key centre", list(prior.centre.values()))
-        _require_finite("key scale", list(prior.scale.values()))
+        numbers = {"key centre": [*prior.centre.values()], "key scale": [*prior.scale.values()]}
         for number, each in enumerate(prior.statements, start=1):
             where = f"key statements {number}"
             p, k = len(each.names), len(each.values)
-            lengths = {len(each.dimensions), *map(len, each.rows)}
-            if each.reference is not None:
-                lengths.add(len(each.reference))
-            if not lengths <= {p} or len(each.rows) != k:
+            reference = [0.0] * p if each.reference is None else each.reference
+            if {len(each.dimensions), len(reference), *map(len, each.rows)} - {p} or len(each.rows) != k:
                 accepted = f"{k} rows of {p} numbers, one a parameter, and as many dimensions and numbers of reference"
                 raise InputError(where, "parts that do not fit together", accepted)
-            _require_finite(where, [*each.values, *(each.reference or ()), *(v for row in each.rows for v in row)])
+            numbers[where] = [*each.values, *reference, *(v for row in each.rows for v in row)]
+        for where, values in numbers.items():
+            if not np.isfinite(values).all():
+                raise InputError(where, "a number that is not finite", "finite numbers")
     except InputError as error:
         raise error.within(path) from None
     return prior
-
-
-def _require_finite(where: str, values: Sequence[float]) -> None:
-    if not np.isfinite(values).all():
-        raise InputError(where, "a number that is not finite", "finite numbers")
 
 
 # --- [prior] of a problem file -----------------------------------------------------------------------------------
@@ -130,17 +109,20 @@ class PriorTable(Table):
     scale: dict[str, float | int] = Field(default_factory=dict)
 
     def files(self, path: Path) -> dict[str, Path]:
-        """Return the files that the prior is read from, by the names that a problem file has for them.
-
-        Raises
-        ------
-        InputError
-            For one outside the problem's folder.
-        """
+        """Return the files that the prior is read from, inside the problem's folder, by their names in its file."""
         named = [(file, "key prior.fleet") for file in self.fleet]
         if self.earlier:
             named.append((self.earlier, "key prior.from"))
-        return {name: _inside(name, key, path) for name, key in named}
+        found = {}
+        for name, key in named:
+            try:
+                found[name] = inside(path.parent, name, key, path)
+                if found[name].is_dir():
+                    found[name] = inside(path.parent, str(Path(name) / "result.json"), key, path)
+            except InputError as error:
+                accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
+                raise InputError(key, error.found, accepted, path) from None
+        return found
 
 
 def stated_prior(
@@ -152,55 +134,15 @@ def stated_prior(
 ) -> Prior:
     """Return the prior that a problem file states, which fits the problem's parameters.
 
-    Parameters
-    ----------
-    table
-        ``[prior]``.
-    scale
-        ``[scale]``: what it says of joint offsets alone, or of a parameter by its name, is taken at its word.
-    parameters
-        Of the problem.
-    path
-        The file.
-    measurements
-        Models of a script's own that results may name.
-
-    Raises
-    ------
-    InputError
-        Naming the file and the key.
+    What ``scale`` says of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
+    thought of it, as of a certificate's standard uncertainty of a reflector's place.
     """
-    prior = _own(table, _offsets(scale, parameters), path)
-    for i, text in enumerate(table.known, start=1):
-        prior &= _named(f"key prior.known {i}", path, lambda text=text: Prior.known(text))
-    files = table.files(path)
-    if table.earlier:
-        prior &= _named("key prior.from", path, lambda: _earlier(table, files[table.earlier], measurements))
-    if table.fleet:
-        prior &= _named("key prior.fleet", path, lambda: _population(table.fleet, files, measurements))
-    prior.stated(parameters)
-    return prior
-
-
-def _inside(name: str, key: str, path: Path) -> Path:
-    """Return the file that a problem file names, of a folder its result; it must lie in the problem's folder."""
-    try:
-        file = inside(path.parent, name, key, path)
-        if file.is_dir():
-            file = inside(path.parent, str(Path(name) / "result.json"), key, path)
-    except InputError as error:
-        accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
-        raise InputError(key, error.found, accepted, path) from None
-    return file
-
-
-def _own(table: PriorTable, offsets: Mapping[str, float], path: Path) -> Prior:
-    """Return what the table says in its own numbers."""
     for key in ("inflate", "without"):
         if key in table.model_fields_set and not table.earlier:
             raise InputError(f"key prior.{key}", "no key from beside it", "from = 'other/result.json'", path)
+    offsets = {key: value for key, value in scale.items() if _is_literal(split_unit(key)[0], parameters)}
     try:
-        return Prior(
+        prior = Prior(
             centre=table.centre,
             scale={**offsets, **table.scale},
             tails=float(table.tails),
@@ -210,14 +152,36 @@ def _own(table: PriorTable, offsets: Mapping[str, float], path: Path) -> Prior:
         )
     except InputError as error:
         raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
+    files = table.files(path)
 
+    def earlier() -> Prior:
+        from rpim_opt.store.result_file import load_result  # most folders name no earlier result
 
-def _offsets(scale: Mapping[str, float], parameters: Parameters) -> dict[str, float]:
-    """Return what ``[scale]`` says of joint offsets and of nothing else, and of single parameters by their names.
+        stored = read_json(files[table.earlier])
+        if _is_prior(stored):
+            return _prior(stored, files[table.earlier])
+        return Prior.from_result(load_result(files[table.earlier], measurements), table.inflate, table.without)
 
-    Somebody has thought of those: a certificate's standard uncertainty of a reflector's place, for instance.
-    """
-    return {key: value for key, value in scale.items() if _is_literal(split_unit(key)[0], parameters)}
+    def population() -> Prior:
+        from rpim_opt.store.result_file import load_result
+
+        return Prior.from_population({name: load_result(files[name], measurements) for name in table.fleet})
+
+    parts: list[tuple[str, Callable[[], Prior]]] = []
+    parts += [(f"known {i}", partial(Prior.known, text)) for i, text in enumerate(table.known, start=1)]
+    if table.earlier:
+        parts.append(("from", earlier))
+    if table.fleet:
+        parts.append(("fleet", population))
+    for key, part in parts:
+        try:
+            prior &= part()
+        except InputError as error:
+            if error.file:
+                raise
+            raise InputError(f"key prior.{key}", error.found, error.accepted, path) from None
+    prior.stated(parameters)
+    return prior
 
 
 def _is_literal(stem: str, parameters: Parameters) -> bool:
@@ -225,29 +189,3 @@ def _is_literal(stem: str, parameters: Parameters) -> bool:
         return True
     matches = [name for name in parameters.names if fits(name, stem)]
     return bool(matches) and all(map(is_joint_offset, matches))
-
-
-def _named(key: str, path: Path, make: Callable[[], Prior]) -> Prior:
-    """Return what ``make`` returns; an error of it names the key, where it does not name a file."""
-    try:
-        return make()
-    except InputError as error:
-        if error.file:
-            raise
-        raise InputError(key, error.found, error.accepted, path) from None
-
-
-def _earlier(table: PriorTable, file: Path, measurements: Sequence[Measurement]) -> Prior:
-    """Return the prior that a file holds, or the posterior of a result."""
-    from rpim_opt.store.result_file import load_result  # most folders name no earlier result
-
-    stored = read_json(file)
-    if _is_prior(stored):
-        return _prior(stored, file)
-    return Prior.from_result(load_result(file, measurements), table.inflate, table.without)
-
-
-def _population(names: Sequence[str], files: Mapping[str, Path], measurements: Sequence[Measurement]) -> Prior:
-    from rpim_opt.store.result_file import load_result
-
-    return Prior.from_population({name: load_result(files[name], measurements) for name in names})

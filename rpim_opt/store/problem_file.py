@@ -55,13 +55,6 @@ def problems_folder() -> Path:
 def find_problem(name: str | Path) -> Path:
     """Return the folder of a problem, given its path or the name of one that comes with the package.
 
-    Raises
-    ------
-    InputError
-        For a folder or a name that is not there.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.store.find_problem("position").name
     'position'
@@ -109,7 +102,7 @@ class FrameTable(Table):
 
 
 class ScatterTable(Table):
-    """The robot's own scatter, where it is known."""
+    """The robot's repeatability, where it is known."""
 
     position: Length = 0.0
     orientation: Angle = 0.0
@@ -273,63 +266,52 @@ def read_problem(
     folder = find_problem(name)
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
-    table, placed = _tables(read_toml(path), variant, kinds, path)
-    observations = _observations(table, path)
+    content = read_toml(path)
+    table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is asked for
+    if variant is not None:
+        variants = content.get("variant", {})
+        own = {key: value for key, value in content.items() if key != "variant"}
+        table, placed = _checked(_overlay(own, pick(variants, variant, "variant", path)), kinds, path)
+    observations = table.observation
+    if table.identification is not None:  # the one of the top level comes first
+        keys = ("measurement", "layout", "identification", "validation")
+        first = Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={})
+        observations = [first, *observations]
+    if not observations:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
     for each in observations:
         pick(kinds, each.measurement, "key measurement", path)
-        _require_inside(each, path)
+        inside(path.parent, each.identification, "key identification", path)
+        if each.validation:  # an empty one is how a variant has none
+            inside(path.parent, each.validation, "key validation", path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
-    if model is not None and not isinstance(model, KinematicModel):
-        accepted = "a ro.robot.Model with terms of your own; families are chosen by calibrate(model='auto')"
-        raise InputError("model", f"{model!r}"[:80], accepted)
     if model is not None:
+        if not isinstance(model, KinematicModel):
+            accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
+            raise InputError("model", f"{model!r}"[:80], accepted)
         arm = replace(arm, robot=replace(arm.robot, model=model))
+    base = None
+    if table.base != "auto":
+        base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
     return ProblemFile(
         path=path,
         table=table,
         placed=placed,
         robot=arm.robot,
         kinds=kinds,
-        observations=observations,
+        observations=tuple(observations),
         tools=_tools(table, arm, path),
-        base=_base(table, arm, path),
+        base=base,
         board=_board(table, path),
     )
 
 
-def _board(table: ProblemTable, path: Path) -> Board | None:
-    """Return the points of the board that cameras see: of a table of the folder, or of a pattern."""
-    if table.target is None:
-        return None
-    if isinstance(table.target, str):
-        return read_board(inside(path.parent, table.target, "key target", path))
-    pattern = _part(GridTable, table.target, "key target", path)
-    try:
-        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
-    except InputError as error:
-        raise InputError("key target", error.found, error.accepted, path) from None
-
-
-def _tables(
-    content: dict[str, Any], variant: str | None, kinds: Mapping[str, Measurement], path: Path
-) -> tuple[ProblemTable, dict[str, Any]]:
-    """Return the checked table of the file or of its variant, and apart from it those that place fixtures."""
-    # the file itself must be right, too, whichever variant is asked for
-    split = _split(content, kinds, path)
-    if variant is None:
-        return split
-    variants = content.get("variant", {})
-    if variant not in variants:
-        raise InputError("variant", f"'{variant}'", choices(variant, variants), path)
-    own = {key: value for key, value in content.items() if key != "variant"}
-    return _split(_overlay(own, variants[variant]), kinds, path)
-
-
-def _split(
+def _checked(
     content: dict[str, Any], kinds: Mapping[str, Measurement], path: Path
 ) -> tuple[ProblemTable, dict[str, Any]]:
+    """Return the checked table, and apart from it those that place fixtures."""
     fixtures = {name.partition("_")[0] for kind in kinds.values() for name in kind.parameters}
     placed = {key: value for key, value in content.items() if key in fixtures and isinstance(value, dict)}
     return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
@@ -344,27 +326,17 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
     return merged
 
 
-def _observations(table: ProblemTable, path: Path) -> tuple[Observation, ...]:
-    """Return all observations; one that the top level states comes first."""
-    if table.identification is not None:
-        first = Observation.model_construct(
-            measurement=table.measurement,
-            layout=table.layout,
-            identification=table.identification,
-            validation=table.validation,
-            noise={},
-        )
-        return (first, *table.observation)
-    if not table.observation:
-        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
-    return tuple(table.observation)
-
-
-def _require_inside(each: Observation, path: Path) -> None:
-    """Refuse tables elsewhere, before anything reads or writes them."""
-    inside(path.parent, each.identification, "key identification", path)
-    if each.validation:  # an empty one is how a variant has none
-        inside(path.parent, each.validation, "key validation", path)
+def _board(table: ProblemTable, path: Path) -> Board | None:
+    """Return the points of the board that cameras see: of a table of the folder, or of a pattern."""
+    if table.target is None:
+        return None
+    if isinstance(table.target, str):
+        return read_board(inside(path.parent, table.target, "key target", path))
+    pattern = _part(GridTable, table.target, "key target", path)
+    try:
+        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
+    except InputError as error:
+        raise InputError("key target", error.found, error.accepted, path) from None
 
 
 def _arm(table: ProblemTable, path: Path) -> Described:
@@ -386,14 +358,8 @@ def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[f
     return {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
 
 
-def _base(table: ProblemTable, arm: Described, path: Path) -> tuple[float, ...] | None:
-    if table.base == "auto":
-        return None
-    return _frame(table.base, "base", path) if table.base else tuple(arm.base)
-
-
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
-    """Return the robot's scatter that a file states, or None."""
+    """Return the repeatability that a file states, or None."""
     if isinstance(table.scatter, str):
         if table.scatter not in LEARNED_NOISE:
             accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,11 +30,11 @@ from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import SELECTORS, Selector
 from rpim_opt.convex.structure import Lost
 from rpim_opt.convex.trust import kept_equations
-from rpim_opt.data.dataset import Block, Dataset, named_sessions
+from rpim_opt.data.dataset import Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.data.record import Record
-from rpim_opt.problem.linear import LinearModel, around
+from rpim_opt.problem.linear import around
 from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.global_start import JointMapping
@@ -49,7 +49,7 @@ Models = Model | Mapping[str, Model]
 RELATIVE = 1e-4
 """Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
 ABSOLUTE = 1e-6
-"""Largest difference [mm] of a stated figure and the one that follows from the data: a nanometre."""
+"""Largest difference of a small figure [mm, deg] and the one that follows from the data."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sum_squares": SQUARES,
     "sum": SUM,
@@ -103,15 +103,14 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
         raise InputError("save_result", "measurements in parts", "measurements in memory, which the file repeats")
     if record is not None:
         result = replace(result, record=record)
-    write_json(result_path(path), content(result))
+    write_json(_result_path(path), content(result))
 
 
 def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Models | None = None) -> Calibration:
     """Return the calibration that a file holds.
 
-    Its figures are computed anew from the data in the file, and those that the file states are compared with them.
-    A digest tells whether anything else was changed since it was written: by error, that is, and not by somebody who
-    also writes a new digest.
+    A digest tells whether anything was changed since it was written: by error, that is, and not by somebody who also
+    writes a new digest. Figures are computed anew from the data, and those that the file states are compared with them.
     A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
     works.
 
@@ -140,16 +139,17 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     >>> print(f"{1e3 * again.errors(again.record.validation).mean():.3f} mm")
     0.032 mm
     """
-    path = result_path(path)
+    path = _result_path(path)
     stored = read_json(path)
     try:
         _require_format(stored)
         file = structured(stored, Stored)
         result = _calibration(file, {**READY, **{m.name: m for m in measurements}}, model or Model())
-        _require_errors(file, result)
-        if _same_version(file):
-            require_agreement(stored, derived(result), "key")
-        _require_digest(stored)
+        found = derived(result)
+        if file.record.versions.get("rpim-opt", version_of("rpim-opt")) != version_of("rpim-opt"):
+            found = {"rows": found["rows"]}  # another version may define figures differently
+        _require_agreement(stored, found, "key")
+        result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
@@ -159,8 +159,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     return result
 
 
-def result_path(path: str | Path) -> Path:
-    """Return a result's file, which may be named by its folder."""
+def _result_path(path: str | Path) -> Path:
     path = Path(path)
     return path / "result.json" if path.is_dir() else path
 
@@ -175,6 +174,12 @@ class OwnTerm(NamedTuple):
     parameters: list[str]
     columns: dict[str, str]
 
+    def __str__(self) -> str:
+        """Return it in words."""
+        what = ", ".join(self.parameters) or "without parameters"
+        columns = [f", column {name} ({dimension or 'no unit'})" for name, dimension in self.columns.items()]
+        return f"a term of the {self.at} ({what}{''.join(columns)})"
+
 
 class Trust(NamedTuple):
     """What a loss of a script made of the equations: a factor, and those that it left out."""
@@ -184,7 +189,7 @@ class Trust(NamedTuple):
 
 
 class Forms(NamedTuple):
-    """The quadratics that a script's loss (of the residual) and penalty (of z) are."""
+    """The quadratic forms of a script's loss (of the residual) and penalty (of z)."""
 
     loss: Quadratic | None
     penalty: Quadratic | None
@@ -259,10 +264,11 @@ def content(result: Calibration) -> dict[str, Any]:
     from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
 
     result = replace(result, record=result.record.dated(), known_causes=result.causes)
-    solvable = is_defined(result.formulation)
+    stated = definition(result.formulation)
+    solvable = formulation_of("", stated).solvable
     stored = Stored(
         formulation=result.formulation.name,
-        definition=definition(result.formulation),
+        definition=stated,
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
         weight=result.weight,
         selection=result.selection,
@@ -278,7 +284,7 @@ def content(result: Calibration) -> dict[str, Any]:
         terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
         transmission=tuple(curve for robot in result.problem.arms.values() for curve in robot.model.curves),
         model=result.problem.parameters,
-        data=sets(result.problem.data, result.record),
+        data=_sets(result),
         scatter=result.problem.scatter,
         learned=result.learned,
         record=result.record,
@@ -324,31 +330,26 @@ def figures(result: Calibration) -> dict[str, Any]:
 
 
 def derived(result: Calibration) -> dict[str, Any]:
-    """Return the figures of a file that follow from its data and parameters: they are computed anew where it is read.
-
-    Those are what a reader looks for first, and the errors before and after, also row by row.
-    """
-    data = sets(result.problem.data, result.record)
-    nominal = {name: statistics(result.nominal_errors(part)) for name, part in data.items()}
+    """Return the figures that follow from data and parameters, computed anew where a file is read."""
+    nominal = {name: statistics(result.nominal_errors(data)) for name, data in _sets(result).items()}
     return {**figures(result), "nominal": nominal, "rows": plain(_rows(result))}
 
 
-def sets(identification: Dataset, record: Record) -> dict[str, Dataset]:
-    """Return the measurements by name: those of the identification, and those of the validation."""
-    data = {"identification": identification}
-    if record.validation is not None:
-        data["validation"] = record.validation
+def _sets(result: Calibration) -> dict[str, Dataset]:
+    """Return the measurements by name."""
+    data = {"identification": result.problem.data}
+    if result.record.validation is not None:
+        data["validation"] = result.record.validation
     return data
 
 
 def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
     rows = {}
-    for name, data in sets(result.problem.data, result.record).items():
+    for name, data in _sets(result).items():
         before = 1e3 * result.nominal_errors(data)
         after = 1e3 * result.errors(data)
-        rows[name] = [
-            RowErrors(label, _finite(b), _finite(a)) for label, b, a in zip(data.label, before, after, strict=True)
-        ]
+        errors = zip(data.label, before, after, strict=True)
+        rows[name] = [RowErrors(label, _finite(b), _finite(a)) for label, b, a in errors]
     return rows
 
 
@@ -360,10 +361,9 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
     """Return what a file says of a user's own terms on a robot: all but their functions."""
     terms = []
     for term in model.terms:
-        if isinstance(term, Transmission):
-            continue
-        names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
-        terms.append(OwnTerm(term.at, names, dict(term.columns)))
+        if not isinstance(term, Transmission):
+            names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
+            terms.append(OwnTerm(term.at, names, dict(term.columns)))
     return terms
 
 
@@ -396,11 +396,6 @@ def definition(formulation: Formulation) -> dict[str, Any]:
         "penalty_over": _name(formulation.penalty_over),
         "largest": _finite(formulation.largest),
     }
-
-
-def is_defined(formulation: Formulation) -> bool:
-    """Whether a file can hold a formulation: all its functions are ready-made."""
-    return formulation_of("", definition(formulation)).solvable
 
 
 def formulation_of(name: str, stated: Mapping[str, Any]) -> Formulation:
@@ -449,7 +444,7 @@ def _function(stated: str | list[Any] | None, name: str) -> Any:
 
 
 def _require_format(stored: Any) -> None:
-    """Refuse what another program or another version wrote, before its keys are looked at."""
+    """Refuse what another program or version wrote, and what was changed since."""
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
     if stored.get("version") != VERSION:
@@ -457,27 +452,30 @@ def _require_format(stored: Any) -> None:
         raise InputError("key version", found, f"{VERSION}; the rpim-opt that wrote it reads others")
     if not isinstance(stored.get("digest"), str):
         raise InputError("key digest", repr(stored.get("digest", "nothing"))[:40].strip("'"), "the digest of the rest")
+    found = digest(stored)
+    if stored["digest"] != found:
+        accepted = "the file as it was written: something in it was changed"
+        raise InputError("key digest", f"'{stored['digest'][:12]}...' for a content of '{found[:12]}...'", accepted)
 
 
 def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models) -> Calibration:
     robots = {name: _robot(name, file, models) for name in file.robots}
-    data = {name: _with_models(part, known, f"key data.{name}") for name, part in file.data.items()}
-    _require_lengths(file.model)
+    data = {name: _with_measurements(part, known, f"key data.{name}") for name, part in file.data.items()}
     problem = CalibrationProblem(robots.get("", robots), file.model, data["identification"], scatter=file.scatter)
     validation = data.get("validation")
     if validation is not None:
         problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
-    unknowns = int(np.count_nonzero(file.model.identified))
-    if len(file.x) != unknowns:
-        raise InputError("key x", f"{len(file.x)} numbers", f"{unknowns}, one an identified parameter")
-    for earlier in file.record.earlier:
-        for name, ranges in earlier.ranges.items():
-            if name not in robots or np.shape(ranges) != (2, robots[name].dof):
-                accepted = "the least and the largest value of every joint, of the file's robots"
-                found = f"ranges of shape {np.shape(ranges)} of robot '{name}'"
-                raise InputError("key record.earlier", found, accepted)
     formulation = formulation_of(file.formulation, file.definition)
-    program = _program(file, formulation, around(problem.linearize(file.x), file.x))
+    model = around(problem.linearize(file.x), file.x)
+    if file.forms is None:
+        program = pose(formulation, model)
+    else:
+        program = Program(formulation, model, Lost(formulation, model, *file.forms))
+    learned = file.learned if not file.record.earlier else None
+    weight: float | Selector | None = None  # estimated, as it was
+    if learned is None:
+        weight = SELECTORS.get(file.selection.name, file.weight) if file.selection else file.weight
+    extensions = "auto" if learned is not None and learned.trials else "geometry"
     return Calibration(
         problem,
         formulation,
@@ -489,9 +487,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         history=file.history,
         program=program,
         certificate=file.certificate,
-        asked=mapped_as(
-            file.mapping, partial(calibrate, formulation=formulation, weight=_rule(file), model=_model(file))
-        ),
+        asked=mapped_as(file.mapping, partial(calibrate, formulation=formulation, weight=weight, model=extensions)),
         record=replace(file.record, validation=validation, digest=file.digest),
         kept=None if formulation.solvable else _kept(file, program),
         learned=file.learned,
@@ -501,13 +497,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
 
 
 def _robot(name: str, file: Stored, models: Models) -> Robot:
-    """Return a robot of the file with the terms that somebody gives again: by name, or one model for all.
-
-    Raises
-    ------
-    InputError
-        For terms that the file has and nobody gives, and others than it has.
-    """
+    """Return a robot of the file with the terms that somebody gives again: by name, or one model for all."""
     stated = file.terms.get(name, [])
     if not isinstance(models, Model):
         if not name:
@@ -520,70 +510,24 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
     robot = file.robots[name]
     given = _terms(model, robot)
     if stated != given:
-        wanted = "; ".join(map(_in_words, stated)) or "none"
+        wanted = "; ".join(map(str, stated)) or "none"
         accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
-        raise InputError("key terms", "; ".join(map(_in_words, given)) or "no term given", accepted)
+        raise InputError("key terms", "; ".join(map(str, given)) or "no term given", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= robot.dof and not name]
     return replace(robot, model=Model((*model.terms, *curves)))
 
 
-def _in_words(term: OwnTerm) -> str:
-    what = ", ".join(term.parameters) or "without parameters"
-    seen = "".join(f", column {name} ({dimension or 'no unit'})" for name, dimension in term.columns.items())
-    return f"a term of the {term.at} ({what}{seen})"
-
-
-def _require_lengths(parameters: Parameters) -> None:
-    for key in ("dimensions", "nominal", "scale", "tolerance", "identified"):
-        values = getattr(parameters, key)
-        if np.shape(values) != (len(parameters),):
-            raise InputError(f"key model.{key}", f"shape {np.shape(values)}", f"{len(parameters)} values, one a name")
-
-
-def _with_models(data: Dataset, known: Mapping[str, Measurement], where: str) -> Dataset:
-    """Return measurements with the models that their blocks name, all of one length."""
-    blocks = [_block(block, known, f"{where}.blocks {i}") for i, block in enumerate(data.blocks, start=1)]
-    rows = sorted(row for block in blocks for row in block.row.tolist())
-    if rows != list(range(len(data.label))) or data.configuration.shape != (len(data.label),):
-        raise InputError(where, f"{len(data.label)} labels for other rows", "one label and configuration a row")
+def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: str) -> Dataset:
+    """Return data with the measurement types that their blocks name."""
+    blocks = []
+    for number, block in enumerate(data.blocks, start=1):
+        name = str(block.measurement)
+        if name not in known:
+            place = f"{where}.blocks {number}.measurement"
+            raise InputError(place, f"'{name}'", f"measurements=[...] with it, or {choices(name, known)}")
+        session = None if block.session is None else named_sessions(block.session, len(block.row))
+        blocks.append(replace(block, measurement=known[name], session=session))
     return replace(data, blocks=tuple(blocks))
-
-
-def _block(block: Block, known: Mapping[str, Measurement], where: str) -> Block:
-    name = str(block.measurement)
-    if name not in known:
-        raise InputError(f"{where}.measurement", f"'{name}'", f"measurements=[...] with it, or {choices(name, known)}")
-    kind = known[name]
-    p, k = kind.points, len(kind.components)
-    if len(block.markers) != p:
-        raise InputError(f"{where}.markers", f"{len(block.markers)} reflectors", f"{p}, one a point")
-    N = len(block.row)
-    shapes = {
-        "q": (N, p, -1),
-        "y": (N, len(kind.columns)),
-        "covariance": (-1, k, k),
-        "torque": (N, p, -1),
-        "payload": (N,),
-        "approach": (N, p, -1),
-        "point": (N, p),
-    }
-    arrays = {key: getattr(block, key) for key in shapes}
-    arrays |= {f"columns.{name}": values for name, values in block.columns.items()}
-    for key, array in arrays.items():
-        shape = shapes.get(key, (N,))
-        if array is None:
-            continue
-        if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
-            raise InputError(f"{where}.{key}", f"shape {array.shape}", f"shape {shape}")
-    session = None if block.session is None else named_sessions(block.session, N)
-    return replace(block, measurement=kind, session=session)
-
-
-def _program(file: Stored, formulation: Formulation, model: LinearModel) -> Program:
-    """Return the program at the solution; of a script's functions the file knows the quadratics that they were."""
-    if file.forms is None:
-        return pose(formulation, model)
-    return Program(formulation, model, Lost(formulation, model, file.forms.loss, file.forms.penalty))
 
 
 def _kept(file: Stored, program: Program) -> Kept:
@@ -597,99 +541,19 @@ def _kept(file: Stored, program: Program) -> Kept:
     return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
 
 
-def _rule(file: Stored) -> float | Selector | None:
-    """Return the selector that chose the weight, where it is a ready one, and otherwise the weight; None: learned."""
-    if file.learned is not None and not file.record.earlier:
-        return None
-    if file.selection is None:
-        return file.weight
-    return SELECTORS.get(file.selection.name, file.weight)
-
-
-def _model(file: Stored) -> str:
-    """Return whether model extensions were compared."""
-    if file.learned is not None and file.learned.trials and not file.record.earlier:
-        return "auto"
-    return "geometry"
-
-
-# --- whether a file says what follows from it --------------------------------------------------------------------
-
-
-def _require_errors(file: Stored, result: Calibration) -> None:
-    """Refuse errors that do not follow from the data: edited, or read with another measurement model."""
-    for name, rows in _rows(result).items():
-        stated = file.rows.get(name, [])
-        if len(stated) != len(rows):
-            raise InputError(f"key rows.{name}", f"{len(stated)} rows", f"{len(rows)}, as in key data")
-        pairs = [(a.identified_mm or 0.0, b.identified_mm or 0.0) for a, b in zip(stated, rows, strict=True)]
-        off = max((abs(a - b) for a, b in pairs), default=0.0)
-        if off > ABSOLUTE:
-            found = f"errors up to {off:.2g} mm off those that the file's data give"
-            accepted = "the file as it was written, and the same terms and measurement models"
-            raise InputError(f"key rows.{name}", found, accepted)
-
-
-def _same_version(file: Stored) -> bool:
-    """Whether this version wrote the file; a later one may define a figure differently, and must still read it."""
-    return file.record.versions.get("rpim-opt", version_of("rpim-opt")) == version_of("rpim-opt")
-
-
-def require_agreement(stated: Any, found: Any, where: str) -> None:
-    """Refuse stated figures that are not the computed ones, to their rounding; other keys of the file do not matter.
-
-    Raises
-    ------
-    InputError
-        Naming the key.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.store.result_file import require_agreement
-    >>> require_agreement({"weight": 1.0, "note": "mine"}, {"weight": 1.0 + 1e-12}, "key")
-    >>> try:
-    ...     require_agreement({"rows": [{"mm": 0.1}]}, {"rows": [{"mm": 0.2}]}, "key")
-    ... except ro.InputError as error:
-    ...     print(error)
-    key rows 1.mm: found 0.1, accepted: 0.2, which follows from the file's data.
-    """
-    known = dict(_leaves(stated, where))
-    for place, value in _leaves(found, where):
-        if place not in known:
-            raise InputError(place, "nothing", "this key, as it was written")
-        if not _same(known[place], value):
-            raise InputError(place, _short(known[place]), f"{_short(value)}, which follows from the file's data")
-
-
-def _leaves(content: Any, where: str) -> Iterator[tuple[str, Any]]:
-    """Yield the places of a content and what stands there; of mappings None, of lists their length."""
-    if isinstance(content, Mapping):
-        for key, value in content.items():
-            yield from _leaves(value, f"{where}{' ' if where == 'key' else '.'}{key}")
-    elif isinstance(content, list | tuple):
-        yield where, range(len(content))
-        for number, value in enumerate(content, start=1):
-            yield from _leaves(value, f"{where} {number}")
-    else:
-        yield where, content
-
-
-def _same(stated: Any, found: Any) -> bool:
-    if isinstance(found, float) and isinstance(stated, int | float) and not isinstance(stated, bool):
-        try:
-            return math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
-        except OverflowError:  # an integer beyond all doubles
-            return False
-    return type(stated) is type(found) and stated == found
-
-
-def _short(value: Any) -> str:
-    return f"{len(value)} entries" if isinstance(value, range) else repr(value)[:60]
-
-
-def _require_digest(stored: Mapping[str, Any]) -> None:
-    found = digest(stored)
-    if stored["digest"] != found:
-        accepted = "the file as it was written: something in it was changed"
-        raise InputError("key digest", f"'{stored['digest'][:12]}...' for a content of '{found[:12]}...'", accepted)
+def _require_agreement(stated: Any, found: Any, where: str) -> None:
+    """Refuse stated figures that are not the computed ones, to their rounding; other keys of the file do not matter."""
+    agree = type(stated) is type(found) and stated == found
+    if isinstance(found, Mapping) and isinstance(stated, Mapping):
+        for key, value in found.items():
+            _require_agreement(stated.get(key), value, f"{where}{' ' if where == 'key' else '.'}{key}")
+        return
+    if isinstance(found, list | tuple) and isinstance(stated, list) and len(stated) == len(found):
+        for number, (each, value) in enumerate(zip(stated, found, strict=True), start=1):
+            _require_agreement(each, value, f"{where} {number}")
+        return
+    if isinstance(found, float) and isinstance(stated, int | float):
+        agree = math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
+    if not agree:
+        accepted = f"{repr(found)[:60]}, which follows from the file's data, terms and measurement models"
+        raise InputError(where, repr(stated)[:60], accepted)

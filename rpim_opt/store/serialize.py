@@ -33,13 +33,7 @@ def plain(value: Any) -> Any:
 
 
 def structured(content: Any, kind: type[T]) -> T:
-    """Return the instance of a class that `plain` wrote; of a robot without its terms, of blocks with names of models.
-
-    Raises
-    ------
-    InputError
-        Naming the first key that does not fit.
-    """
+    """Return the instance of a class that `plain` wrote, without what a file cannot hold: a robot's terms, models."""
     from cattrs import BaseValidationError
 
     try:
@@ -57,7 +51,6 @@ def digest(content: Mapping[str, Any]) -> str:
 
 @cache
 def _converter() -> Converter:
-    """Return what converts all classes; nothing is prepared before a file is written or read."""
     from cattrs import Converter
     from cattrs.cols import is_namedtuple, namedtuple_dict_structure_factory, namedtuple_dict_unstructure_factory
     from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
@@ -90,7 +83,6 @@ def _converter() -> Converter:
 
 
 def _scalar(value: Any, kind: type) -> Any:
-    """Return a text, a number or a truth value of exactly that kind; a float may be written as an integer."""
     if kind is float:
         return _number(value)
     if type(value) is not kind:
@@ -115,7 +107,6 @@ def _is_array(kind: Any) -> bool:
 
 
 def _listed(array: np.ndarray) -> Any:
-    """Return an array as lists."""
     if array.dtype.kind != "f" or np.isfinite(array).all():
         return array.tolist()
     return [_listed(each) if array.ndim > 1 else _spelled(each) for each in array]
@@ -149,7 +140,6 @@ def _floats(values: Any, array: np.ndarray) -> np.ndarray:
 
 
 def _unfit(value: Any, accepted: str) -> InputError:
-    """Return an error without its place, which those who look into the content know."""
     return InputError("", repr(value)[:60], accepted)
 
 

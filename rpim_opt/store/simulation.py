@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.files import inside, write_files
 from rpim_opt.basics.schema import Length, Table, validate
 from rpim_opt.basics.tables import csv_text
@@ -35,6 +35,8 @@ TORQUE = 20.0
 """Simulated joint torques are uniform up to this [Nm]."""
 DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
 """Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""
+PREFIXES = ("", "to_")
+"""What precedes the columns of the points of a row."""
 
 
 class PlaneTable(Table):
@@ -79,19 +81,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
 
     True deviations are normal with the scales as standard deviations, times ``spread``, for every identified
     parameter; those of ``[simulation.truth]`` are fixed instead. Joint values are uniform in ``joint_share`` of
-    the limits. Identification data carry the declared noise, validation data none.
-
-    Parameters
-    ----------
-    name
-        A problem folder; its tables need not exist yet.
-    seed
-        Instead of the file's.
-
-    Raises
-    ------
-    InputError
-        For a folder without ``[simulation]``, a joint without limits, a key that does not fit.
+    the limits. Identification data carry the declared noise, validation data none. The tables need not exist yet.
     """
     stated = read_problem(name)
     if not stated.table.simulation:
@@ -101,21 +91,26 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     if not np.isfinite(stated.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
     _require_tables(stated)
-    shapes = [_shape(stated, plan, each) for each in stated.observations]
-    parameters = _parameters(stated, shapes)
-    world = World(stated, plan, parameters, _deviations(parameters, plan, rng, stated.path))
+    fixtures = [_fixtures(stated, stated.kinds[each.measurement]) for each in stated.observations]
+    parameters = _parameters(stated, fixtures)
+    x = _deviations(parameters, plan, rng, stated.path)
     tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         # drawn where no table of that role is, too: other tables of the same seed stay as they are
         q = random_candidates(stated.robot, 2 * count, rng, plan.joint_share)
-        for shape in shapes:
-            file = getattr(shape.observation, role)
+        for each, of in zip(stated.observations, fixtures, strict=True):
+            file = getattr(each, role)
+            markers = tuple(plan.markers.get(each.identification, stated.tools))
+            for marker in markers:
+                pick(stated.tools, marker, "table simulation.markers", stated.path)
             if count and file:
-                tables[file], wrong = TableMaker(world, shape, rng, role == "identification").made(q)
+                kind = stated.kinds[each.measurement]
+                maker = _Table(stated, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
+                tables[file], wrong = maker.made(q)
                 blunders += wrong
     free = parameters.free
-    truth = zip(free.names, free.dimensions, world.x.tolist(), strict=True)
+    truth = zip(free.names, free.dimensions, x.tolist(), strict=True)
     return Simulated(tables, {name: (dimension, value) for name, dimension, value in truth}, tuple(blunders))
 
 
@@ -154,56 +149,29 @@ def _require_tables(stated: ProblemFile) -> None:
             taken.add(place)
 
 
-# --- the world that is simulated ---------------------------------------------------------------------------------
+# --- what is simulated -------------------------------------------------------------------------------------------
 
 
-class Shape(NamedTuple):
-    """Which reflectors and fixtures the rows of an observation involve."""
-
-    observation: Observation
-    kind: Measurement
-    markers: tuple[str, ...]
-    fixtures: tuple[str, ...]
-
-
-class World(NamedTuple):
-    """What is simulated: a problem file, its plan, the parameters and their true deviations (n,) [SI]."""
-
-    stated: ProblemFile
-    plan: Simulation
-    parameters: Parameters
-    x: Array
-
-    @property
-    def with_torques(self) -> bool:
-        """Whether joints give way to torques that tables state, and not to those of gravity."""
-        names = self.parameters.free.names
-        return self.plan.torques == "measured" and any(name.startswith("compliance") for name in names)
-
-
-def _shape(stated: ProblemFile, plan: Simulation, each: Observation) -> Shape:
-    kind = stated.kinds[each.measurement]
-    markers = tuple(plan.markers.get(each.identification, stated.tools))
-    for marker in markers:
-        if marker not in stated.tools:
-            raise InputError("table simulation.markers", f"'{marker}'", choices(marker, stated.tools), stated.path)
+def _fixtures(stated: ProblemFile, kind: Measurement) -> tuple[str, ...]:
+    """Return the fixtures of a measurement type; one without a name is the only one."""
     tables = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
     nested = [key for table in tables for key, value in table.items() if isinstance(value, dict)]
-    return Shape(each, kind, markers, tuple(dict.fromkeys(nested)) or ("",))
+    return tuple(dict.fromkeys(nested)) or ("",)
 
 
-def _parameters(stated: ProblemFile, shapes: Sequence[Shape]) -> Parameters:
-    places = [(shape.kind, fixture) for shape in shapes for fixture in shape.fixtures]
+def _parameters(stated: ProblemFile, fixtures: Sequence[tuple[str, ...]]) -> Parameters:
     none = np.empty(0, dtype=int)
     blocks = []
-    for kind, fixture in places:
-        empty = np.empty((0, kind.points, stated.robot.dof))
-        blocks.append(Block(kind, empty, np.empty((0, len(kind.columns))), np.empty((0, 1, 1)), none, fixture=fixture))
+    for each, of in zip(stated.observations, fixtures, strict=True):
+        kind = stated.kinds[each.measurement]
+        for fixture in of:
+            q = np.empty((0, kind.points, stated.robot.dof))
+            blocks.append(Block(kind, q, np.empty((0, len(kind.columns))), np.empty((0, 1, 1)), none, fixture=fixture))
     nothing = Dataset(tuple(blocks), (), none)
     own = place_fixtures(stated.placed, nothing)
     entries = {}
-    for kind, fixture in places:
-        named = {of_fixture(name, fixture): dimension for name, dimension in kind.parameters.items()}
+    for block in blocks:
+        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
         entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
     base = (0.0,) * 6 if stated.base is None else stated.base
     return stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
@@ -221,52 +189,52 @@ def _deviations(parameters: Parameters, plan: Simulation, rng: np.random.Generat
     return truth
 
 
-# --- one table of it ---------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
-class TableMaker:
-    """One table of a world: what it holds, its draws, whose order is that of the making, and whether it is noisy.
+class _Table:
+    """One table: what it holds, its draws, whose order is that of the making, and whether it is noisy.
 
-    A table that identifies has noise and blunders; one that validates has none, though they are drawn all the same.
+    ``x`` are the true deviations (n,) [SI]. A table that identifies has noise and blunders; one that validates has
+    none, though they are drawn all the same.
     """
 
-    world: World
-    shape: Shape
+    stated: ProblemFile
+    plan: Simulation
+    parameters: Parameters
+    x: Array
+    observation: Observation
+    kind: Measurement
+    markers: tuple[str, ...]
+    fixtures: tuple[str, ...]
     rng: np.random.Generator
     noisy: bool
 
     def made(self, random: Array) -> tuple[Columns, list[str]]:
         """Return the columns as text, and the labels of blunders; of joint values (2 count, dof) [rad or m]."""
-        if self.shape.kind.touching:
+        if self.kind.touching:
             return self._touched(), []
-        if self.shape.kind.by_camera:
+        if self.kind.by_camera:
             return self._seen(len(random) // 2), []
         return self._measured(random)
 
     def _measured(self, random: Array) -> tuple[Columns, list[str]]:
         """Return a table of measured values, or of configurations on a plane or sphere."""
-        kind, truth = self.shape.kind, self.world.x
-        rows = self._rows(len(random) // 2)
-        q = np.array([[random[k], random[len(random) // 2 + k]][: kind.points] for k, _, _ in rows])
+        kind, truth = self.kind, self.x
+        count = len(random) // 2
+        columns, rows = self._labelled(count)
+        q = np.array([[random[k], random[count + k]][: kind.points] for k in rows])
         torque = None
-        if self.world.with_torques:
+        if self.plan.torques == "measured" and any(n.startswith("compliance") for n in self.parameters.free.names):
             torque = self.rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
-        columns = self._names(rows, len(random) // 2)
         constraint = not kind.columns
         columns |= self._joints(q, EXACT_DIGITS if constraint else DIGITS, torque)
         values = np.zeros((len(rows), len(kind.columns)))
         values[:, [i for i, name in enumerate(kind.columns) if name == "qw"]] = 1.0  # no turn
         data = self._read({**columns, **self._values(values)})
-        problem = CalibrationProblem(self.world.stated.robot, self.world.parameters, data)
+        problem = CalibrationProblem(self.stated.robot, self.parameters, data)
         if constraint:
             sigma = np.sqrt(data.blocks[0].covariance[0, 0, 0])
             errors = sigma * self.rng.normal(size=len(data)) * self.noisy
-            try:
-                q = touching_poses(problem, truth, errors, self.rng, self.world.plan.joint_share)
-            except InputError as error:
-                raise error.within(self.world.stated.path) from None
-            return columns | self._joints(q[:, None], EXACT_DIGITS), []
+            return columns | self._joints(self._touching(problem, errors)[:, None], EXACT_DIGITS), []
         for block, modelled in zip(data.blocks, problem.modelled(truth), strict=True):
             values[block.row] = modelled
         # covariances at the true values: a tracker's depend on them
@@ -275,41 +243,60 @@ class TableMaker:
             if self.noisy:
                 values[block.row] = kind.plus(block.y, errors)
         wrong: list[int] = []
-        if self.noisy and self.world.plan.blunders:
-            wrong = self._move(values)
+        if self.noisy and self.plan.blunders:  # moved by the length of a blunder, in random directions
+            hit = self.rng.choice(len(values), self.plan.blunders, replace=False)
+            lengths = [i for i, dimension in enumerate(kind.columns.values()) if dimension == "length"]
+            direction = self.rng.normal(size=(len(hit), len(lengths)))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            values[hit[:, None], np.array(lengths)] += self.plan.blunder * direction
+            wrong = sorted(hit.tolist())
         return columns | self._values(values), [columns["label"][i] for i in wrong]
 
-    def _rows(self, count: int) -> list[tuple[int, tuple[str, ...], str]]:
-        """Return configuration, reflectors and fixture of every row."""
-        _, kind, markers, fixtures = self.shape
-        if kind.points == 1:
-            return [(k, (m,), f) for k in range(count) for m in markers for f in fixtures]
-        return [(k, tuple(self.rng.choice(markers, kind.points)), f) for k in range(count) for f in fixtures]
+    def _touching(self, problem: CalibrationProblem, wanted: Array) -> Array:
+        """Return joint values (N, dof) at which a constraint's residuals are the wanted ones (N,) [m].
 
-    def _names(self, rows: Sequence[tuple[int, tuple[str, ...], str]], count: int) -> Columns:
-        """Return labels, and what tells rows of one configuration apart."""
-        _, _, markers, fixtures = self.shape
+        From random configurations by Newton's steps (`Target`); the generator advances by the same amount however many
+        are needed.
+        """
+
+        def away(q: Array, rows: np.ndarray) -> Array:
+            data = problem.data.take(rows)
+            blocks = tuple(replace(block, q=q[block.row][:, None]) for block in data.blocks)
+            posed = problem.on(Dataset(blocks, data.label, data.configuration))
+            residual = np.empty(len(q))
+            residual[np.concatenate([block.row for block in blocks])] = posed.residual(self.x)
+            return (residual - wanted[rows])[:, None]
+
+        target = Target(problem.robot, away, damping=1e-20)  # more would change the last digits of tables
+        q, beyond = target.reached(len(wanted), self.rng.spawn(1)[0], self.plan.joint_share)
+        if beyond is not None:
+            found = "a plane or sphere out of reach"
+            raise InputError("table simulation", found, "one that the robot can touch", self.stated.path)
+        return q
+
+    def _labelled(self, count: int) -> tuple[Columns, list[int]]:
+        """Return labels, what tells rows of one configuration apart, and every row's configuration."""
+        points = self.kind.points
+        if points == 1:
+            rows = [(k, (m,), f) for k in range(count) for m in self.markers for f in self.fixtures]
+        else:
+            rows = [(k, tuple(self.rng.choice(self.markers, points)), f) for k in range(count) for f in self.fixtures]
         several = len(rows) > count
-        columns = {"label": [f"c{k}{''.join(m) * several}{f * (len(fixtures) > 1)}" for k, m, f in rows]}
+        columns = {"label": [f"c{k}{''.join(m) * several}{f * (len(self.fixtures) > 1)}" for k, m, f in rows]}
         if several:
             columns["configuration"] = [str(k) for k, _, _ in rows]
-        if markers != ("",):
-            for i, prefix in enumerate(self._prefixes):
+        if self.markers != ("",):
+            for i, prefix in enumerate(PREFIXES[:points]):
                 columns[f"{prefix}marker"] = [row[1][i] for row in rows]
-        if fixtures != ("",):
+        if self.fixtures != ("",):
             columns["fixture"] = [fixture for _, _, fixture in rows]
-        return columns
-
-    @property
-    def _prefixes(self) -> list[str]:
-        """What precedes the columns of each point."""
-        return ["", "to_"][: self.shape.kind.points]
+        return columns, [k for k, _, _ in rows]
 
     def _joints(self, q: Array, digits: int, torque: Array | None = None) -> Columns:
         """Return the joint values (N, p, dof) of every point, each beside its torque [Nm] where there are torques."""
         columns = {}
-        for p, prefix in enumerate(self._prefixes):
-            for i, (name, si) in enumerate(joint_columns(self.world.stated.robot.joint_dimensions).items()):
+        for p, prefix in enumerate(PREFIXES[: self.kind.points]):
+            for i, (name, si) in enumerate(joint_columns(self.stated.robot.joint_dimensions).items()):
                 columns[prefix + name] = [f"{v:.{digits}f}" for v in q[:, p, i] / si]
                 if torque is not None:
                     columns[f"{prefix}tau{i + 1}_Nm"] = [f"{v:.3f}" for v in torque[:, p, i]]
@@ -318,7 +305,7 @@ class TableMaker:
     def _values(self, y: Array) -> Columns:
         """Return measured values (N, c): millimetres to a nanometre, quaternions to 1e-12."""
         columns = {}
-        for i, (name, dimension) in enumerate(self.shape.kind.columns.items()):
+        for i, (name, dimension) in enumerate(self.kind.columns.items()):
             if dimension:
                 unit, si = display(dimension)
                 columns[f"{name}_{unit}"] = [f"{v:.6f}" for v in y[:, i] / si]
@@ -327,8 +314,8 @@ class TableMaker:
         return columns
 
     def _read(self, columns: Mapping[str, Sequence[Any]]) -> Dataset:
-        noise = self.shape.observation.noise or self.world.stated.table.noise
-        return read_data(columns, self.world.stated.robot, noise, self.shape.kind)
+        noise = self.observation.noise or self.stated.table.noise
+        return read_data(columns, self.stated.robot, noise, self.kind)
 
     def _errors(self, block: Block) -> Array:
         """Return errors (N, k) of the declared covariance; zero without noise."""
@@ -336,21 +323,11 @@ class TableMaker:
         L = np.linalg.cholesky(np.broadcast_to(block.covariance, (len(block.row), k, k)))
         return self.noisy * (L @ self.rng.normal(size=(len(block.row), k, 1)))[:, :, 0]
 
-    def _move(self, y: Array) -> list[int]:
-        """Move some rows of y by the length of a blunder, in random directions; return which."""
-        plan = self.world.plan
-        hit = self.rng.choice(len(y), plan.blunders, replace=False)
-        lengths = [i for i, dimension in enumerate(self.shape.kind.columns.values()) if dimension == "length"]
-        direction = self.rng.normal(size=(len(hit), len(lengths)))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        y[hit[:, None], np.array(lengths)] += plan.blunder * direction
-        return sorted(hit.tolist())
-
     # --- cameras -------------------------------------------------------------------------------------------------
 
     def _seen(self, count: int) -> Columns:
         """Return a camera's table: configurations in which it sees its whole board, and where every point appears."""
-        stated, plan = self.world.stated, self.world.plan
+        stated, plan = self.stated, self.plan
         if stated.board is None:
             raise InputError("key target", "nothing", "the points of the board that the camera sees", stated.path)
         if len(plan.image_px) != 2 or min(plan.image_px) < 1:
@@ -359,15 +336,15 @@ class TableMaker:
         names = list(board)
         joints = list(joint_columns(stated.robot.joint_dimensions))
         one = self._read(on_board({"point": names[:1], **{n: ["0"] for n in ("u_px", "v_px", *joints)}}, board))
-        world = CalibrationProblem(stated.robot, self.world.parameters, one)
+        world = CalibrationProblem(stated.robot, self.parameters, one)
         width, height = plan.image_px
         points = np.array(list(board.values()))
-        q = postures_in_sight(world, points, count, self.rng, self.world.x, plan.joint_share, (width, height))
+        q = postures_in_sight(world, points, count, self.rng, self.x, plan.joint_share, (width, height))
         table: Columns = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
         table |= self._joints(np.repeat(q, len(names), axis=0)[:, None], CAMERA_DIGITS)
         empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
         data = self._read(on_board({**table, **empty}, board))
-        y = world.on(data).modelled(self.world.x)[0] + self._errors(data.blocks[0])
+        y = world.on(data).modelled(self.x)[0] + self._errors(data.blocks[0])
         return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
 
     # --- touches of points and planes that nobody measures -------------------------------------------------------
@@ -375,7 +352,7 @@ class TableMaker:
     def _touched(self) -> Columns:
         """Return a table of touches, by tools that take turns."""
         column, things = self._things()
-        robot, markers = self.world.stated.robot, self.shape.markers
+        robot, markers = self.stated.robot, self.markers
         names = [name for name, places in things.items() for _ in places]
         table = {"label": [f"{name}_{i}" for name, places in things.items() for i in range(len(places))], column: names}
         turn = np.arange(len(names)) % len(markers)
@@ -385,16 +362,16 @@ class TableMaker:
         declared = self._read({**table, **self._joints(q[:, None], 0)}).blocks[0].covariance[0]
         errors = self.rng.normal(size=(len(names), 3)) @ np.linalg.cholesky(declared).T
         targets = np.concatenate(list(things.values())) + self.noisy * errors
-        problem = CalibrationProblem(robot, self.world.parameters, touches(q[:1], ["any"], 1.0))
+        problem = CalibrationProblem(robot, self.parameters, touches(q[:1], ["any"], 1.0))
         for k, marker in enumerate(markers):
             mine = turn == k
-            share = self.world.plan.joint_share
-            q[mine] = postures_at(problem, targets[mine], self.rng, self.world.x, share, marker)
+            share = self.plan.joint_share
+            q[mine] = postures_at(problem, targets[mine], self.rng, self.x, share, marker)
         return table | self._joints(q[:, None], EXACT_DIGITS)
 
     def _things(self) -> tuple[str, dict[str, Array]]:
         """Return the column that names what is touched, and by name where (K, 3) [m]."""
-        plan = self.world.plan
+        plan = self.plan
         points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
         if self.noisy:
             points, planes, each = plan.points_mm, plan.planes, plan.configurations
@@ -420,44 +397,3 @@ def _vector(values: Sequence[float]) -> Array:
     if len(values) != 3:
         raise InputError("table simulation", f"{list(values)}", "three numbers, x, y and z")
     return np.array(values, dtype=float)
-
-
-def touching_poses(
-    problem: CalibrationProblem, x: Array, wanted: Array, rng: np.random.Generator, share: float = 1.0
-) -> Array:
-    """Return joint values (N, dof) [rad or m] at which a constraint's residuals are the wanted ones.
-
-    From random configurations by Newton's steps (`Target`), whose ends are within the joints' limits.
-
-    Parameters
-    ----------
-    problem
-        Its data are N rows of a measurement with one component and no columns; their joint values do not matter.
-    x
-        (n,) deviations of the identified parameters [SI].
-    wanted
-        (N,) residuals [m], in the order of the rows.
-    rng
-        Of the random configurations. It advances by the same amount however many are needed.
-    share
-        Which part of every joint's range they are drawn from, from 0 to 1.
-
-    Raises
-    ------
-    InputError
-        Where no random configuration leads to the surface.
-    """
-
-    def away(q: Array, rows: np.ndarray) -> Array:
-        data = problem.data.take(rows)
-        blocks = tuple(replace(block, q=q[block.row][:, None]) for block in data.blocks)
-        posed = problem.on(Dataset(blocks, data.label, data.configuration))
-        residual = np.empty(len(q))
-        residual[np.concatenate([block.row for block in blocks])] = posed.residual(x)
-        return (residual - wanted[rows])[:, None]
-
-    target = Target(problem.robot, away, damping=1e-20)  # more would change the last digits of tables
-    poses, beyond = target.reached(len(wanted), rng.spawn(1)[0], share)
-    if beyond is not None:
-        raise InputError("table simulation", "a plane or sphere out of reach", "one that the robot can touch")
-    return poses

@@ -95,21 +95,15 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     values = {stem: value for (stem, _), value in quantities(table, known, where, _numbers).items()}
     if set(values) == set(BOX):
         return values
-    if set(values) == {"q"}:
-        return _joint_values([values["q"]], robot, where)
-    if set(values) == set(joints):
-        return _joint_values([[values[name] for name in joints]], robot, where)
-    accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
-    raise InputError(where, ", ".join(table) or "nothing", accepted)
-
-
-def _joint_values(values: Any, robot: Robot, where: str) -> Array:
-    """Return joint values (N, dof) of one or several configurations."""
+    if set(values) not in ({"q"}, set(joints)):
+        accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
+        raise InputError(where, ", ".join(table) or "nothing", accepted)
+    stated = values["q"] if "q" in values else [values[name] for name in joints]
     try:
-        q = np.array(values, dtype=float)
+        q = np.array(stated, dtype=float)
     except ValueError:
         raise InputError(where, "lists of different lengths", f"{robot.dof} joint values a configuration") from None
-    q = q.reshape(-1, q.shape[-1])
+    q = q.reshape(-1, q.shape[-1] if q.ndim else 1)
     if q.shape[1] != robot.dof:
         raise InputError(where, f"{q.shape[1]} joint values", f"{robot.dof} a configuration")
     return q
@@ -131,26 +125,16 @@ def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
 
 
 def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
-    """Return what ``[record]`` states, in the order of `FIELDS`.
-
-    Raises
-    ------
-    InputError
-        For another key, and values that are no text, number or date.
-    """
-    for key in table:
+    """Return what ``[record]`` states, in the order of `FIELDS`."""
+    for key, value in table.items():
         if key not in FIELDS:
             raise InputError(f"key record.{key}", "a key that is not known", choices(key, FIELDS))
-    return {key: _text(table[key], f"key record.{key}") for key in FIELDS if key in table}
-
-
-def _text(value: Any, where: str) -> str:
-    if isinstance(value, bool) or not isinstance(value, str | int | float | date | datetime):
-        raise InputError(where, repr(value)[:60], "a text, a number or a date")
-    text = str(value).strip()
-    if not 0 < len(text) <= LONGEST_TEXT:
-        raise InputError(where, f"{len(text)} characters", f"1 to {LONGEST_TEXT}")
-    return text
+        if isinstance(value, bool) or not isinstance(value, str | int | float | date | datetime):
+            raise InputError(f"key record.{key}", repr(value)[:60], "a text, a number or a date")
+        length = len(str(value).strip())
+        if not 0 < length <= LONGEST_TEXT:
+            raise InputError(f"key record.{key}", f"{length} characters", f"1 to {LONGEST_TEXT}")
+    return {key: str(table[key]).strip() for key in FIELDS if key in table}
 
 
 def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | None:
@@ -163,11 +147,6 @@ def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | 
         x_mm = [300.0, 800.0]           in this box of the robot's base frame (with y_mm and z_mm), and
         q1_deg = [-90.0, 90.0]          whose joints are within these, the others within the measured ranges
         marker = "smr1"
-
-    Raises
-    ------
-    InputError
-        For other keys, sides that are no two numbers, a limit that nothing can keep.
     """
     if not table:
         return None
@@ -215,20 +194,16 @@ def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]
         if table not in used:
             raise InputError(f"table {table}", "a place for no measurement here", choices(table, used))
         for fixture, coordinates in used[table].items():
-            own |= _placed(table, fixture, content, coordinates)
+            part: Any = content
+            where = f"table {table}"
+            if fixture:
+                part = content.get(fixture, {})
+                where = f"table {table}.{fixture}"
+            if not isinstance(part, dict):
+                raise InputError(where, repr(part)[:60], "a table")
+            values = quantities(part, {name: (dimension,) for name, dimension in coordinates.items()}, where)
+            own |= {of_fixture(f"{table}_{name}", fixture): value for (name, _), value in values.items()}
         unknown = [key for key, value in content.items() if isinstance(value, dict) and key not in used[table]]
         if unknown:
             raise InputError(f"table {table}", f"'{unknown[0]}'", choices(unknown[0], used[table]))
     return own
-
-
-def _placed(table: str, fixture: str, content: Mapping[str, Any], coordinates: Mapping[str, str]) -> dict[str, float]:
-    part: Any = content
-    where = f"table {table}"
-    if fixture:
-        part = content.get(fixture, {})
-        where = f"table {table}.{fixture}"
-    if not isinstance(part, dict):
-        raise InputError(where, repr(part)[:60], "a table")
-    values = quantities(part, {name: (dimension,) for name, dimension in coordinates.items()}, where)
-    return {of_fixture(f"{table}_{name}", fixture): value for (name, _), value in values.items()}

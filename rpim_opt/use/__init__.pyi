@@ -1,10 +1,10 @@
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
 from .compensation import compensate_file as compensate_file
+from .export import export_files as export_files
 from .export import export_urdf as export_urdf
 from .export import geometry_alone as geometry_alone
 from .export import identified as identified
-from .export import write_joint_corrections as write_joint_corrections
 from .iso9283 import Performance as Performance
 from .iso9283 import iso9283 as iso9283
 from .iso9283 import read_approaches as read_approaches

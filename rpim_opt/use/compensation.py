@@ -34,6 +34,7 @@ from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
 from rpim_opt.robot.parameters import Parameters
+from rpim_opt.use.export import noted
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
 from rpim_opt.use.reading import Targets, read_targets
 
@@ -54,16 +55,13 @@ class Compensation:
 
     Parameters
     ----------
-    robot
-        The nominal robot.
-    label
-        N row labels.
+    robot, label
+        The nominal robot, and N row labels.
     nominal, q
         (N, dof) commands of the nominal controller, and the corrected ones [rad or m].
-    position_before, orientation_before
-        (N,) how far the nominal command misses the target [m], [rad]; NaN for an orientation that does not count.
-    position_error, orientation_error
-        (N,) the same for the corrected command.
+    position_before, orientation_before, position_error, orientation_error
+        (N,) how far the nominal and the corrected command miss the target [m], [rad]; NaN for an orientation that does
+        not count.
     std
         (N,) standard uncertainty of the position there [m], sqrt(tr J C J' + tr R), with the calibration's covariance
         C, the Jacobian J of the position in the instrument's frame and the repeatability R. Infinite without C.
@@ -73,19 +71,8 @@ class Compensation:
         ``"near singular"`` (the correction would be too large, and was damped).
     outside
         Corrected commands beyond the joint ranges that the calibration measured.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
-    >>> found = ro.use.compensate(result, np.radians([[10, -80, 60, 20, 30, 0]]), label=["P1"])
-    >>> np.degrees(found.q - found.nominal).round(2), found.status
-    (array([[ 0.08,  0.86, -2.02,  1.21, -0.09, -0.04]]), ('ok',))
-    >>> sorted(found.content())
-    ['corrected', 'largest_corrections', 'nominal', 'outside', 'rows']
-    >>> print(found.csv().splitlines()[0])
-    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
+    note
+        Why the robot is not delivered, where it is used all the same.
     """
 
     robot: Robot
@@ -99,6 +86,7 @@ class Compensation:
     std: Array
     status: tuple[str, ...]
     outside: Outside = field(default_factory=Outside)
+    note: str = ""
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
@@ -154,6 +142,7 @@ class Compensation:
             "largest_corrections": self._largest_corrections(),
             "outside": [self.label[i] for i in self.outside.rows],
             "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
+            "note": self.note,
         }
 
     def csv(self) -> str:
@@ -162,7 +151,8 @@ class Compensation:
         for name, values in self._columns().items():
             digits = 9 if name.startswith("q") else 6
             cells.append([f"{v:.{digits}f}" if np.isfinite(v) else "" for v in values])
-        return csv_text(["label", *self._columns(), "status"], zip(self.label, *cells, self.status, strict=True))
+        text = csv_text(["label", *self._columns(), "status"], zip(self.label, *cells, self.status, strict=True))
+        return noted(text, ".csv", self.note)
 
 
 @one_blas_thread
@@ -181,6 +171,7 @@ def compensate(
     largest: float = 0.2,
     label: Sequence[str] = (),
     robot: str = "",
+    despite_verdict: bool = False,
 ) -> Compensation:
     """Correct joint commands so that the calibrated robot goes where the nominal one would.
 
@@ -232,21 +223,31 @@ def compensate(
         N row labels; numbers from 1 by default.
     robot
         Which of several robots.
+    despite_verdict
+        Use a robot that is not delivered, too.
 
     Raises
     ------
+    NotDelivered
+        For a calibration that is not delivered.
     InputError
         For shapes that do not fit, numbers that are not finite, a reflector that is not known.
 
     Examples
     --------
+    >>> import numpy as np
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
     >>> found = ro.use.compensate(result, instance.validation.q)
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
+    >>> np.degrees(found.q - found.nominal)[0].round(2), found.status[0]
+    (array([ 0.24,  0.09,  0.41, -0.53,  0.21,  0.17]), 'ok')
+    >>> print(found.csv().splitlines()[0])
+    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
     """
+    note = result.verdict.require(despite_verdict)
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:
@@ -272,20 +273,11 @@ def compensate(
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     whole["status"] = tuple(whole["status"].tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
-    return Compensation(arm, targets.label, **whole, outside=result.outside(commands))
+    return Compensation(arm, targets.label, **whole, outside=result.outside(commands), note=note)
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
-    """Compensate the targets of a table (`read_targets`) and write `Compensation.csv`, whole or not at all.
-
-    Parameters
-    ----------
-    result
-        The calibration.
-    targets, out
-        The table to read, and the CSV file to write.
-    options
-        Those of `compensate`.
+    """Compensate the targets of a table (`read_targets`) and write `Compensation.csv`; ``options`` of `compensate`.
 
     Examples
     --------

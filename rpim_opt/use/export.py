@@ -6,8 +6,10 @@ import csv
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +22,15 @@ from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.robot.chain import Described, placed, same_place
-from rpim_opt.robot.formats.universal_robots import write_ur_calibration
+from rpim_opt.robot.formats.tables import write_robodk, write_robot
+from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
 from rpim_opt.robot.terms import transmission
+
+Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
+"""A file, and what writes to the path that it is given and says what the user has to know of it."""
 
 
 def identified(result: Calibration, marker: str = "") -> Described:
@@ -66,16 +72,95 @@ def identified(result: Calibration, marker: str = "") -> Described:
     return Described(result.robot, base, tool)
 
 
-def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
-    """Return the calibration without the model extensions that the evidence added, and what that costs in a sentence.
+def export_files(
+    result: Calibration,
+    out: Path | None = None,
+    *,
+    urdf: Path | None = None,
+    ur_kinematics: Path | None = None,
+    ur_calibration: Path | None = None,
+    mdh: Path | None = None,
+    robodk: Path | None = None,
+    corrections: Path | None = None,
+    marker: str | None = None,
+    despite_verdict: bool = False,
+    **frames: Any,
+) -> tuple[list[Path], list[str]]:
+    """Write the identified robot for other tools: all files that are asked for, or none.
 
-    Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
-    measurements are calibrated once more.
+    Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
 
     Parameters
     ----------
     result
-        The calibration; returned as it is where nothing was added.
+        The calibration.
+    out
+        Where to write what corrects a file; of several the folder.
+    urdf, ur_kinematics, ur_calibration
+        Files of the nominal robot to correct: a URDF, ``kinematics.yaml`` of ROS and ``calibration.conf`` of a
+        Universal Robot.
+    mdh, robodk
+        Files to write: MDH parameters (.csv, .json, .toml), RoboDK's four numbers a joint (.csv).
+    corrections
+        CSV file to write with the transmission errors of the calibration as a whole, ``joint``, ``angle_deg`` (of the
+        model), ``correction_mrad``, ``std_mrad``: a joint stands at its angle plus the correction.
+    marker
+        The reflector that is the tip.
+    despite_verdict
+        Write a robot that is not delivered, too, with a note in every file.
+    frames
+        ``root``, ``tip``, ``base`` and ``tool`` of `export_urdf`.
+
+    Returns
+    -------
+    The files, and sentences on what they do not hold.
+
+    Raises
+    ------
+    NotDelivered
+        For a calibration that is not delivered.
+    InputError
+        Where there is nothing to write, or a file cannot hold what was identified.
+    """
+    whole = result
+    result, notes = geometry_alone(whole)
+    note = result.verdict.require(despite_verdict)
+    robot = _with_first_reflector(result, marker).robot
+    frames["marker"] = marker
+    corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
+        (urdf, lambda source, target: _write_urdf(result, source, target, **frames)),
+        (ur_kinematics, lambda source, target: write_ur_kinematics(source, robot, target)),
+        (ur_calibration, lambda source, target: export_ur_calibration(result, source, target)),
+    ]
+    sources = [(source, write) for source, write in corrected if source]
+    if sources and out is None:
+        raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
+    writers: list[Writer] = []
+    for source, write in sources:
+        target = Path(out or "")
+        if len(sources) > 1 or target.is_dir():
+            target = target / source.name
+        if target.resolve() == source.resolve():
+            raise InputError("--out", f"the original, {source}", "another place: the original stays")
+        writers.append((target, partial(write, source)))
+    plain = [
+        (mdh, partial(write_robot, robot)),
+        (robodk, partial(write_robodk, robot)),
+        (corrections, partial(_write_joint_corrections, whole)),
+    ]
+    writers += [(target, write) for target, write in plain if target]
+    if not writers:
+        accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
+        raise InputError("export", "nothing to write", accepted)
+    said = write_all(writers, note)
+    return [target for target, _ in writers], [*filter(None, [note]), *notes, *said]
+
+
+def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
+    """Return the calibration without the model extensions that the evidence added, and what that costs in a sentence.
+
+    Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
+    measurements are calibrated once more. A calibration to which nothing was added is returned as it is.
 
     Examples
     --------
@@ -97,25 +182,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     return alone, [said]
 
 
-def write_joint_corrections(result: Calibration, target: str | Path) -> list[str]:
-    """Write the transmission errors of joints as a CSV table: a joint stands at its angle plus the correction.
-
-    Columns ``joint``, ``angle_deg`` (of the model, see `Robot`), ``correction_mrad`` and its standard deviation
-    ``std_mrad``, four rows a period of the finest harmonic. They belong to the geometry of the same result. Returned is
-    a sentence on how large they are.
-
-    Parameters
-    ----------
-    result
-        A calibration with transmission errors.
-    target
-        The file.
-
-    Raises
-    ------
-    InputError
-        For a calibration without.
-    """
+def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
+    """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
     curves = result.problem.robot.model.curves
     if not curves:
         accepted = "one with transmission errors of joints (model 'auto', where the data support them)"
@@ -134,7 +202,7 @@ def write_joint_corrections(result: Calibration, target: str | Path) -> list[str
         sizes.append(f"joint {curve.joint} {np.sqrt(np.mean(correction**2)):.3f}")
         rows = zip(np.degrees(q), correction, std, strict=True)
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
-    write_text(Path(target), "\n".join(lines) + "\n")
+    write_text(target, "\n".join(lines) + "\n")
     return [f"Transmission errors (RMS, mrad): {joined(sizes)}. They belong to the geometry of this very result."]
 
 
@@ -147,6 +215,7 @@ def export_urdf(
     base: bool | None = None,
     tool: bool | None = None,
     marker: str | None = None,
+    despite_verdict: bool = False,
 ) -> list[str]:
     """Write a URDF with the identified robot's origins, and base and tool where they are the file's.
 
@@ -166,6 +235,8 @@ def export_urdf(
         Whether to write the base and the tool, instead of that rule.
     marker
         The reflector that is the tip. Of several none is, unless it is named.
+    despite_verdict
+        As for `export_files`.
 
     Examples
     --------
@@ -173,7 +244,7 @@ def export_urdf(
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf")
     >>> parameters = ro.robot.model_parameters(arm.robot, arm.base, {"": arm.tool}).identify(["d1"])
-    >>> data = ro.Dataset.of(np.zeros((1, 1)), np.zeros((1, 3)), 1e-4)
+    >>> data = ro.Dataset.of(np.linspace(-1, 1, 8)[:, None], np.zeros((8, 3)), 1e-4)
     >>> empty = ro.CalibrationProblem(arm.robot, parameters, data)
     >>> longer = empty.on(ro.Dataset.of(data.q, empty.modelled(np.array([0.001]))[0], 1e-4))
     >>> ro.use.export_urdf(ro.calibrate(longer, weight=0.0), "arm.urdf", "identified.urdf")
@@ -181,7 +252,22 @@ def export_urdf(
     >>> (ro.read_urdf("identified.urdf").robot.mdh - arm.robot.mdh)[0, 3].round(6)  # [m]
     np.float64(0.001)
     """
-    arm = with_first_reflector(result, marker)
+    note = result.verdict.require(despite_verdict)
+    options = {"root": root, "tip": tip, "base": base, "tool": tool, "marker": marker}
+    return write_all([(Path(target), lambda path: _write_urdf(result, source, path, **options))], note)
+
+
+def _write_urdf(
+    result: Calibration,
+    source: str | Path,
+    target: Path,
+    root: str | None = None,
+    tip: str | None = None,
+    base: bool | None = None,
+    tool: bool | None = None,
+    marker: str | None = None,
+) -> list[str]:
+    arm = _with_first_reflector(result, marker)
     own = read_urdf(source, root, tip)
     names = result.problem.parameters.names
     if marker is None and tool is None and len(reflectors(names)) > 1:
@@ -204,7 +290,7 @@ def export_urdf(
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
     """Write a ``calibration.conf``; what alpha1 and a1 say is where the controller's Base is, and is left out."""
-    robot = with_first_reflector(result).robot
+    robot = _with_first_reflector(result).robot
     nominal = result.problem.robot
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
@@ -222,8 +308,7 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     return notes
 
 
-def with_first_reflector(result: Calibration, marker: str | None = None) -> Described:
-    """Return what was identified with a reflector, by default the first."""
+def _with_first_reflector(result: Calibration, marker: str | None = None) -> Described:
     return identified(result, reflectors(result.problem.parameters.names)[0] if marker is None else marker)
 
 
@@ -249,30 +334,27 @@ def noted(text: str, ending: str, note: str) -> str:
     return f"{declaration}{mark}\n<!-- {note.replace('--', '-')} -->\n{rest.lstrip()}".lstrip()
 
 
-def write_all(writers: Sequence[tuple[Path, Callable[[Path], Sequence[str] | None]]], note: str = "") -> list[str]:
-    """Write several files with a note in each, or none if one cannot be written; return what their writers say.
-
-    ``writers`` are targets, each with a function that writes to the path it is given.
-    """
+def write_all(writers: Sequence[Writer], note: str = "") -> list[str]:
+    """Write several files with a note in each, or none if one cannot be written; return what their writers say."""
     targets = [target for target, _ in writers]
     for target in targets:
         if target.is_dir() or targets.count(target) > 1:
             found = "a folder" if target.is_dir() else "two files for it"
             raise InputError("the file", found, "a name of its own for every file", target)
     notes: list[str] = []
+    contents: dict[Path, bytes] = {}
     with TemporaryDirectory() as folder:
-        written: dict[Path, Path] = {}
         for number, (target, write) in enumerate(writers):
-            written[target] = path = Path(folder) / str(number) / target.name
+            path = Path(folder) / str(number) / target.name
             path.parent.mkdir()
             try:
                 notes += write(path) or ()
             except InputError as error:
                 file = target if error.file == path else error.file
-                raise InputError(error.where, error.found, error.accepted, file) from None
-        with refused(", ".join(str(target) for target in written)):
-            contents = {target: read_bytes(path) for target, path in written.items()}
+                raise type(error)(error.where, error.found, error.accepted, file) from None
+            contents[target] = read_bytes(path)
             if note:
-                contents = {t: noted(data.decode(), t.suffix.lower(), note).encode() for t, data in contents.items()}
-            write_files(contents)
+                contents[target] = noted(contents[target].decode(), path.suffix.lower(), note).encode()
+    with refused(", ".join(str(target) for target in contents)):
+        write_files(contents)
     return notes

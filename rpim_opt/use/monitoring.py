@@ -71,10 +71,8 @@ class Monitoring:
 
     Parameters
     ----------
-    label, times
-        Names of the N checks, and their times as the table states them; empty without.
-    when
-        (N,) times [s]; None without.
+    label, times, when
+        Names of the N checks, their times as the table states them, and (N,) in s; empty and None without.
     error
         (N,) errors against the calibration [m].
     sigmas, allowed
@@ -86,16 +84,6 @@ class Monitoring:
         The change that explains them best; None where chance does.
     mistake
         The likely mistake in the checks, in a sentence; empty where there is none.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> instance = ro.load("position")
-    >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
-    >>> found.alarm, found.beyond, found.drifts, str(found).splitlines()[0]
-    (None, (), False, 'No drift in 40 checks.')
-    >>> found.content()["checks"], found.csv().splitlines()[0]
-    (40, 'label,error_mm,sigmas,allowed_sigmas,sum')
     """
 
     label: tuple[str, ...]
@@ -230,8 +218,10 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)
-    >>> found.drifts, found.drift, len(found.sums)
-    (False, None, 40)
+    >>> found.alarm, found.beyond, found.drift, str(found).splitlines()[0]
+    (None, (), None, 'No drift in 40 checks.')
+    >>> found.csv().splitlines()[0]
+    'label,error_mm,sigmas,allowed_sigmas,sum'
     """
     count = len(data)
     if when is not None:

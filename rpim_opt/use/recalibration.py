@@ -124,16 +124,6 @@ class Update:
         By how much the released parameters moved.
     readings
         Rows that were given.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
-    >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
-    >>> found.changed, found.explained, found.causes[0].p_value > 1e-4, found.content()["readings"]
-    (False, True, True, 8)
     """
 
     result: Calibration

@@ -77,16 +77,17 @@ def test_a_file_holds_the_curves(rippled, tmp_path):
 
 def test_corrections_are_a_table(rippled, tmp_path):
     result, _ = rippled
-    said = ro.use.write_joint_corrections(result, tmp_path / "joints.csv")
+    _, said = ro.use.export_files(result, corrections=tmp_path / "joints.csv")
     table = np.genfromtxt(tmp_path / "joints.csv", delimiter=",", skip_header=1)
     rows = table[(table[:, 0] == 2) & (np.abs(table[:, 1]) < 50)]
     q = np.radians(rows[:, 1])
     wave = 1e3 * SIZE * np.cos(CYCLES * q + 0.5)
     slow = np.polynomial.Polynomial.fit(q, rows[:, 2] - wave, 4)  # geometry may stand for it
     assert rms(rows[:, 2] - wave - slow(q)) < 0.2 * 1e3 * SIZE
-    assert said[0].startswith("Transmission errors (RMS, mrad): joint 1")
+    assert said[-1].startswith("Transmission errors (RMS, mrad): joint 1")
+    plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
-        ro.use.write_joint_corrections(ro.calibrate(result.stated, weight=1.0), tmp_path / "none.csv")
+        ro.use.export_files(plain, corrections=tmp_path / "none.csv")
 
 
 def test_commands_are_corrected_for_curves(rippled):

@@ -12,6 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.verdict import worse_than_nominal
 from rpim_opt.store import load_result, save_result
+from rpim_opt.store.serialize import digest
 from tests.calibration.mistakes import IN_TABLES, coupled, joints, simulated_arm, values
 from tests.test_cli import run
 
@@ -89,9 +90,24 @@ def test_files_hold_the_verdict(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "result.json").read_text())
     assert stored["verdict"] == {"delivered": False, "reasons": list(result.verdict.reasons)}
     stored["verdict"] = {"delivered": True, "reasons": []}
-    (tmp_path / "result.json").write_text(json.dumps(stored))
+    (tmp_path / "result.json").write_text(json.dumps({**stored, "digest": digest(stored)}))
     with pytest.raises(ro.InputError, match="key verdict"):
         load_result(tmp_path)
+
+
+def test_python_follows_it(tmp_path: Path) -> None:
+    result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0)
+    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
+    with pytest.raises(ro.basics.NotDelivered, match="joints 2 and 3 exchanged"):
+        ro.use.compensate(result, np.zeros((1, 6)))
+    forced = ro.use.compensate(result, np.zeros((1, 6)), orientation=False, despite_verdict=True)
+    assert "in spite of the verdict" in forced.note
+    assert forced.note in forced.csv()
+    with pytest.raises(ro.basics.NotDelivered):
+        ro.use.export_urdf(result, "arm.urdf", tmp_path / "out.urdf")
+    with pytest.raises(ro.basics.NotDelivered):
+        ro.use.export_files(result, mdh=tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
 
 
 def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:

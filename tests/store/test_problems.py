@@ -136,6 +136,14 @@ def test_intervals_of_the_seen_directions_hold_the_truth(name: str) -> None:
     assert np.sum(left**2) < 2.5 * robot.sum()
 
 
+def test_a_surface_out_of_reach_is_refused(tmp_path: Path) -> None:
+    folder = shutil.copytree(problems_folder() / "sphere", tmp_path / "sphere")
+    file = folder / "problem.toml"
+    file.write_text(file.read_text().replace("r_mm = 300", "r_mm = 90000"))
+    with pytest.raises(ro.InputError, match="out of reach"):
+        simulate(folder)
+
+
 def test_another_seed_is_another_truth(tmp_path: Path) -> None:
     a, b = simulate("position"), simulate("position", seed=99)
     assert a.deviations["a2"][1] != b.deviations["a2"][1]

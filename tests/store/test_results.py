@@ -142,7 +142,7 @@ def test_a_measurement_of_a_script_is_passed_again(tmp_path: Path) -> None:
         ro.load_result(tmp_path)
     assert np.array_equal(ro.load_result(tmp_path, [height]).x, result.x)
     other = ro.data.Measurement("height", model=lambda T: T[1, 3], columns={"z": "length"})
-    with pytest.raises(ro.InputError, match="mm off those that the file's data give"):
+    with pytest.raises(ro.InputError, match="which follows from the file's data, terms and measurement models"):
         ro.load_result(tmp_path, [other])
 
 
@@ -160,13 +160,9 @@ BAD = {
     "a list": (lambda t: "[1, 2]", "no result of rpim-opt"),
     "a newer version": (lambda t: t.replace('"version": 2', '"version": 3', 1), "key version: found 3, accepted: 2"),
     "a key twice": (lambda t: t.replace('"weight": 1.0', '"weight": 1.0, "weight": 1.0', 1), "the key 'weight' twice"),
-    "not a number": (lambda t: t.replace('"weight": 1.0', '"weight": NaN', 1), "key weight"),
-    "a key left out": (lambda t: t.replace('"history"', '"hist"', 1), "key history: found nothing"),
-    "an edited parameter": (lambda t: re.sub(r'"x": \[\S+,', '"x": [0.001,', t, count=1), "mm off those"),
-    "one parameter too few": (lambda t: re.sub(r'"x": \[\S+,', '"x": [', t, count=1), "key x: found 25 numbers"),
-    "ragged joint values": (lambda t: re.sub(r'("q": [\s\[]+)\S+,', r"\1", t, count=1), "rows of different lengths"),
-    "an unknown term": (lambda t: t.replace('"loss": "sum_squares"', '"loss": "sun_squares"'), "mean sum_squares"),
-    "a label too few": (lambda t: re.sub(r'"T2-1",\s+"T2-2"', '"T2-2"', t, count=1), "labels for other rows"),
+    "not a number": (lambda t: t.replace('"weight": 1.0', '"weight": NaN', 1), "parts that do not fit"),
+    "a key left out": (lambda t: t.replace('"history"', '"hist"', 1), "something in it was changed"),
+    "an edited parameter": (lambda t: re.sub(r'"x": \[\S+,', '"x": [0.001,', t, count=1), "was changed"),
 }  # fmt: skip
 
 

@@ -180,7 +180,7 @@ def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Ro
     for side in stored["record"]["earlier"][0]["ranges"][""]:
         side.pop()
     path.write_text(json.dumps({**stored, "digest": digest(stored)}), encoding="utf-8")
-    with pytest.raises(InputError, match="every joint"):
+    with pytest.raises(InputError, match="parts that do not fit together"):
         ro.load_result(path)
 
 
