@@ -11,8 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.bayes.statements import FAR, Result, equation_variance, marginal, triangle_of
+from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, equation_variance, marginal, triangle_of
 
 PRIOR_ROBOTS = 3.0
 """Degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for."""

@@ -11,9 +11,8 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
-from rpim_opt.bayes import statements
-from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, default_widths
-from rpim_opt.bayes.statements import Result, Statement, posterior
+from rpim_opt.bayes import prior_terms as terms
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
 from rpim_opt.robot.parameters import Parameters, overlay
@@ -112,7 +111,7 @@ class Prior:
         InputError
             For a text that is no such statement, or an sd that is not above zero.
         """
-        return cls(statements=(statements.known(text, value, sd),))
+        return cls(statements=(terms.known(text, value, sd),))
 
     @classmethod
     def gaussian(
@@ -139,7 +138,7 @@ class Prior:
         InputError
             For a matrix that is no covariance or precision, and if not one of the three is given.
         """
-        return cls(statements=(statements.gaussian(dict(mean), covariance, precision, sd),))
+        return cls(statements=(terms.gaussian(dict(mean), covariance, precision, sd),))
 
     @classmethod
     def from_result(
@@ -183,7 +182,7 @@ class Prior:
         >>> int(stated.replaced.sum()), stated.rows.shape
         (28, (28, 34))
         """
-        return cls(statements=(posterior(result, inflate, without, noise),))
+        return cls(statements=(terms.posterior(result, inflate, without, noise),))
 
     @classmethod
     def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:

@@ -1,20 +1,24 @@
-"""A prior of one problem in numbers, and the convex penalty that it amounts to."""
+"""A prior in numbers: statements about parameters, the prior of one problem, and the penalty that it amounts to."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.bayes.statements import listed
-from rpim_opt.convex.constraints import Ready
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.units import UNITS, display, split_unit
+from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
+from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Quadratic
+from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
@@ -23,6 +27,10 @@ FIXED = -1
 
 JOINT_OFFSET, FRAMES = 3.0, 10.0
 """Factors on the scales of joint offsets, which are set at assembly, and of frames."""
+
+
+FAR = 100.0
+"""Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:
@@ -213,3 +221,297 @@ def believed(
     ready = penalty is None or penalty in NAMED or isinstance(penalty, Ready)
     kind = _ReadyPenalty if ready else _Penalty
     return kind(kept, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), groups)
+
+
+# --- statements -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Statement:
+    """Rows (v - reference) ~ N(values, I), where v are values of parameters, or their deviations.
+
+    Parameters
+    ----------
+    names, dimensions
+        (p) parameters that it is about, and what they are.
+    rows, values
+        (k, p) [1 / SI] and (k,), whitened.
+    reference
+        (p,) [SI] from which the parameters' values count; None: from nominal, whatever that is.
+    whole
+        Whether it stands in the place of the parameters' own scales, and is marginal where some of them are not
+        identified. Otherwise those are nominal.
+    text
+        As a person wrote it.
+    """
+
+    names: tuple[str, ...]
+    dimensions: tuple[str, ...]
+    rows: tuple[tuple[float, ...], ...]
+    values: tuple[float, ...]
+    reference: tuple[float, ...] | None = None
+    whole: bool = False
+    text: str = ""
+
+    @property
+    def where(self) -> str:
+        """What an error calls it."""
+        return f"prior '{self.text}'"
+
+    def on(self, parameters: Parameters) -> tuple[Array, Array, np.ndarray]:
+        """Return rows (k, n) and values (k,) in units of the scales of the n identified parameters of a whole table.
+
+        And (n,) for which of them they stand in the place of their own scales. InputError for a name that the table has
+        not, another dimension, a value far from nominal.
+        """
+        here = self._here(parameters)
+        known = [name for name in self.names if name in here]
+        place = np.array([here[name] for name in known], dtype=int)
+        own = np.array([self.names.index(name) for name in known], dtype=int)
+        offset = self._offset(parameters, place, own)
+        identified = parameters.identified[place]
+        rows = np.array(self.rows, dtype=float).reshape(len(self.values), len(self.names))
+        values = np.array(self.values, dtype=float)
+        if self.whole:
+            rows, values = marginal(rows, values, own[identified])
+            values = values - rows @ offset[identified]
+        else:
+            values = values - rows[:, own] @ offset
+            rows = rows[:, own[identified]]
+        column = (np.cumsum(parameters.identified) - 1)[place[identified]]
+        full = np.zeros((len(rows), len(parameters.free)))
+        full[:, column] = rows * parameters.scale[place[identified]]
+        replaced = np.zeros(full.shape[1], dtype=bool)
+        replaced[column] = self.whole
+        says = full.any(axis=1)
+        return full[says], values[says], replaced
+
+    def _here(self, parameters: Parameters) -> dict[str, int]:
+        """Return the places of a table, names and dimensions checked."""
+        here = {name: i for i, name in enumerate(parameters.names)}
+        missing = [name for name in self.names if name not in here]
+        if missing and (not self.whole or len(missing) == len(self.names)):
+            raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
+        dimensions = set()
+        for name, said in zip(self.names, self.dimensions, strict=True):
+            if name in here:
+                dimensions.add(parameters.dimensions[here[name]])
+                if said not in (parameters.dimensions[here[name]], ""):
+                    accepted = f"one of {parameters.dimensions[here[name]]}"
+                    raise InputError(self.where, f"a unit of {said} for '{name}'", accepted)
+        if len(dimensions) > 1 and "" in self.dimensions:
+            found = f"a sum of {' and '.join(sorted(dimensions))}"
+            raise InputError(self.where, found, "parameters of one dimension")
+        return here
+
+    def _offset(self, parameters: Parameters, place: np.ndarray, own: np.ndarray) -> Array:
+        """Return by how much nominal values (p,) [SI] differ from the reference; zero where that is nominal."""
+        if self.reference is None:
+            return np.zeros(len(place))
+        offset = parameters.nominal[place] - np.array(self.reference)[own]
+        if self.whole:
+            some = parameters.take(place)
+            turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
+            if len(turned):  # angles of frames do not add up
+                found = f"'{some.names[turned[0]]}' that counts from another orientation"
+                raise InputError(self.where, found, "the same start of the frame; or leave out what was set up anew")
+            return offset
+        rows = np.array(self.rows)[:, own]
+        apart = np.abs(np.array(self.values) - rows @ offset)
+        if (apart > FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))).any():
+            norms = np.linalg.norm(rows, axis=1)
+            size = float(np.max(apart / np.where(norms > 0, norms, 1.0)))
+            unit, si = display(parameters.dimensions[place[0]])
+            found = f"a value {size / si:.4g} {unit} off nominal"
+            raise InputError(self.where, found, "one near it; '= nominal +- ...' where the nominal value is meant")
+        return offset
+
+
+def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
+    """Return rows (k', p') and values (k',) of what a statement says of some parameters, whatever the others are.
+
+    Projected off the columns of the others.
+    """
+    if len(kept) == rows.shape[1] and (kept == np.arange(len(kept))).all():
+        return rows, values
+    others = np.setdiff1d(np.arange(rows.shape[1]), kept)
+    norms = np.linalg.norm(rows, axis=0)
+    Q, R = np.linalg.qr(rows[:, others] / np.where(norms[others] > 0, norms[others], 1.0))
+    U, s, _ = np.linalg.svd(R)
+    seen = Q @ U[:, s > 1e-10 * np.max(s, initial=0.0)]
+    left = rows[:, kept] - seen @ (seen.T @ rows[:, kept])
+    right = values - seen @ (seen.T @ values)
+    return left, right
+
+
+def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
+    """Return the statement that a combination of parameters has a value; arguments as for `Prior.known`."""
+    from rpim_opt.convex.tolerances import combination  # texts are read where there are any
+
+    said = combination(text)
+    if said.sd is not None:
+        if value is not None or sd is not None:
+            raise InputError(f"prior '{text}'", "a value or sd besides", "the text alone, or value and sd [SI]")
+        value, sd = said.value, said.sd
+    if sd is None or not (np.isfinite(sd) and sd > 0):
+        raise InputError(f"prior '{text}'", f"sd {sd}", "a standard deviation above zero: '+- 0.05 mm', or sd [SI]")
+    if value is not None and not np.isfinite(value):
+        raise InputError(f"prior '{text}'", f"value {value}", "a finite number [SI]")
+    row = tuple(factor / sd for factor in said.factors)
+    dimensions = (said.dimension,) * len(row)
+    reference = None
+    if value is None:
+        value = said.deviation
+    else:
+        reference = (0.0,) * len(row)
+    return Statement(said.names, dimensions, (row,), (value / sd,), reference, text=text.strip())
+
+
+def gaussian(mean: dict[str, float], covariance: Any, precision: Any, sd: Any) -> Statement:
+    """Return the statement that deviations have a mean and a covariance; arguments as for `Prior.gaussian`."""
+    given = sum(each is not None for each in (covariance, precision, sd))
+    if given != 1:
+        raise InputError("Prior.gaussian", f"{given} of covariance, precision and sd", "one of them")
+    if not mean:
+        raise InputError("Prior.gaussian", "no parameter", "mean={'a2_mm': 0.0, ...}")
+    names, units = [], []
+    for key in mean:
+        name, unit = split_unit(key)
+        if unit is None:
+            raise InputError(f"Prior.gaussian, key {key}", "no unit", f"{key}_mm, {key}_mrad, ...")
+        names.append(name)
+        units.append(UNITS[key.removeprefix(name + "_")])
+    centre = np.array([float(value) for value in mean.values()])
+    if not np.isfinite(centre).all():
+        raise InputError("Prior.gaussian", "a mean that is not finite", "finite numbers")
+    if sd is not None:
+        covariance = np.diag(_vector(sd, len(mean)) ** 2)
+    rows = _root(precision, covariance, len(mean))
+    values = rows @ centre
+    rows = rows / np.array([unit.si for unit in units])
+    dimensions = tuple(unit.dimension for unit in units)
+    return Statement(tuple(names), dimensions, listed(rows), tuple(values.tolist()), None, True, "mean and covariance")
+
+
+def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix (k, p) as tuples, which are equal where their content is."""
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _vector(sd: float | Sequence[float], count: int) -> Array:
+    values = np.asarray(sd, dtype=float)
+    if values.ndim > 1 or values.size not in (1, count):
+        raise InputError("Prior.gaussian", f"sd of shape {values.shape}", f"a number, or {count} numbers")
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        raise InputError("Prior.gaussian", "an sd that is not above zero", "finite numbers above zero")
+    return np.broadcast_to(values.ravel(), (count,))
+
+
+def _root(precision: Any, covariance: Any, count: int) -> Array:
+    """Return W (k, p) with W'W the precision or inverse covariance; k < p where it leaves directions open."""
+    what = "covariance" if precision is None else "precision"
+    matrix = np.asarray(covariance if precision is None else precision, dtype=float)
+    if matrix.shape != (count, count):
+        raise InputError("Prior.gaussian", f"{what} of shape {matrix.shape}", f"({count}, {count})")
+    if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
+        raise InputError("Prior.gaussian", f"a {what} that is not finite and symmetric", "one that is")
+    size = np.sqrt(np.maximum(np.diag(matrix), 0))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    if precision is None:
+        if np.min(values) <= 1e-15:
+            accepted = "one that is; [constraints] for what is known exactly, precision for what is not known at all"
+            raise InputError("Prior.gaussian", "a covariance that is not positive definite", accepted)
+        return (vectors / np.sqrt(values)).T / unit
+    if np.min(values) < -1e-10 * max(np.max(values), 1e-300):
+        raise InputError("Prior.gaussian", "a precision with negative eigenvalues", "one that is positive semidefinite")
+    kept = values > 1e-13 * np.max(values, initial=0.0)
+    return (vectors[:, kept] * np.sqrt(values[kept])).T * unit
+
+
+# --- an earlier result -----------------------------------------------------------------------------------------------
+
+
+class Result(Protocol):
+    """What a prior needs of an earlier result: a `Calibration` has it."""
+
+    @property
+    def problem(self) -> Source:
+        """What was asked."""
+        ...
+
+    @property
+    def x(self) -> Array:
+        """Deviations (n,) [SI]."""
+        ...
+
+    @property
+    def program(self) -> Program:
+        """The convex program at the solution."""
+        ...
+
+    @property
+    def penalty_weight(self) -> float:
+        """Zero without a penalty."""
+        ...
+
+    @cached_property
+    def linear(self) -> LinearModel:
+        """The equations of the fit."""
+        ...
+
+    @cached_property
+    def noise_variance(self) -> float:
+        """Of the equations, in units of the declared variance."""
+        ...
+
+    @cached_property
+    def spread(self) -> Any:
+        """``factor`` of a robust loss on squares, and ``drift`` (n, k) [SI], or InputError without covariance."""
+        ...
+
+
+def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
+    """Return what a result says of its parameters; arguments as for `Prior.from_result`."""
+    for name, value in (("inflate", inflate), ("noise", noise)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"Prior.from_result, {name}", f"{value}", "a number above zero")
+    free = result.problem.parameters.free
+    form = result.program.penalty_form
+    variance = equation_variance(result) if noise is None else noise**2 * result.spread.factor
+    parts = [result.linear.triangle[:, : len(free)] / np.sqrt(variance)]
+    if form is not None and result.penalty_weight > 0:
+        parts.append(np.sqrt(result.penalty_weight / variance) * form.matrix)
+    if isinstance(without, str):
+        without = without.split()
+    kept = np.arange(len(free))
+    if without:
+        kept = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
+    if not len(kept):
+        raise InputError("Prior.from_result, without", "every parameter", "patterns that leave some")
+    R = triangle_of(np.vstack(parts))
+    if result.spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
+        moved = R @ (result.spread.drift / free.scale[:, None])
+        R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
+    rows, _ = marginal(R, np.zeros(len(free)), kept)
+    rows = triangle_of(rows) / (free.scale[kept] * inflate)
+    return Statement(
+        names=tuple(free.names[i] for i in kept),
+        dimensions=tuple(free.dimensions[i] for i in kept),
+        rows=listed(rows),
+        values=tuple((rows @ result.x[kept]).tolist()),
+        reference=tuple(free.nominal[kept].tolist()),
+        whole=True,
+        text="an earlier result",
+    )
+
+
+def equation_variance(result: Result) -> float:
+    """Return the variance of the equations' noise, in units of the declared one, as the loss weighs them."""
+    return result.noise_variance * result.spread.factor
+
+
+def triangle_of(rows: Array) -> Array:
+    """Return R with R'R = rows' rows, square."""
+    n = rows.shape[1]
+    return np.asarray(np.linalg.qr(np.vstack([rows, np.zeros((max(n - len(rows), 0), n))]), mode="r"), dtype=float)
