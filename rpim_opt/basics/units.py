@@ -216,8 +216,8 @@ SPELLED = {
     "metre": "m", "meters": "m", "metres": "m", "millimeter": "mm", "millimetre": "mm", "millimeters": "mm",
     "millimetres": "mm", "nm": "Nm", "n.m": "Nm", "n·m": "Nm", "µm": "um", "μm": "um", "micron": "um", "microns": "um",
     "inch": "in", "inches": "in", '"': "in", "centimeter": "cm", "centimetre": "cm", "°c": "degC", "celsius": "degC",
-    "kelvin": "K", "Grad": "deg", "gradi": "deg", "grados": "deg", "graus": "deg", "degrés": "deg", "度": "deg",
-    "毫米": "mm", "ミリ": "mm", "gons": "gon",
+    "kelvin": "K", "Grad": "deg", "gradi": "deg", "grados": "deg", "graus": "deg", "degrés": "deg", "graden": "deg",
+    "derece": "deg", "град": "deg", "рад": "rad", "度": "deg", "도": "deg", "мм": "mm", "毫米": "mm", "gons": "gon",
 }  # fmt: skip
 """Units as they are spelled in headers; a small grad may be a gon."""
 UNIT_SIGNS = frozenset(map(str.lower, [*UNITS, *SPELLED, "in", "cm", "gon", "-", "s", "1"]))
@@ -227,6 +227,7 @@ IN_A_NAME = (
     re.compile(r"(.+?)\s*/\s*(\S+)"),
     re.compile(r"(.+?)\s+in\s+(\S+)"),
     re.compile(r"(.+)[\s_]+([^\s_]+)"),
+    re.compile(r"(.*[\dxyzXYZ])(mm|deg|rad)"),
 )
 
 
@@ -282,7 +283,7 @@ def split(name: str) -> tuple[str, str]:
     """
     stem, unit = split_unit(name)
     if unit:
-        return stem, name[len(stem) + 1 :]
+        return stem, "degC" if name == CELSIUS else name[len(stem) + 1 :]
     if len(name) <= LONGEST:
         for pattern in IN_A_NAME:
             match = pattern.fullmatch(name)

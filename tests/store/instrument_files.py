@@ -19,6 +19,7 @@ from tests.store.raw_files import (
     LABELS,
     METRES,
     NAMED,
+    ORDER,
     POINTS,
     RADIANS,
     ROWS,
@@ -356,6 +357,22 @@ STRANGERS: dict[str, Shape] = {
     "subscripts": one(text([["label", *(f"θ{i} (°)" for i in "₁₂₃₄₅₆"), *HEAD[7:]]], ROWS)),
     "capitals": one(text([["POINT_ID", *joint_names("JOINT_{}_DEG"), *(f"MEAS_{a}_MM" for a in "XYZ")]], ROWS)),
     "units of many letters in a row": one(text([BARE, ["", *["degrees"] * 6, *["millimeters"] * 3]], ROWS)),
+    "a language that no list has": one(
+        text([["Nokta", *joint_names("Eksen {} [derece]"), *HEAD[7:]]], ROWS, ";", comma=True)
+    ),
+    "units without a gap": one(text([["point", *joint_names("axis{}deg"), "Xmm", "Ymm", "Zmm"]], ROWS)),
+    "a column of temperatures under our name": one(
+        text([[*HEAD, "temperature_C"]], beside(ROWS, [["21.5"]] * COUNT))
+    ),
+    "JSON lines of ROS, joints by the alphabet": one(
+        "".join(
+            json.dumps({
+                "joints": {"name": [UR_JOINTS[i] for i in ORDER], "position": [float(q[i]) for i in ORDER]},
+                "point": {"x": float(p[0]), "y": float(p[1]), "z": float(p[2])},
+            }) + "\n"
+            for q, p in zip(RADIANS, METRES, strict=True)
+        ), "raw.jsonl", units="m",
+    ),
     "units above the header": one("Cell 7\nUnits: mm, deg\n\n" + text([BARE], ROWS, "\t"), "raw.txt"),
     "units in the cells, decimal commas": one(text([BARE], WITH_UNITS, ";", comma=True)),
     "the robot's own position beside the measured one": one(

@@ -88,7 +88,7 @@ KINDS = {
                          "teorico", "理论"}),
     "measured": frozenset({"measured", "meas", "measurement", "actual", "act", "ist", "tracker", "leica", "observed",
                           "istwert", "messwert", "gemessen", "mesuré", "mesurée", "misurato", "misurata", "medido",
-                          "medida", "实测"}),
+                          "medida", "gemeten", "实测"}),
 }  # fmt: skip
 """Words of a name that say whether it was measured, wanted or computed from others."""
 TURNS = (

@@ -167,9 +167,12 @@ def _by_joints(q: Array) -> np.ndarray:
     """Return the number of every row's configuration by equal joint values (N, p, dof)."""
     joints = q.reshape(len(q), -1)
     first, which = np.unique(joints[:, 0], return_inverse=True)
-    if len(first) == len(joints):  # then it alone decides the order, too; to sort numbers is ten times quicker
+    if len(first) == len(joints):  # then it alone decides the order, too
         return which
-    return np.unique(joints, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
+    others = np.any(np.diff(joints[order], axis=0) != 0, axis=1)
+    which[order] = np.concatenate([[0], np.cumsum(others)])
+    return which
 
 
 def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[str]) -> tuple[Block, ...]:

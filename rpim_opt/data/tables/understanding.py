@@ -160,6 +160,7 @@ def _readings(
     read.update(_from_one(read, dof))
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}):
         read.update(_without_prefix(read, stems, joints, options.prefix))
+    read.update(_counted(read, robot))
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "a row each, with a column marker")
@@ -279,6 +280,22 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     if len(whole) > 1:
         raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
     return next(iter(whole.values()), {})
+
+
+def _counted(read: Readings, robot: Robot) -> Readings:
+    """Return the joints where a word of whatever language is counted from 1 in their units, and none are known."""
+    if any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
+        return {}
+    found: dict[str, Readings] = {}
+    for name, each in read.items():
+        match = re.fullmatch(r"(\D+?)_?([1-9]\d?)", each.stem)
+        if match and each.unit and not each.why:
+            why = f"'{match[1]}' counted from 1, in units of joints"
+            found.setdefault(match[1], {})[name] = Reading(f"q{match[2]}", each.unit, why, each.kind)
+    wanted = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    said = [{each.stem: dimension_of(each.unit) for each in of.values()} for of in found.values()]
+    whole = [of for of, stems in zip(found.values(), said, strict=True) if wanted.items() <= stems.items()]
+    return whole[0] if len(whole) == 1 else {}
 
 
 def _left_out(read: Readings, targets: bool) -> dict[str, str]:

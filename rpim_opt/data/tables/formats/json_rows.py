@@ -39,13 +39,19 @@ def _is_object(value: Any) -> bool:
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the values of an object with their names; lists of numbers stay together."""
-    if isinstance(value, Mapping):
-        stem, unit = split(prefix)
-        for name, part in value.items():
-            whole = f"{stem}.{name} [{unit}]" if unit else f"{prefix}.{name}"
-            yield from _flat(whole if prefix else name, part)
-    elif value is not None:
-        yield prefix, value
+    if not isinstance(value, Mapping):
+        if value is not None:
+            yield prefix, value
+        return
+    stem, unit = split(prefix)
+    joints = value.get("name")
+    for name, part in value.items():
+        if isinstance(joints, list) and isinstance(part, list) and part is not joints:
+            # ROS: lists of values beside one of names, in whatever order
+            yield from ((f"/{prefix}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
+            continue
+        whole = f"{stem}.{name} [{unit}]" if unit else f"{prefix}.{name}"
+        yield from _flat(whole if prefix else name, part)
 
 
 FORMATS = (TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),)
