@@ -198,12 +198,7 @@ def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress
     from rich.console import Console
 
     console = Console(stderr=True)
-    columns = (
-        progress.TextColumn(name),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeRemainingColumn(),
-    )
+    columns = (name, progress.BarColumn(), progress.MofNCompleteColumn(), progress.TimeRemainingColumn())
     drawable = console.is_jupyter and find_spec("ipywidgets") is not None  # which rich asks for, with a warning
     visible = wanted and (console.is_terminal or drawable)
     with progress.Progress(*columns, console=console, transient=True, disable=not visible) as bar:

@@ -35,6 +35,8 @@ from rpim_opt.robot.mdh import Robot
 TURNED = ("rx", "ry", "rz")
 """Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
+INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
+"""In the name of a coordinate that is not the robot's own; actual may be either."""
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
@@ -305,13 +307,14 @@ def _left_out(read: Readings, targets: bool) -> dict[str, str]:
     """
     why: dict[str, str] = {}
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
-    called_so = {each.stem for each in read.values() if each.kind == "measured"} & {"x", "y", "z"}
+    named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
+    by_instrument = named & {"x", "y", "z"}
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
     for name, each in list(read.items()):
         if each.kind == "derived":
             why[name] = "computed from others"
-        elif not each.kind and each.stem in called_so:
-            why[name] = "another column is called measured"
+        elif not each.kind and each.stem in by_instrument and not INSTRUMENT.search(name):
+            why[name] = "another column names the instrument"
         elif targets:
             if each.kind != "wanted" and each.stem in wanted:
                 why[name] = "it is not where the robot is to go"
