@@ -3,11 +3,11 @@ from .acceptance import Acceptance as Acceptance
 from .acceptance import accept as accept
 from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
-from .expected import Improvement as Improvement
-from .expected import improvement as improvement
 from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
+from .leverage import Improvement as Improvement
 from .leverage import Influence as Influence
+from .leverage import improvement as improvement
 from .leverage import influence as influence
 from .loop import Iteration as Iteration
 from .outcome import Prediction as Prediction

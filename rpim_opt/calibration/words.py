@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,12 @@ from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance
-from rpim_opt.calibration.verdict import Verdict
+from rpim_opt.calibration.verdict import Verdict, rms
 from rpim_opt.convex.select import disagreement
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameter_names import EXPANSION, is_joint_offset, of_session, own_name
 
@@ -26,11 +29,12 @@ MOST_ROWS, MOST_BOUNDS = 8, 5
 """Outlying rows and active bounds that are named one by one."""
 LAST_DIGIT = 1e-4
 """What tables of parameters show [mm, degree]."""
-NOISE_UNITS = {"position": ("mm", 1e3), "orientation": ("mrad", 1e3), "joint": ("mrad", 1e3)}
-"""Unit in which the robot's repeatability is said, and how many of it are one in SI."""
-WHERE = {"position": "in position", "orientation": "in orientation", "joint": "at the joints"}
-SESSION_UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}
-"""Unit in which session offsets are said, and its size in SI."""
+REPEATABILITY = {
+    "position": ("mm", "in position"),
+    "orientation": ("mrad", "in orientation"),
+    "joint": ("mrad", "at the joints"),
+}
+"""How the parts of the robot's repeatability are said."""
 DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",
     "ecc": "first harmonic of joints",
@@ -38,7 +42,7 @@ DEFLECTIONS = {
     "bend": "deflection of links under gravity",
 }
 """Model extensions whose scales are said as deflections of `EXPECTED` where these are largest."""
-MOVED = 10.0
+UNUSUAL = 10.0
 """Scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3."""
 MOST = 5
 """Unusual parameters and outliers that are named one by one."""
@@ -85,16 +89,13 @@ def parameter_table(result: Outcome) -> str:
 
 
 def _columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
-    head = ["parameter", "unit", "nominal", "identified", "deviation", "std"]
-    return head, [_cells(row) for row in parameter_rows(result) if family_of(row["name"]) != "transmission"]
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    std = "-"
-    if row["std"] is not None:
-        std = f"{row['std']:.4f}"
-    figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}", std]
-    return [row["name"], row["unit"], *figures]
+    cells = []
+    for row in parameter_rows(result):
+        if family_of(row["name"]) != "transmission":
+            figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
+            std = "-" if row["std"] is None else f"{row['std']:.4f}"
+            cells.append([row["name"], row["unit"], *figures, std])
+    return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
 
 
 def as_text(result: Outcome, verdict: Verdict) -> str:
@@ -228,15 +229,56 @@ def _bound(result: Outcome, held: Held) -> str:
 
 def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
     """Say which hyperparameters were estimated; parameters' names (n,), and z (n,) in units of the local scales."""
+    groups = []
+    deflections = []
+    for name, size in learned.sizes.items():
+        if name in DEFLECTIONS:
+            deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
+        elif name not in (*SESSIONS.values(), BASE, EXPANSION, "transmission"):
+            groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
+    curves = []
+    if learned.curves is not None:
+        curves.append(
+            f"{_figure(learned.curves.size, 1e3, 'mrad')}, length scale {learned.curves.length.value:.2g} rad"
+        )
+    robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
+    largest = max((size.value for size in robot.values()), default=0.0)
+    parts = []
+    for kind, size in robot.items():
+        if size.value > NEGLIGIBLE * largest:
+            unit, where = REPEATABILITY[kind]
+            parts.append(f"{_figure_or_bound(size, 1e3, unit)} {where}")
+    instrument = []
+    if "instrument" in learned.noise:
+        instrument.append(_figure_or_bound(learned.noise["instrument"], 1.0, "x the stated one"))
+    expansion = []
+    for name, stated, value in zip(names, learned.stated, z, strict=True):
+        if own_name(name) == EXPANSION and EXPANSION in learned.sizes:
+            per_kelvin = 1e6 * stated * learned.sizes[EXPANSION].value * value
+            expansion.append(f"{per_kelvin:.3g} um per metre and kelvin")
     lines = [
-        _scales(learned),
-        _transmission(learned),
-        *_noise(learned),
-        _sessions(learned, names),
-        _expansion(learned, names, z),
+        _said("Estimated prior scale", groups),
+        _said("Estimated scale of model extensions", deflections),
+        _said("Transmission error of joints (1 sigma)", curves),
+        _said("Robot repeatability (1 sigma)", parts),
+        _said("Measurement noise", instrument),
+        _said("Session offsets (1 sigma)", _sessions(learned, names)),
+        _said("Thermal expansion", expansion),
+        _model(learned),
     ]
-    lines += [_model(learned), *_unusual(learned, names, z), _excluded(learned)]
+    for name, ratio in learned.unusual(names, z, UNUSUAL)[:MOST]:
+        cause = ": an error of assembly or of its zero" if is_joint_offset(name) else ""
+        lines.append(f"{name} deviates by {ratio:.0f} prior standard deviations of its group{cause}.")
+    excluded = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out[:MOST]]
+    if len(learned.left_out) > MOST:
+        excluded[-1] += f" and {len(learned.left_out) - MOST} more"
+    if excluded:
+        lines.append(f"Excluded outliers: {', '.join(excluded)}.")
     return [line for line in [*lines, *learned.notes] if line]
+
+
+def _said(what: str, parts: Sequence[str]) -> str:
+    return f"{what}: {joined(parts)}." if parts else ""
 
 
 def _figure(size: Size, factor: float, unit: str) -> str:
@@ -253,50 +295,7 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
     return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
 
 
-def _scales(learned: Learned) -> str:
-    """Say the scales of groups; those of the base and of sessions have other sentences, or none."""
-    said = []
-    deflections = []
-    unit = "x the stated one"
-    for name, size in learned.sizes.items():
-        if name in DEFLECTIONS:
-            deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
-        elif name not in (*SESSIONS.values(), BASE, EXPANSION, "transmission"):
-            said.append(f"{name} {_figure(size, 1.0, unit)}")
-            unit = "x"
-    lines = []
-    if said:
-        lines.append(f"Estimated prior scale: {joined(said)}.")
-    if deflections:
-        lines.append(f"Estimated scale of model extensions: {joined(deflections)}.")
-    return " ".join(lines)
-
-
-def _transmission(learned: Learned) -> str:
-    if learned.curves is None:
-        return ""
-    size, length, _ = learned.curves
-    return f"Transmission error of joints (1 sigma): {_figure(size, 1e3, 'mrad')}, length scale {length.value:.2g} rad."
-
-
-def _noise(learned: Learned) -> list[str]:
-    """Say the robot's repeatability, and the instrument's noise where that was estimated."""
-    robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
-    largest = max((size.value for size in robot.values()), default=0.0)
-    said = []
-    for kind, size in robot.items():
-        if size.value > NEGLIGIBLE * largest:
-            unit, per_si = NOISE_UNITS[kind]
-            said.append(f"{_figure_or_bound(size, per_si, unit)} {WHERE[kind]}")
-    lines = []
-    if said:
-        lines.append(f"Robot repeatability (1 sigma): {joined(said)}.")
-    if "instrument" in learned.noise:
-        lines.append(f"Measurement noise: {_figure_or_bound(learned.noise['instrument'], 1.0, 'x the stated one')}.")
-    return lines
-
-
-def _sessions(learned: Learned, names: tuple[str, ...]) -> str:
+def _sessions(learned: Learned, names: tuple[str, ...]) -> list[str]:
     """Say the standard deviation of session offsets, a coordinate and an axis."""
     said = []
     for dimension, group in SESSIONS.items():
@@ -307,22 +306,8 @@ def _sessions(learned: Learned, names: tuple[str, ...]) -> str:
             s for name, s in zip(names, learned.stated, strict=True)
             if of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn
         )  # fmt: skip
-        unit, si = SESSION_UNITS[dimension]
-        said.append(_figure_or_bound(learned.sizes[group], scale / si, unit))
-    if not said:
-        return ""
-    return f"Session offsets (1 sigma): {joined(said)}."
-
-
-def _expansion(learned: Learned, names: tuple[str, ...], z: Array) -> str:
-    """Say the thermal expansion of lengths."""
-    said = []
-    for name, stated, value in zip(names, learned.stated, z, strict=True):
-        if own_name(name) == EXPANSION and EXPANSION in learned.sizes:
-            said.append(f"{1e6 * stated * learned.sizes[EXPANSION].value * value:.3g} um per metre and kelvin")
-    if not said:
-        return ""
-    return f"Thermal expansion: {joined(said)}."
+        said.append(_figure_or_bound(learned.sizes[group], 1e3 * scale, "mrad" if turn else "mm"))
+    return said
 
 
 def _model(learned: Learned) -> str:
@@ -330,32 +315,10 @@ def _model(learned: Learned) -> str:
         return ""
     gains = {family: learned.gain(family) for trial in learned.trials for family in trial.families}
     supported = [f"{family} {gain:.0f}" for family, gain in gains.items() if gain is not None and gain >= 0.5]
-    evidence = ""
-    if supported:
-        evidence = f" (-2 ln L falls by {joined(supported)})"
+    evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
     if not learned.families:
         return f"Model: geometry alone; the data support no model extension{evidence}."
     return f"Model: geometry with {joined(learned.families)}{evidence}."
-
-
-def _unusual(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
-    lines = []
-    for name, ratio in learned.unusual(names, z, MOVED)[:MOST]:
-        cause = ""
-        if is_joint_offset(name):
-            cause = ": an error of assembly or of its zero"
-        lines.append(f"{name} deviates by {ratio:.0f} prior standard deviations of its group{cause}.")
-    return lines
-
-
-def _excluded(learned: Learned) -> str:
-    if not learned.left_out:
-        return ""
-    named = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out[:MOST]]
-    text = f"Excluded outliers: {', '.join(named)}"
-    if len(learned.left_out) > MOST:
-        text += f" and {len(learned.left_out) - MOST} more"
-    return f"{text}."
 
 
 # --- tables -----------------------------------------------------------------------------------------------------
@@ -386,3 +349,126 @@ def frame_rows(result: Outcome, what: str) -> list[dict[str, Any]]:
     if what not in FRAMES:
         raise InputError("to_frame", f"'{what}'", choices(what, FRAMES))
     return FRAMES[what](result)
+
+
+MOST_POINTS = 20
+"""Points of a table; of others one row says how many there are."""
+HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
+
+
+# --- cameras ----------------------------------------------------------------------------------------------------------
+
+
+def camera_remarks(result: Outcome) -> list[str]:
+    """Return remarks on a camera's views; nothing where there are none."""
+    if not camera_blocks(result.problem.sample().data):
+        return []
+    from rpim_opt.calibration.leverage import improvement  # which no other measurement asks for
+
+    before, after = (rms(errors(dimension="pixel")) for errors in (result.nominal_errors, result.errors))
+    remarks = [
+        f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; in millimetres, the distance of the "
+        "line of sight from the point. It measures how well views agree, not how well the robot is identified."
+    ]
+    found = improvement(result)
+    if found is None:
+        remarks.append("This result does not determine the expected position error of the flange.")
+    else:
+        remarks.append(
+            "Expected position error of the flange over its joint ranges, base and tool fitted: "
+            f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % of it within "
+            f"{1e3 * found.within:.3g} mm along any axis)."
+        )
+        if not found.improves:
+            remarks.append(
+                "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the "
+                "board nearer or larger, or an instrument that measures positions would."
+            )
+    if not any("stretch" in name for name in result.problem.parameters.free.names):
+        remarks.append(
+            "Views do not identify the size of the board: an error of it scales the robot by the same factor "
+            "(identify board_stretch_x and board_stretch_y where it was printed)."
+        )
+    return remarks
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+
+class Scatter(NamedTuple):
+    """How far the touches of a point or plane are from it: RMS before and after calibration, and the largest [m]."""
+
+    name: str
+    touches: int
+    nominal: float
+    identified: float
+    largest: float
+
+    def content(self) -> dict[str, Any]:
+        """Return the figures [mm]."""
+        lengths = {"nominal_rms_mm": self.nominal, "rms_mm": self.identified, "max_mm": self.largest}
+        return {"name": self.name, "count": self.touches, **{key: 1e3 * value for key, value in lengths.items()}}
+
+
+def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
+    """Return the scatter of every point or plane that rows touched, the worst first, from errors (N,) [m]."""
+    found = []
+    for name, rows in _touched(data):
+        before = float(np.sqrt(np.mean(nominal[rows] ** 2)))
+        after = float(np.sqrt(np.mean(error[rows] ** 2)))
+        found.append(Scatter(name, len(rows), before, after, float(error[rows].max())))
+    return tuple(sorted(found, key=lambda each: -each.identified))
+
+
+def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield every point or plane by name, with the rows that touched it: with any tool, of any robot."""
+    rows: dict[str, list[int]] = {}
+    for block in data.blocks:
+        if block.measurement.touching and block.touched is not None:
+            for name, row in zip(block.touched[:, 0], block.row, strict=True):
+                rows.setdefault(name, []).append(int(row))
+    for name, of in rows.items():
+        yield name, np.array(of)
+
+
+def scatter_rows(found: Sequence[Scatter]) -> list[list[str]]:
+    """Return the rows of a table [mm] under `HEADER`: the worst points, and how many others there are."""
+    rows = []
+    for each in found[:MOST_POINTS]:
+        lengths = (each.nominal, each.identified, each.largest)
+        rows.append([each.name, str(each.touches), *(f"{1e3 * value:.3f}" for value in lengths)])
+    others = found[MOST_POINTS:]
+    if others:
+        largest = max(each.largest for each in others)
+        rows.append(
+            [f"{len(others)} others", str(sum(each.touches for each in others)), "", "", f"{1e3 * largest:.3f}"]
+        )
+    return rows
+
+
+def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
+    """Say of which points that rows touched the calibration has touches of its own: those are not held out."""
+    known = {name for name, _ in _touched(problem.data)}
+    both = [name for name, _ in _touched(data) if name in known]
+    if not both:
+        return []
+    return [f"Not held out: the calibration has touches of {listed(both)}, too."]
+
+
+def contact_remarks(problem: CalibrationProblem) -> list[str]:
+    """Return remarks on errors of touches; nothing where there are none."""
+    if problem.touches is None:
+        return []
+    nearest = []
+    if not all(problem.touches.planar):
+        nearest.append("the mean of all touches of its point")
+    if any(problem.touches.planar):
+        nearest.append("the plane that fits all touches of it best")
+    said = f"Error of a touch: the distance of the tool from {', or '.join(nearest)}, as the model has them"
+    tells = "how well the robot returns there"
+    if len(problem.arms) > 1:
+        tells = "how well the robots meet and return there"
+    remarks = [f"{said}. Their positions were not measured: the error is {tells} from all sides."]
+    if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
+        remarks.append("No distance is known: the size of the robot rests on its nominal lengths alone.")
+    return remarks

@@ -20,10 +20,9 @@ from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import Acceptance
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
-from rpim_opt.calibration.remarks import HEADER, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.calibration.words import turned_frames, weight_lines
+from rpim_opt.calibration.words import HEADER, scatter, scatter_rows, turned_frames, weight_lines
 from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.rules.selection import Selection, weight_grid

@@ -11,9 +11,8 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, percent, table
 from rpim_opt.calibration.lack_of_fit import judged
-from rpim_opt.calibration.remarks import camera_remarks, contact_remarks, known_points
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.words import turned_frames, weight_lines
+from rpim_opt.calibration.words import camera_remarks, contact_remarks, known_points, turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.data.record import Requirement

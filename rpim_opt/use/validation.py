@@ -14,9 +14,9 @@ from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import judged
-from rpim_opt.calibration.remarks import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal
+from rpim_opt.calibration.words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.data.dataset import Dataset
 
 

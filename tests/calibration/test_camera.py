@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.units import split_unit
-from rpim_opt.calibration.remarks import camera_remarks
+from rpim_opt.calibration.words import camera_remarks
 from rpim_opt.report.report import write_report
 from rpim_opt.report.summary import summary
 from rpim_opt.store.problem_file import problems_folder

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.remarks import scatter
+from rpim_opt.calibration.words import scatter
 from rpim_opt.problem.registration.frames import met
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
