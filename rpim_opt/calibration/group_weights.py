@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.registration.frames import relocated
+from rpim_opt.robot.parameters import Parameters
 
 SAME, NEARLY = 1e-3, 1e-2
 """Weights have settled when their logarithms change by no more than the first; a note is given above the second."""
@@ -120,10 +122,11 @@ def grouped(
         selection = replace(selection, groups={**selection.groups, **used})
         if change > NEARLY:
             notes.insert(0, f"The weights of groups did not settle in {MOST_ROUNDS} rounds: the last ones are used.")
-    table = problem.parameters
-
-    def again(other: Source) -> Calibration:
-        other = other.with_parameters(table)  # those of a result have the weights in their scales
-        return grouped(other, formulation, weights, prior=prior, options=replace(options, progress=None))
-
+    how = {"formulation": formulation, "weights": weights, "prior": prior, "options": replace(options, progress=None)}
+    again = partial(_again, table=problem.parameters, **how)
     return replace(result, selection=selection, message=" ".join([result.message, *notes]), asked=again)
+
+
+def _again(problem: Source, *, table: Parameters, **how: Any) -> Calibration:
+    """Ask the same of other rows; the parameters of a result have the weights in their scales."""
+    return grouped(problem.with_parameters(table), **how)

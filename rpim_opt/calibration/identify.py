@@ -177,9 +177,11 @@ def calibrate(
 
 def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:
     """Return a calibration of problems whose joints are mapped already, which says so."""
-    if mapping is None:
-        return asked
-    return lambda problem: replace(asked(problem), mapping=mapping)
+    return asked if mapping is None else partial(_mapped, mapping, asked)
+
+
+def _mapped(mapping: JointMapping, asked: Callable[[Source], Calibration], problem: Source) -> Calibration:
+    return replace(asked(problem), mapping=mapping)
 
 
 def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration], None]:
