@@ -83,9 +83,7 @@ def scalar(value: Any, where: str) -> Any:
     _require_numbers(expression, where)
     if not expression.is_convex():
         raise InputError(where, "a program that is not convex", f"CVXPY's DCP rules; {reason(expression)}")
-    if expression.shape == ():
-        return expression
-    return cp.reshape(expression, (), order="C")
+    return expression if expression.shape == () else cp.reshape(expression, (), order="C")
 
 
 def listed(value: Any, where: str) -> list[Any]:

@@ -33,8 +33,8 @@ DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
-FACES, FEWER_FACES = 8, 3
-"""Faces that are tried before Clarabel is asked for one; with variables besides z, where one costs as much as that."""
+FACES = 8
+"""Faces that are tried before Clarabel is asked for one."""
 
 
 class Canonical:
@@ -45,6 +45,7 @@ class Canonical:
     """
 
     order: np.ndarray  # of a box: the stated places of its rows, equations first
+    own = False  # whether the functions have variables of their own
 
     def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
         import cvxpy as cp
@@ -53,6 +54,7 @@ class Canonical:
 
         every = [objective, *constraints]
         stated = {v.id: v for e in every for v in e.variables()}
+        self.own = len(stated) - (variable.id in stated) > 0
         for v in stated.values():  # atoms ask for the value of what they are made of, and may get a stale one
             v.save_value(None)
         anchor = [] if variable.id in stated else [variable == cp.Variable(variable.shape)]
@@ -317,7 +319,8 @@ class Small:
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        if squares is None or self.loss is not None or not p.polyhedral or len(p.b) * p.size > DENSE:
+        faces = p.polyhedral and not p.own and len(p.b) * p.size <= DENSE  # own variables: Clarabel is quicker
+        if squares is None or self.loss is not None or not faces:
             return self._by_cones(squares, weight, A, b)[0]
         found = self._on_faces(squares, weight, self.face, self.near)
         if found is not None:
@@ -336,7 +339,7 @@ class Small:
         A = p.dense[0]
         inequalities = np.arange(p.zero, p.linear)
         seen: set[bytes] = set()
-        for _ in range(FACES if p.size == len(p.at) else FEWER_FACES):
+        for _ in range(FACES):
             if face.tobytes() in seen:
                 return None
             seen.add(face.tobytes())
@@ -385,6 +388,7 @@ class Small:
             if self._solver is None or attempt:
                 settings = clarabel_settings(attempt)
                 settings.chordal_decomposition_enable = d.semidefinite  # a sparse matrix: 30 times faster at 34 rows
+                settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
                 self._solver = clarabel.DefaultSolver(P, q * scale, matrix, bound, d.cones, settings)
             else:
                 self._solver.update(P=P.data, q=q * scale, A=matrix.data, b=bound)
@@ -394,6 +398,8 @@ class Small:
                 self._solver = None
             if status in SOLVED:
                 break
+            if status == "DualInfeasible" and self.loss is not None:  # too few rows of the loss
+                raise Unsolved(status)
         else:
             raise Unsolved(status)
         x, z, s = np.array(found.x), np.array(found.z) / scale, np.array(found.s)

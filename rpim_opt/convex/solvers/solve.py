@@ -14,6 +14,8 @@ from rpim_opt.convex.solvers.separable import FEW, Newton, OutsideDomain, Rows, 
 
 GENERATIONS = 40
 """Rounds of row generation before all rows are taken."""
+INACTIVE = 1e-6
+"""Part of the largest slope below which an entry of a loss is not active."""
 VIOLATED = 1e-8
 """Part of the largest entry by which an inequality of a left-out row may be missed."""
 
@@ -193,7 +195,10 @@ def _coupled(
         slope = np.zeros(len(rows.b))
         slope[rows.places(warm.working)] = point.slope
         more = _violated(canonical, owner, warm.working, v, point.rest)
-        if not len(more):
+        if not len(more):  # the next minimum begins with what is active, and the largest beside it
+            size = np.abs(entries(slope))
+            active = np.flatnonzero(size > INACTIVE * size.max())
+            warm.working = np.union1d(active, np.argsort(-np.abs(v))[: len(active) + n])
             return replace(point, slope=slope)
         warm.working = np.union1d(warm.working, more[: max(4 * n, len(warm.working))])
     return _all_rows(loss, rows, warm, weight, squares, damping)
