@@ -13,6 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import counted
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread, phase
 from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import Measurement
@@ -113,6 +114,9 @@ class PartitionedProblem(RobotModel):
         if self.compute is None:
             ours = all(isinstance(part, partial) and part.func in (read_data, _taken) for part in self.parts)
             object.__setattr__(self, "compute", on_all_cores if ours else map)
+
+    def _short(self) -> str:
+        return f"{counted(len(self.parts), 'block')}, the first {super()._short()}"
 
     @property
     def data(self) -> NoReturn:

@@ -214,7 +214,7 @@ def choose(
             share = np.maximum(weights, 1e-6)
             start = rng.choice(len(A), count, replace=False, p=share / share.sum())
         picked = np.sort(_exchanged(A, start, criterion, C, weights))
-        value = _value(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
+        value, _ = _criterion(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
         score = value if criterion in "DE" else -value
         if score > best:
             best, chosen = score, picked
@@ -268,24 +268,16 @@ def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:
     return np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)
 
 
-def _value(M: Array, criterion: str, C: Array) -> float:
-    if criterion == "D":
-        return float(np.linalg.slogdet(M)[1])
-    if criterion == "E":
-        return float(np.linalg.eigvalsh(M)[0])
-    return float(np.trace(np.linalg.solve(M, C)))
-
-
-def _slope(M: Array, criterion: str, C: Array) -> Array:
-    """Z such that tr(A_i Z A_i') is by how much the relaxed criterion gains from candidate i."""
-    if criterion == "D":
-        return np.asarray(np.linalg.inv(M), dtype=float)
+def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
+    """Return the value, and Z such that tr(A_i Z A_i') is by how much the relaxed criterion gains from candidate i."""
     if criterion == "E":
         values, vectors = np.linalg.eigh(M)
         power = (values[0] / values) ** (SMOOTH + 1)
-        return np.asarray((vectors * (power / power.sum())) @ vectors.T, dtype=float)
-    inverse = np.linalg.inv(M)
-    return inverse @ C @ inverse
+        return float(values[0]), np.asarray((vectors * (power / power.sum())) @ vectors.T, dtype=float)
+    inverse = np.asarray(np.linalg.inv(M), dtype=float)
+    if criterion == "D":
+        return float(np.linalg.slogdet(M)[1]), inverse
+    return float(np.sum(inverse * C.T)), inverse @ C @ inverse
 
 
 def _relaxed(
@@ -303,9 +295,9 @@ def _relaxed(
     power = {"D": 1.0, "E": 1.0 / (SMOOTH + 1)}.get(criterion, 0.5)
     for k in range(most):
         M = np.eye(n) + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
-        Z = _slope(M, criterion, C)
+        value, Z = _criterion(M, criterion, C)
         gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
-        value, most_gain = _value(M, criterion, C), float(np.sort(gain)[-count:].sum())
+        most_gain = float(np.sort(gain)[-count:].sum())
         if criterion == "E":
             bound = min(bound, 1.0 + most_gain)
         elif criterion == "D":

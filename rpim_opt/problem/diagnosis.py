@@ -428,10 +428,7 @@ def copied_rows(data: Dataset) -> Iterator[str]:
 
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:
-    """Say that rows that were excluded follow each other in time: what moved is the instrument, not one reading.
-
-    ``labels``: of the rows that were kept, which have to be in the order of their numbers for that to be known.
-    """
+    """Say that excluded rows follow each other, where the others' labels are in the order of their numbers."""
     numbers = {label: [int(part) for part in re.findall(r"\d+", label)] for label in (*labels, *left_out)}
     ordered = sorted(numbers, key=lambda label: numbers[label])
     if [label for label in ordered if label not in left_out] != list(labels):

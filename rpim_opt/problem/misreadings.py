@@ -29,22 +29,19 @@ ZERO_STEPS = 20
 """Steps of a fit of joint zeros, too."""
 
 
-def placed(robot: Robot, points: Points) -> Fit:
-    """Return where base and reflectors fit best, robot nominal: the only candidate's fit, of poses their positions."""
-    fit = _nominal(robot, points)
+def placed(robot: Robot, points: Points, steps: int = STEPS, zeros: bool = False) -> Fit:
+    """Return where base and reflectors fit best, joint zeros too if asked; of poses their positions."""
+    fit = fit_arms(robot, Candidates.of(robot, [points]), steps, zeros=zeros, robust=True)
     every = 1 if points.turns is None else 4
     return Fit(
         fit.modelled[0, ::every], fit.error[0, ::every], fit.cost[0], fit.base[0], fit.tools[0, ::every], fit.zero[0]
     )
 
 
-def _nominal(robot: Robot, points: Points) -> Fit:
-    return fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
-
-
 def misfit(robot: Robot, points: Points) -> float:
     """Return the error over the extent of the points, the RMS of the best three quarters; robot nominal."""
-    return float(rms(_nominal(robot, points))[0]) / points.extent
+    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
+    return float(rms(fit)[0]) / points.extent
 
 
 def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
@@ -297,8 +294,7 @@ def lost_row(problem: CalibrationProblem) -> Better | None:
     start, by = tries[int(np.argmin(size))]
     if not size.min() < BETTER * stated:
         return None
-    fit = fit_arms(robot, Candidates.of(robot, [moved(start, by)]), ZERO_STEPS, zeros=True, robust=True)
-    error = fit.error[0, :: 1 if points.turns is None else 4]
+    error = placed(robot, moved(start, by), ZERO_STEPS, zeros=True).error
     wrong = np.append(error > ROW_WRONG * np.median(error), False)
     first = start
     while wrong[start]:  # rows before the right start fit as they stand
