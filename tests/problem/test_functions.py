@@ -13,7 +13,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.row_functions import Kept, asked
 
 ZERO = 0.0
 COLUMNS = {"z": "length"}
@@ -172,19 +171,7 @@ def test_threads_get_the_serial_numbers() -> None:
     assert max(wrong) < 1e-15
 
 
-def test_a_kept_function_is_the_one_of_its_structure() -> None:
-    kept = Kept()
-    problem = heights(by_closure()[0])
-    one = replace(problem, asked=kept)
-    block = problem.data.blocks[0]
-    both = one.functions(block)
-    other = one.identifying(problem.parameters.identify(["base_z"]).identified)
-    assert other.functions(block)["jacobian"].size_in(0) == (1, 1)
-    assert one.functions(block) is both
-
-
 def test_a_wrong_number_of_components_is_named() -> None:
     wrong = ro.data.Measurement("height", lambda T: ca.vertcat(T[2, 3], 1), COLUMNS, components=COLUMNS)
     with pytest.raises(ro.InputError, match="height: found 2 components of the residual, accepted: 1"):
         heights(wrong).residual(np.zeros(2))
-    assert callable(asked)
