@@ -16,7 +16,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, counted, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.problem.design import Observability, combination, observe
 from rpim_opt.problem.misreadings import better_reading, lever_arms, misfit, placed
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
@@ -53,8 +52,6 @@ TOGETHER = 4
 """Excluded rows that follow each other, from which on something moved."""
 MOST_EQUATIONS = 3000
 """Equations up to which a change is looked for."""
-STATED = frozenset(kind.name for kind in KNOWN)
-"""Measurements that are statements of a drawing."""
 CLOSE = 0.05
 """Places that are nearer [m] say little of the scale."""
 
@@ -670,7 +667,8 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} directions are "
         "seen better than the scales say. Where the robot stands and how its first joint is counted no touch shows."
     )
-    known = {problem.labels[i] for b in problem.data.blocks if b.measurement.name in STATED for i in b.row}
+    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
+    known = {problem.labels[i] for block in drawn for i in block.row}
     alone = _scale(problem, problem.without(known).linearize(x).A)
     if alone is None:
         yield "All that was touched is in one place: the robot's scale is that of the drawing."
