@@ -78,13 +78,3 @@ def test_only_the_precisions_of_deviations_with_tails_change() -> None:
     assert np.allclose(change, np.diag(less), atol=1e-10)
     assert (np.abs(less[[1, 4]]) < 1e-10).all()
     assert ((less[heavy] > 0) & (less[heavy] <= (1 - 1 / MOST_WIDENED) / v[heavy] + 1e-10)).all()
-
-
-def test_units_do_not_matter() -> None:
-    rng = np.random.default_rng(2)
-    A = rng.normal(size=(4, 6))
-    h = A.T @ rng.normal(size=4)
-    unit = 10.0 ** rng.uniform(-4, 4, 6)
-    _, wide = widened(A.T @ A, h, np.ones(6), 3.0)
-    _, scaled = widened((A.T @ A) / np.outer(unit, unit), h / unit, unit, 3.0)
-    assert np.allclose(scaled, wide * np.outer(unit, unit), rtol=1e-6, atol=0)
