@@ -35,14 +35,34 @@ whether a limit is kept cannot be decided.
 """
 
 
+def _others() -> dict[str, Any]:
+    """Return commands that other packages have, as entry points by name."""
+    from importlib.metadata import entry_points
+
+    return {each.name: each for each in entry_points(group="rpim_opt.commands")}
+
+
 class Commands(TyperGroup):
-    """The commands with their first lines, which are wrapped and never cut."""
+    """The commands, those of other packages too (entry points ``rpim_opt.commands``), with whole first lines."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names."""
+        return [*super().list_commands(ctx), *sorted(_others())]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of a name; one of ours goes before another's."""
+        own = super().get_command(ctx, cmd_name)
+        if own is not None or cmd_name not in _others():
+            return own
+        alone = typer.Typer(rich_markup_mode=None)
+        alone.command(cmd_name)(_others()[cmd_name].load())
+        return typer.main.get_command(alone)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
-        helps = {name: self.commands[name].help or "" for name in self.list_commands(ctx)}
+        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text.partition("\n\n")[0]) for name, text in helps.items()])
+            formatter.write_dl([(name, (command.help or "").partition("\n\n")[0]) for name, command in commands])
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)

@@ -42,7 +42,7 @@ FLOORS: dict[str, set[str]] = {
 }
 """Third-party packages that a folder may import besides those for all; its place is its floor."""
 EVERYWHERE = {"numpy", "scipy"}
-TOP = {"cli": {"rich", "typer"}}
+TOP: dict[str, set[str]] = {"cli": {"rich", "typer"}, "__main__": set()}
 CORE = {
     "calibration",
     "data",

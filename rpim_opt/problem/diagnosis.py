@@ -48,8 +48,8 @@ MOST_PLACES = 40
 """Places of a change that are tried."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
-TOGETHER = 4
-"""Excluded rows that follow each other, from which on something moved."""
+TOGETHER, CHANCE_RUNS = 4, 0.05
+"""Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 MOST_EQUATIONS = 3000
 """Equations up to which a change is looked for."""
 CLOSE = 0.05
@@ -432,7 +432,11 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
         return
     at = np.array([i for i, label in enumerate(ordered) if label in left_out], dtype=int)
     for run in np.split(at, np.flatnonzero(np.diff(at) > 2) + 1):
-        if len(run) >= TOGETHER:
+        if len(run) < TOGETHER:
+            continue
+        # expected number of such runs of the other outliers, each within two rows of the last
+        share = (len(at) - len(run)) / max(len(ordered) - len(run), 1)
+        if len(at) * (1 - (1 - share) ** 2) ** (len(run) - 1) < CHANCE_RUNS:
             yield (
                 f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers, and follow each other: did "
                 "the instrument or the robot's foot move there? Calibrate the parts apart, or register the second anew."

@@ -11,6 +11,7 @@ import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
 from rpim_opt.calibration.causes import _in_table_order
 from rpim_opt.problem import inspect
+from rpim_opt.problem.diagnosis import left_out_together
 from rpim_opt.problem.misreadings import lost_row
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
@@ -200,6 +201,16 @@ def test_rows_that_were_left_out_together_are_an_instrument_that_moved() -> None
     last = np.arange(COUNT)[:, None] >= COUNT - 5
     causes = likely_causes(ro.calibrate(values(lambda y: y + last * [0.03, -0.02, 0.01])(problem)))
     assert any("did the instrument or the robot's foot move" in text for text in causes), causes
+
+
+def test_many_scattered_outliers_are_no_instrument_that_moved() -> None:
+    """Of 5,000 in 50,000 rows some dozens follow each other by chance."""
+    rng = np.random.default_rng(0)
+    out = rng.uniform(size=50_000) < 0.1
+    kept, left_out = ([f"P{i}" for i in np.flatnonzero(part)] for part in (~out, out))
+    assert not list(left_out_together(kept, set(left_out)))
+    kept = [label for label in kept if not 100 <= int(label[1:]) < 120]
+    assert len(list(left_out_together(kept, {*left_out, *(f"P{i}" for i in range(100, 120))}))) == 1
 
 
 def test_a_lost_reading_is_named_also_where_rows_are_held_out() -> None:

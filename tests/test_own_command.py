@@ -1,0 +1,68 @@
+"""The program from outside: a stranger's command, an interrupt while commands are loaded, folders left alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests import ROOT
+
+MINE = '''
+from pathlib import Path
+from typing import Annotated
+import typer
+import rpim_opt as ro
+
+def worst(problem: str, more: Annotated[int, typer.Option(help="How many.")] = 1) -> None:
+    """Name the rows of a problem that the nominal robot misses most.
+
+    By their labels.
+    """
+    data = ro.load(problem).problem
+    errors = data.errors([0.0] * len(data.parameters.free))
+    for row in errors.argsort()[::-1][:more]:
+        print(data.data.label[row])
+'''
+
+
+def run(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), **variables}
+    command = [sys.executable, "-m", "rpim_opt", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "mine.py").write_text(MINE)
+    about = tmp_path / "mine-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[rpim_opt.commands]\nworst = mine:worst\nrobots = mine:worst\n")
+    return tmp_path
+
+
+def test_a_command_of_another_package_is_one_function(folder: Path) -> None:
+    assert run(folder, "worst", "paper_arm", "--more", "2").stdout.split() == ["T2-9", "T2-8"]
+    said = run(folder, "--help").stdout
+    assert "Name the rows of a problem that the nominal robot misses most." in said
+    assert "ur5e" in run(folder, "robots").stdout  # ours go before others
+    assert run(folder, "worst", "no such problem").returncode == 2
+
+
+def test_an_interrupt_while_commands_are_loaded_is_one_word(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n")
+    done = run(tmp_path, "robots")
+    assert done.returncode == 128 + signal.SIGINT
+    assert done.stderr == "Interrupted.\n"
+
+
+def test_no_folder_for_temporary_files_or_caches_is_used(tmp_path: Path) -> None:
+    """A link that somebody planted in a shared one is not followed, since there is nothing to plant it for."""
+    places = {"TMPDIR": str(tmp_path), "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    assert run(tmp_path, "calibrate", "paper_arm", **places).returncode == 0
+    assert not list(tmp_path.iterdir())
