@@ -93,8 +93,12 @@ class Formulation(Brief):
         object.__setattr__(self, "penalty", named(self.penalty))
         if self.loss_over not in ("equation", "configuration"):
             raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
-        if not isinstance(self.constraints, tuple):
-            object.__setattr__(self, "constraints", _functions(self.constraints))
+        stated: Any = self.constraints
+        try:
+            object.__setattr__(self, "constraints", (stated,) if callable(stated) else tuple(stated))
+        except TypeError:
+            found = f"a {type(stated).__name__}"
+            raise InputError("constraints", found, "functions of z and the parameters, in a tuple") from None
         for key in ("loss", "penalty", "penalty_over"):
             function = getattr(self, key)
             if not callable(function) and (key == "loss" or function is not None):
@@ -113,16 +117,6 @@ class Formulation(Brief):
 
 def _called(function: Any) -> str:
     return str(getattr(function, "maker", "") or getattr(function, "__name__", type(function).__name__))
-
-
-def _functions(constraints: Any) -> tuple[Constraint, ...]:
-    if callable(constraints):
-        return (constraints,)
-    try:
-        return tuple(constraints)
-    except TypeError:
-        found = f"a {type(constraints).__name__}"
-        raise InputError("constraints", found, "functions of z and the parameters, in a tuple") from None
 
 
 def _is_ready(function: Any) -> bool:

@@ -23,7 +23,7 @@ from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
-from rpim_opt.convex.trust import Trusted, kept_equations, outlying
+from rpim_opt.convex.trust import Trusted
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
@@ -54,7 +54,7 @@ class Estimate(Brief):
 
     ``duals`` are multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the
     objective would fall if the constraint were loosened by one unit of the scales. ``status`` is CVXPY's word;
-    zero ``iterations``: a formula, or an active set.
+    zero ``iterations``: a formula, or an active set; ``slope`` (m,) is that of the loss where the solver tells it.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -75,6 +75,7 @@ class Estimate(Brief):
     status: str = OPTIMAL
     iterations: int = 0
     seconds: float = 0.0
+    slope: Array | None = field(default=None, repr=False)
 
     def _short(self) -> str:
         return f"{self.status} at weight {self.weight:.4g}: loss {self.loss:.4g}, penalty {self.penalty:.4g}"
@@ -368,11 +369,7 @@ class Program(Brief):
         every rule for the weight sees. With a squared loss it is that loss's. InputError as for `trust`.
         """
         trust = self.trust(z)
-        if trust is None:
-            return self.squared
-        which, count = self.model.members
-        lengths = self.norms(z)
-        return kept_equations(self.model, (lengths <= outlying(lengths, count))[which], trust.factor)
+        return self.squared if trust is None else trust(self.model, z)[0]
 
     # --- solutions -----------------------------------------------------------------------------------------------
 
@@ -487,21 +484,6 @@ class Program(Brief):
         found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
         return [found[weight] for weight in checked.tolist()]
 
-    def solve_with_slope(self, weight: float) -> tuple[Estimate, Array | None]:
-        """Return the solution of a loss that is no square, and the loss's slope (m,) where the solver tells it."""
-        weight = self._weight(weight)
-        if self.structure.joint:
-            return self.solve(weight), None
-        try:
-            found = minimum(self.structure.loss, self._rows, self._warm, weight, self._squares)
-        except Unsolved:
-            return self.solve(weight), None
-        slope = found.slope
-        if slope is not None and self.structure.order is not None:
-            slope = np.empty_like(slope)
-            slope[self.structure.order] = found.slope
-        return self._at(found.x[self.structure.canonical.at], weight), slope
-
     def derivative(self, estimate: Estimate) -> tuple[Array, Array]:
         """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e."""
         squares, n = Squares.of_factor(self.squared.triangle), self.structure.n
@@ -598,7 +580,11 @@ class Program(Brief):
         if weight == 0 and damping is None and not self.constrained:  # what the data do not see stays nominal
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)
-        return self._at(z, weight, self._duals(found), found.iterations)
+        slope = found.slope
+        if slope is not None and self.structure.order is not None:
+            slope = np.empty_like(slope)
+            slope[self.structure.order] = found.slope
+        return replace(self._at(z, weight, self._duals(found), found.iterations), slope=slope)
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""

@@ -76,17 +76,6 @@ class Answers:
     live: tuple[Any, Any, list[list[Any]]]
     predicts: bool
 
-    def like(self, other: Answers) -> bool:
-        """Whether the functions returned the same another time."""
-        stated = [[a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts] for a in (self, other)]
-        pairs: dict[int, int] = {}
-        for mine, its in ((self.z, other.z), (self.loss.variable, other.loss.variable)):
-            pairs |= {id(mine): id(its), id(its): id(mine)}
-        try:
-            return alike(stated[0], stated[1], pairs)
-        except ValueError:  # something that has no truth value: then they may differ
-            return False
-
 
 def answers(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Answers:
     """Call the functions of a formulation for so many equations."""
@@ -236,7 +225,17 @@ class Structure:
     def like(self, other: Structure) -> bool:
         """Whether the functions returned the same another time, for data of the same shape."""
         same = (self.n, self.equations) == (other.n, other.equations) and np.array_equal(self.groups, other.groups)
-        return same and not self._declared and self.answers.like(other.answers)
+        if self._declared or not same:
+            return False
+        both = self.answers, other.answers
+        mine, its = ([a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts] for a in both)
+        pairs: dict[int, int] = {}
+        for one, another in zip(*((a.z, a.loss.variable) for a in both), strict=True):
+            pairs |= {id(one): id(another), id(another): id(one)}
+        try:
+            return alike(mine, its, pairs)
+        except ValueError:  # something that has no truth value: then they may differ
+            return False
 
     # --- structure ---------------------------------------------------------------------------------------------
 

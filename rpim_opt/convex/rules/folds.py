@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.curve import l_curve
-from rpim_opt.convex.rules.scores import Rule, Squared, influence, linear_rule, penalty_of
+from rpim_opt.convex.rules.scores import Rule, Squared, influence, linear_rule
 from rpim_opt.convex.rules.selection import Score, Selection, edge, on_squares, searched, weight_grid, with_rows
 
 SOME = 6
@@ -174,7 +174,7 @@ def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray]
 def _left_out_error(program: Program) -> Score:
     """Return what gives `held_out_error` of configurations left out one by one, with little solving."""
     if program.closed_form and program.squared is program.model:
-        squares = _of_squares(Squared(program.squared, penalty_of(program), program.ridge))
+        squares = _of_squares(Squared.of(program))
         return lambda weights: np.sqrt(squares(weights) / len(program.model.b))
     if _approximates(program):
         predicted = _approximately(program)
@@ -307,12 +307,11 @@ def _of_influential(program: Program, weights: Array) -> Array:
     groups = np.unique(program.model.group)
     found = []
     for weight in weights:
-        estimate, slope = program.solve_with_slope(float(weight))
+        estimate = program.solve(float(weight))
         norms = program.norms(estimate.z)
-        if slope is None:
-            heard = np.arange(len(groups))
-        else:
-            size = program.model.norms(slope)
+        heard = np.arange(len(groups))
+        if estimate.slope is not None:
+            size = program.model.norms(estimate.slope)
             heard = np.flatnonzero(size > SILENT * size.max(initial=0.0))
         norms[heard] = Folds(program, list(groups[heard][:, None])).norms(np.array([weight]))[0]
         found.append(norms)

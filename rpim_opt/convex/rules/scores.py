@@ -36,15 +36,16 @@ class Squared:
     penalty: Quadratic
     form: Ridge
 
+    @classmethod
+    def of(cls, program: Program) -> Squared:
+        """Return those of a program, with the penalty |z|^2 where it has none."""
+        penalty = program.penalty_form or identity(program.model.A.shape[1])
+        return cls(program.squared, penalty, program.ridge)
+
     @property
     def spare(self) -> int:
         """Equations besides those that the directions without penalty take."""
         return self.model.equations - self.form.fixed
-
-
-def penalty_of(program: Program) -> Quadratic:
-    """Return the squared penalty of a program, |z|^2 where it has none."""
-    return program.penalty_form or identity(program.model.A.shape[1])
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def linear_rule(program: Program, rule: Rule) -> Selection:
         raise InputError(f"selector {rule.name}", found, accepted)
     if program.loss_form is None:
         program.trusted(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
-    squared = Squared(program.squared, penalty_of(program), program.ridge)
+    squared = Squared.of(program)
     weights = grid_of(squared.form)
     score_at = rule.score(squared)
     score = score_at(weights)
