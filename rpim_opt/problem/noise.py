@@ -58,20 +58,10 @@ class Scatter:
 class Stack:
     """Configurations with the same number k of equations: what divides their noise, one array each.
 
-    Parameters
-    ----------
-    index
-        (N, k) numbers of the equations.
-    instrument
-        (N, k, k) covariance as the rows state it [SI].
-    length, angle
-        (N, k) which equations are lengths, and which angles.
-    joint
-        (N, k, dof) slopes by the revolute joints' angles [SI]; (N, k, 0) where nobody asks. Where equations mix several
-        stops of the joints, dof columns a stop.
-    unit
-        (N, k, k) covariance of a unit scatter of every measured position where equations mix several, or a camera sees
-        several points of one; None where each has its own, 1 on the diagonal for lengths.
+    ``index`` (N, k) numbers of the equations; ``instrument`` (N, k, k) covariance as the rows state it [SI]; ``length``
+    and ``angle`` (N, k) which are such; ``joint`` (N, k, dof) slopes by the revolute joints' angles [SI], dof columns a
+    stop of the joints, none where nobody asks; ``unit`` (N, k, k) covariance of a unit scatter of every measured
+    position where equations mix several, or a camera sees several points of one, else None: 1 for lengths.
     """
 
     index: np.ndarray

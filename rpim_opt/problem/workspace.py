@@ -205,14 +205,11 @@ def postures_at(
 
 
 class Target(NamedTuple):
-    """What is to vanish at joint values: Newton's steps of least norm, in units u of the joints' ranges, lead there.
+    """What is to vanish at joint values: e (M, k) [m] of ``away`` at (M, dof) joint values of rows (M,).
 
-    ::
+    Newton's steps of least norm, in units u of the joints' ranges and ``within`` (dof, 2), lead there::
 
-        u <- u - G' (G G' + d)^-1 e,    G = de / du
-
-    ``away`` maps joint values (M, dof) and the numbers (M,) of their rows to e (M, k) [m]; no step leaves ``within``
-    (dof, 2), by default the ends alone keep the joints' limits; d is ``damping`` [m^2].
+        u <- u - G' (G G' + d)^-1 e,    G = de / du,    d the damping [m^2]
     """
 
     robot: Robot
