@@ -378,19 +378,15 @@ def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float,
         behind = chain[i + 1 :]
         alike = [each]
         for other in each.others:
-            tried = _changed(behind, other.change(changed)) if _as_many(each, other, changed) else None
-            if not behind or (tried is not None and float(misfits(robot, [tried])[0]) <= SAME * left):
+            tried = other.change(changed)
+            as_many = len(tried.row) == len(each.change(changed).row)  # the mistakes behind it are of so many rows
+            if not behind or (as_many and float(misfits(robot, [_changed(behind, tried)])[0]) <= SAME * left):
                 alike.append(other)
         same.append(alike)
         changed = each.change(changed)
     what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
     remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
     return Better(what, remedy, stated * points.extent, left * changed.extent)
-
-
-def _as_many(one: Reading, other: Reading, points: Points) -> bool:
-    """Return whether two readings leave as many rows: the mistakes behind them are of so many."""
-    return len(one.change(points).row) == len(other.change(points).row)
 
 
 def _changed(chain: Sequence[Reading], points: Points) -> Points:
