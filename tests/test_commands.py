@@ -204,7 +204,7 @@ def test_held_out_rows_are_whole_configurations_drawn_by_the_seed(monkeypatch, c
     assert split[0] == split[1] != split[2]
 
 
-def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, made, tmp_path) -> None:
+def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, capsys, made, tmp_path) -> None:
     """The result has both figures: of the fit that did not see them, and of the one that did."""
     whole = json.loads((made / "results" / "result.json").read_text())
     assert run(monkeypatch, "calibrate", str(made), "--no-use-validation", "--out", str(tmp_path)) == 0
@@ -212,6 +212,10 @@ def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, made, tmp_
     assert [each["identification"]["count"] for each in (whole, apart)] == [40, 32]
     assert whole["validation"] == apart["validation"] == whole["held_out"]["identified"]
     assert apart["held_out"] is None
+    for folder, used in ((made / "results", True), (tmp_path, False)):
+        capsys.readouterr()
+        assert run(monkeypatch, "validate", str(folder), str(made / "validation.csv")) == 0
+        assert ("8 of 8 rows of the validation set are identification rows" in capsys.readouterr().out) == used
 
 
 def test_every_guess_is_what_auto_means(cell, made) -> None:

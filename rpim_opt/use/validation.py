@@ -18,6 +18,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.diagnosis import shared_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +166,9 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     nominal = result.nominal_errors(data)
     error = result.errors(data)
     touched = scatter(data, nominal, error)
+    remarks = list(shared_rows(problem.data, data))
+    if touched:
+        remarks += [*contact_remarks(problem), *known_points(problem, data)]
     return Validation(
         data.label,
         nominal,
@@ -174,6 +178,6 @@ def validate(result: Calibration, data: Dataset) -> Validation:
         *judged(result, data),
         outside=result.outside(data),
         touched=touched,
-        remarks=(*contact_remarks(problem), *known_points(problem, data)) if touched else (),
+        remarks=tuple(remarks),
         mistake=misread(result, data),
     )
