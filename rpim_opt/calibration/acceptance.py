@@ -104,18 +104,14 @@ class Acceptance:
 
     Parameters
     ----------
-    requirement
-        The limit and the region.
-    verdict
-        ``"accepted"``: at every configuration of the region the bound is within the limit, and held-out rows bear it
-        out. ``"rejected"``: they miss oftener than chance allows, or the robot's repeatability at its least is above
-        the limit. ``"undecided"``: something is lacking, see ``reasons``.
+    requirement, verdict
+        The limit and the region; ``"accepted"``: at every configuration of the region the bound is within the limit,
+        and held-out rows bear it out. ``"rejected"``: they miss oftener than chance allows, or the robot's
+        repeatability at its least is above the limit. ``"undecided"``: something is lacking.
     reasons
         What rejects it, or what is lacking, a sentence each.
-    count
-        How many configurations of the region were drawn.
-    bound, typical
-        The largest bound of the region, and the median of those drawn [m]; None where there is none.
+    count, bound, typical
+        How many configurations of the region were drawn; the largest bound, and the median of those drawn [m].
     scatter
         What would be left of the largest bound if all parameters were known [m].
     worst, place
@@ -130,10 +126,6 @@ class Acceptance:
     >>> found = ro.calibration.accept(result, ro.data.Requirement(limit=1e-4))
     >>> print(found.verdict, f"{1e3 * found.bound:.2f} mm")
     accepted 0.08 mm
-    >>> print(found.sentences()[1])
-    Region: joints within the measured ranges.
-    >>> ro.calibration.accept(result, ro.data.Requirement(limit=5e-5)).content()["verdict"]
-    'undecided'
     """
 
     requirement: Requirement
