@@ -142,7 +142,7 @@ def _most_likely(
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
     """Return the optimum of curves and noise, those curves and their columns (m, c); None where no joint turned."""
     problem, data = models.whole, models.columns.data
-    slopes = np.zeros((len(data.y), problem.robot.dof))
+    slopes = np.zeros((len(data.y), len(problem.robot.joint_types)))
     for stack in data.stacks:
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]

@@ -192,7 +192,7 @@ def _length(problem: Source) -> float:
     """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
     longest = 0.0
     for robot in problem.arms.values():
-        sliding = np.array([kind == "prismatic" for kind in robot.joint_types])
+        sliding = np.array(robot.joint_dimensions) == "length"
         stroke = np.zeros(robot.dof)
         for part in problem.rows():
             for block in part.data.blocks:

@@ -342,9 +342,9 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         low, high = robot.limits[i]
         if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
             yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
-        if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[i]]:
+        if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
             yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are hardly seen."
-    turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
+    turning = [i for i, dimension in enumerate(robot.joint_dimensions) if dimension == "angle"]
     if turning:
         largest = np.abs(q[:, turning]).max()
         if largest > 4 * np.pi:
@@ -479,7 +479,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Say whether joint values are rounded so that this explains the RMS error [m] of a fit."""
     points = points_of(problem)
-    turning = np.array([kind == "revolute" for kind in problem.robot.joint_types])
+    turning = np.array(problem.robot.joint_dimensions) == "angle"
     if points is None or not turning.any():
         return
     arms = lever_arms(problem.robot, points.q, points.tools[0])[:, turning]

@@ -165,7 +165,7 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
     def of(what: str, remedy: str, M: Array) -> Reading:
         return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
-    turning = np.array([kind == "revolute" for kind in robot.joint_types])
+    turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
     for what, factor, remedy in (
         ("as degrees, not radians", np.pi / 180, "name the columns q1_deg, ... (--units deg)"),
@@ -415,7 +415,7 @@ def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
 
 def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
     """Return the best order of up to six turning joints."""
-    if robot.dof > 6 or len(set(robot.joint_types)) > 1:
+    if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
         return None
     readings = [
         Reading(
@@ -444,7 +444,7 @@ def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
         tried.append((f"a table in the {which} Denavit-Hartenberg convention", remedy, replace(robot, mdh=mdh)))
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
-        if ready.joint_types == robot.joint_types:
+        if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
             tried.append((f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready))
     size = [misfit(other, points) for _, _, other in tried]
     what, remedy, _ = tried[int(np.argmin(size))]

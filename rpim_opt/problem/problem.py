@@ -266,7 +266,7 @@ class CalibrationProblem(RobotModel):
     @property
     def joint_values(self) -> Array:
         """Joint values of the model at every row's first point, (N, dof) [rad or m]; zero for joints that it lacks."""
-        found = np.zeros(self.data.q.shape)
+        found = np.zeros((len(self.data.label), max(len(arm.mdh) for arm in self.arms.values())))
         for block in self.data.blocks:
             M = self.arms[block.robot].joint_map
             found[block.row, : len(M)] = block.q[:, 0] @ M.T
@@ -702,7 +702,7 @@ def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
     """
     return tuple(
         f"beta{i}"
-        for i in range(1, robot.dof)
+        for i in range(1, len(robot.mdh))
         if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
     )
 

@@ -338,6 +338,8 @@ def loads_in(robot: Robot, block: Block) -> list[Array]:
     N = len(block.y)
     found = [(block.q @ robot.joint_map.T).reshape(N, -1)]
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
+        if robot.dof < len(robot.mdh):
+            raise InputError("joint torques", "those of a robot with mimic joints", "a table without them")
         found.append((block.torque @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
     if block.payload is not None:
         found.append(block.payload.reshape(N, 1))

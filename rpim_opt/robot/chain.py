@@ -122,9 +122,12 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Ar
     return origins, before[-1] @ tool
 
 
-def require_same_arm(robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path) -> None:
+def require_same_arm(
+    robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path, joint_map: Array | None = None
+) -> None:
     """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints, or another drawing."""
-    if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, np.eye(len(joint_types))):
+    joint_map = np.eye(len(joint_types)) if joint_map is None else joint_map
+    if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, joint_map):
         found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")
         raise InputError("joints of the robot", found, f"those of the file, {', '.join(joint_types)}", file)
     deviation = np.abs(robot.mdh - table)
@@ -143,9 +146,10 @@ def without_beta(robot: Robot) -> Robot:
     Refused are a beta after the last joint, and axes so parallel that the four numbers lose more than 1e-9 m or rad.
     """
     table = robot.mdh
-    n = robot.dof
     if table[-1, 4]:
-        raise InputError("robot", f"beta{n} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint")
+        raise InputError(
+            "robot", f"beta{len(table)} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint"
+        )
     before = np.append(0.0, table[:-1, 4])
     origins = [numeric_link(beta=b) @ numeric_link(*row[:4]) for b, row in zip(before, table, strict=True)]
     origins[0] = numeric_link(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
@@ -153,7 +157,7 @@ def without_beta(robot: Robot) -> Robot:
     plain[0, :2] = table[0, :2]
     plain[:, 4] = 0.0
     result = replace(robot, mdh=plain)
-    q = np.random.default_rng(0).uniform(-1, 1, (20, n))
+    q = np.random.default_rng(0).uniform(-1, 1, (20, robot.dof))
     lost = float(np.abs(forward_kinematics(result, q) - forward_kinematics(robot, q)).max())
     if lost > 1e-9:
         raise InputError("robot", f"axes too nearly parallel (loses {lost:.1g})", "a table with beta", robot.name)

@@ -134,7 +134,7 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
     >>> ro.robot.gravity_torques(arm, np.array([[0.0, 0.0]])).round(3)  # 1 kg at 0.6 m, and at 0.2 m
     array([[-5.884, -1.961]])
     """
-    return _evaluated(robot, q, payload)[0].reshape(-1, robot.dof)
+    return _evaluated(robot, q, payload)[0].reshape(-1, len(robot.mdh))
 
 
 def moment_slopes(robot: Robot, q: Array) -> Array:
@@ -143,7 +143,7 @@ def moment_slopes(robot: Robot, q: Array) -> Array:
     z_i . (R_k e_a x g_hat) of the nominal arm at q (N, dof) of the controller; zero for k < i and for prismatic joints.
     A joint's deflection is the sum of these times the parameters ``bend{i}_{k}{a}`` [rad].
     """
-    return _evaluated(robot, q, None)[1].reshape(-1, robot.dof, robot.dof, 3)
+    return _evaluated(robot, q, None)[1].reshape(-1, len(robot.mdh), len(robot.mdh), 3)
 
 
 # Parameters beyond the table
@@ -152,8 +152,8 @@ def moment_slopes(robot: Robot, q: Array) -> Array:
 def _draws(robot: Robot) -> Array:
     """Return random joint values (DRAWS, dof): (-pi, pi), prismatic joints within limits or a metre."""
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (DRAWS, robot.dof))
-    for j, kind in enumerate(robot.joint_types):
-        if kind == "prismatic":
+    for j, dimension in enumerate(robot.joint_dimensions):
+        if dimension == "length":
             low, high = np.where(np.isfinite(robot.limits[j]), robot.limits[j], (0.0, 1.0))
             q[:, j] = low + (high - low) * (q[:, j] + np.pi) / (2 * np.pi)
     return q
@@ -171,14 +171,14 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def _bend_names(mdh: bytes, joint_types: tuple[str, ...], joint_map: bytes, gravity: Gravity) -> tuple[str, ...]:
-    dof = len(joint_types)
-    table, signs = (np.frombuffer(values).reshape(dof, -1) for values in (mdh, joint_map))
+    n = len(joint_types)
+    table, signs = (np.frombuffer(values).reshape(n, -1) for values in (mdh, joint_map))
     robot = Robot("", table, joint_types, signs, gravity=gravity)
     slopes = moment_slopes(robot, _draws(robot))
     names = []
-    for i in range(robot.dof):
+    for i in range(n):
         known: list[Array] = []
-        for k in range(i, robot.dof):
+        for k in range(i, n):
             for a, axis in enumerate(AXES):
                 v = slopes[:, i, k, a] - slopes[:, i, k, a].mean()
                 size = float(np.linalg.norm(v))
@@ -232,7 +232,7 @@ def family_scales(robot: Robot, names: Iterable[str]) -> Array:
     slopes = np.abs(moment_slopes(robot, q)).max(axis=0)
     scales = []
     for name in names:
-        term, i = term_of(name, robot.dof)
+        term, i = term_of(name, len(robot.mdh))
         largest = 1.0
         if term.name == "compliance":
             largest = torques[i - 1]

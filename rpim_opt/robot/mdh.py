@@ -142,12 +142,12 @@ class Robot(Brief):
     name
         What to call it.
     mdh
-        (dof, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad].
+        (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad].
     joint_types
         ``"revolute"`` or ``"prismatic"`` for every joint; all revolute by default.
     joint_map
-        (dof, dof), the identity by default: signs and couplings between the controller's
-        joint values and the model's (a FANUC counts joint 3 from the horizontal).
+        (n, dof), the identity by default: signs and couplings between the controller's joint values and the model's (a
+        FANUC counts joint 3 from the horizontal). Mimic joints have a row and no column: dof is less than n then.
     limits
         (dof, 2) lower and upper joint values of the controller [rad or m]; infinite where unknown.
     source
@@ -200,12 +200,14 @@ class Robot(Brief):
         right = len(types) == n and set(types) <= {"revolute", "prismatic"}
         require(right, "joint_types", repr(types), f"{n} times revolute or prismatic")
         joint_map = _frozen(self.joint_map if np.size(self.joint_map) else np.eye(n))
-        right = joint_map.shape == (n, n) and bool((np.abs(joint_map) <= LARGEST).all())
-        right = right and bool(abs(np.linalg.det(joint_map)) > 1e-9)
-        require(right, "joint_map", f"{joint_map.tolist()}", f"an invertible {n} x {n} matrix")
-        limits = _frozen(self.limits if np.size(self.limits) else np.tile([-np.inf, np.inf], (n, 1)))
-        right = limits.shape == (n, 2) and bool((limits[:, 0] < limits[:, 1]).all())
-        require(right, "limits", f"{limits.tolist()}", f"{n} pairs lower < upper")
+        right = joint_map.ndim == 2 and len(joint_map) == n >= joint_map.shape[1]
+        right = right and bool((np.abs(joint_map) <= LARGEST).all())
+        right = right and bool(np.linalg.det(joint_map.T @ joint_map) > 1e-18)
+        require(right, "joint_map", f"{joint_map.tolist()}", f"an invertible {n} x {n} matrix, or independent columns")
+        k = joint_map.shape[1]
+        limits = _frozen(self.limits if np.size(self.limits) else np.tile([-np.inf, np.inf], (k, 1)))
+        right = limits.shape == (k, 2) and bool((limits[:, 0] < limits[:, 1]).all())
+        require(right, "limits", f"{limits.tolist()}", f"{k} pairs lower < upper")
         masses = len(self.gravity.masses)
         require(masses in (0, n), "gravity", f"{masses} masses", f"{n}, one a joint")
         for name, value in (("mdh", mdh), ("joint_types", types), ("joint_map", joint_map), ("limits", limits)):
@@ -213,13 +215,23 @@ class Robot(Brief):
 
     @property
     def dof(self) -> int:
-        """Number of joints."""
-        return len(self.mdh)
+        """Number of the controller's joints."""
+        return self.joint_map.shape[1]
+
+    @property
+    def leading(self) -> tuple[int, ...]:
+        """The model's joint (from 0) of every joint of the controller: the first that moves as it does, and alone."""
+        n, k = self.joint_map.shape
+        if n == k:
+            return tuple(range(n))
+        unit = [np.flatnonzero((self.joint_map == column).all(axis=1)) for column in np.eye(k)]
+        moved = [np.flatnonzero(column) for column in self.joint_map.T]
+        return tuple(int((rows if len(rows) else other)[0]) for rows, other in zip(unit, moved, strict=True))
 
     @property
     def joint_dimensions(self) -> tuple[str, ...]:
-        """``"angle"`` for a revolute joint, ``"length"`` for a prismatic one."""
-        return tuple("angle" if kind == "revolute" else "length" for kind in self.joint_types)
+        """``"angle"`` for a revolute joint of the controller, ``"length"`` for a prismatic one."""
+        return tuple("angle" if self.joint_types[i] == "revolute" else "length" for i in self.leading)
 
 
 def _frozen(values: ArrayLike) -> Array:

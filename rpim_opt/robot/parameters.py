@@ -438,7 +438,7 @@ def _of_joints(robot: Robot) -> Iterator[Entry]:
     for i, row in enumerate(robot.mdh, start=1):
         for (column, dimension), value in zip(MDH_DIMENSION.items(), row, strict=True):
             yield f"{column}{i}", dimension, value, _usual(f"{column}{i}", dimension)
-    for i in range(1, robot.dof + 1):
+    for i in range(1, len(robot.mdh) + 1):
         for term in JOINT_TERMS:
             if i in term.places(robot.joint_types):
                 for name, entry in zip(term.names(i), term.entries, strict=True):

@@ -298,7 +298,7 @@ def _problem_text(
         **context,
         title=toml(arm.robot.name),
         measurement=toml(kind.name),
-        identify=toml(_patterns(names, arm.robot.dof)),
+        identify=toml(_patterns(names, len(arm.robot.mdh))),
         noise=list(noise.items()),
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),

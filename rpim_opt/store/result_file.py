@@ -513,7 +513,7 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
         wanted = "; ".join(map(str, stated)) or "none"
         accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
         raise InputError("key terms", "; ".join(map(str, given)) or "no term given", accepted)
-    curves = [transmission(curve) for curve in file.transmission if curve.joint <= robot.dof and not name]
+    curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
     return replace(robot, model=Model((*model.terms, *curves)))
 
 

@@ -45,7 +45,7 @@ class Arm(NamedTuple):
         loads: Loads,
     ) -> Arm:
         """Build the function from parameter values by name; gravity acts on the nominal ones."""
-        command = loads.symbols(robot.dof, 1)
+        command = loads.symbols(len(robot.joint_types), 1)
         y = ca.SX.sym("y", len(kind.columns))
 
         def value(name: str) -> float:
@@ -170,8 +170,8 @@ def joint_units(robot: Robot, equations: int) -> Array:
     unit = np.ones(robot.dof)
     if robot.dof > equations:
         span[~np.isfinite(span)] = 2 * np.pi
-        for kind in set(robot.joint_types):
-            alike = np.array([k == kind for k in robot.joint_types])
+        for dimension in set(robot.joint_dimensions):
+            alike = np.array(robot.joint_dimensions) == dimension
             unit[alike] = span[alike] / span[alike].min()
     return unit
 

@@ -267,9 +267,11 @@ HOSTILE = {
     "floating": (PLAIN.replace("continuous", "floating"), "joint 'j2', type: found 'floating'"),
     "planar": (PLAIN.replace("revolute", "planar"), "joint 'j1', type: found 'planar'"),
     "no type": (PLAIN.replace('type="revolute"', ""), "joint 'j1', type: found ''"),
-    "mimic": (
-        PLAIN.replace('<origin xyz="0.5 0 0"/>', '<mimic joint="j1" multiplier="-1"/>'),
-        "joint 'j2', mimic: found motion that follows joint 'j1'",
+    "mimic of nothing": (PLAIN.replace('<origin xyz="0.5 0 0"/>', '<mimic joint="j"/>'), "mimic: found no joint 'j'"),
+    "mimic of itself": (PLAIN.replace('<origin xyz="0.5 0 0"/>', '<mimic joint="j2"/>'), "does not follow this one"),
+    "mimic at rest": (
+        PLAIN.replace('<origin xyz="0.5 0 0"/>', '<mimic joint="j1" multiplier="0"/>'),
+        "joint 'j2', mimic multiplier: found 0",
     ),
     "too large": (b" " * (LARGEST_TEXT + 1), "bytes"),
 }  # fmt: skip
@@ -305,16 +307,25 @@ def test_links_are_found_or_listed(tmp_path: Path) -> None:
 
 
 def tree_urdf(seed: int) -> tuple[str, list[str]]:
-    """Return a random tree of 5 to 12 joints of all kinds, and its links; every leaf is held by a fixed joint."""
+    """Return a random tree of 5 to 12 joints of all kinds, some following others, and its links with fixed leaves."""
     rng = np.random.default_rng(seed)
     links = ["root"]
     joints = []
+    kinds: dict[str, str] = {}
 
     def add(kind: str, parent: str) -> str:
         child = f"{'tip' if kind == 'fixed' else 'L'}{len(links)}"
         xyz, rpy, axis = rng.normal(size=3), rng.uniform(-3, 3, 3), rng.normal(size=3)
         rest = f'<axis xyz="{text(axis)}"/><limit lower="-2" upper="1.5" effort="1" velocity="1"/>'
         name = f"J{len(links)}"
+        alike = [other for other, its in kinds.items() if (its == "prismatic") == (kind == "prismatic")]
+        if kind != "fixed":
+            if alike and rng.random() < 0.4:  # in a chain of them, too
+                factor, offset = rng.choice([-1, 1]) * rng.uniform(0.2, 2), rng.uniform(-1, 1)
+                rest += (
+                    f'<mimic joint="{rng.choice(alike)}" multiplier="{float(factor)!r}" offset="{float(offset)!r}"/>'
+                )
+            kinds[name] = kind
         joints.append(
             JOINT.format(kind=kind, name=name, parent=parent, child=child, xyz=text(xyz), rpy=text(rpy), rest=rest)
         )
@@ -330,13 +341,18 @@ def tree_urdf(seed: int) -> tuple[str, list[str]]:
 
 def between_links(path: Path, names: tuple[str, ...], base: str, tip: str, q: np.ndarray) -> np.ndarray:
     """Return T_base_tip (N, 4, 4) of joint values q (N, n) by name, from the transforms of both links from the root."""
+    elements = {each.get("name"): each for each in ElementTree.parse(path).getroot().findall("joint")}
+
+    def value(name: str) -> np.ndarray:
+        mimic = elements[name].find("mimic")
+        if mimic is not None:
+            return float(mimic.get("multiplier")) * value(mimic.get("joint")) + float(mimic.get("offset"))
+        return q[:, names.index(name)] if name in names else np.zeros(len(q))
+
     places = []
     for link in (base, tip):
-        moving = [j for j in joints_above(path, link) if j.get("type") != "fixed"]
-        columns = [names.index(j.get("name")) if j.get("name") in names else None for j in moving]
-        values = np.column_stack(
-            [np.zeros(len(q)) if c is None else q[:, c] for c in columns] or [np.zeros((len(q), 0))]
-        )
+        moving = [j.get("name") for j in joints_above(path, link) if j.get("type") != "fixed"]
+        values = np.array([value(name) for name in moving]).reshape(len(moving), len(q)).T
         places.append(urdf_kinematics(path, link, values))
     return np.linalg.inv(places[0]) @ places[1]
 

@@ -162,7 +162,7 @@ def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Loca
     register(modelled, y)  # refuses points on a line
     q = np.concatenate([block.q[:, 0] for block in seen]) @ robot.joint_map.T
     spread = np.full(len(places), TOOL_ERROR)
-    given = Candidates(q[None], y[None], marker[None], np.zeros((1, robot.dof)), places[None], places, spread)
+    given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
     fit = fit_arms(robot, given, QUICK_STEPS)
     if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
         return None

@@ -221,6 +221,8 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
     """Return the mapping that explains points, None where the nominal one does as well, or none does."""
     rng = np.random.default_rng(seed)
     n = robot.dof
+    if n < len(robot.mdh):  # a sign or zero of a joint would not say what follows it
+        return None
     turning = _turning(robot)
     few = points.evenly(FEW)
     base = Candidates.of(robot, [few])

@@ -157,7 +157,7 @@ class Candidates(NamedTuple):
         q, y, marker = (np.stack(each) for each in zip(*targets, strict=True))
         stated, spread = tries[0].stated
         tools = np.stack([points.stated[0] for points in tries])
-        return cls(q @ robot.joint_map.T, y, marker, np.zeros((len(y), robot.dof)), tools, stated, spread)
+        return cls(q @ robot.joint_map.T, y, marker, np.zeros((len(y), len(robot.mdh))), tools, stated, spread)
 
     def take(self, index: np.ndarray) -> Candidates:
         """Return the candidates at ``index``."""

@@ -125,8 +125,8 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     table = validate(_RobotTable, content, path)
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
-    if len(coupling) != dof or any(len(row) != dof for row in coupling):
-        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers", path)
+    if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
+        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or fewer alike", path)
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
@@ -139,15 +139,15 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
             gravity = Gravity(masses=masses, centres=centres)
         except InputError as error:
             raise error.within(path) from None
-    return Robot(
+    robot = Robot(
         name=table.name,
         mdh=np.array([[getattr(joint, column) for column in MDH] for joint in table.joint]),
         joint_types=tuple(joint.type for joint in table.joint),
         joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ np.array(coupling),
-        limits=np.array(limits, dtype=float),
         source=table.source,
         gravity=gravity_with(gravity, table.mounting, table.payload, path),
     )
+    return replace(robot, limits=np.array([limits[i] for i in robot.leading], dtype=float))
 
 
 # Reading
@@ -357,15 +357,16 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
 
 def _content(robot: Robot) -> dict[str, Any]:
     """Return the keys of ``robot.toml`` with which it reads back the same, zeros left out."""
+    n = len(robot.mdh)
     signs = np.diag(robot.joint_map)
-    plain = np.array_equal(robot.joint_map, np.diag(signs)) and set(np.abs(signs)) == {1.0}
+    plain = robot.dof == n and np.array_equal(robot.joint_map, np.diag(signs)) and set(np.abs(signs)) == {1.0}
     content: dict[str, Any] = {"name": robot.name}
     if robot.source:
         content["source"] = robot.source
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
-    joints = [_keys(robot, i) for i in range(robot.dof)]
-    for joint, sign in zip(joints, signs, strict=True):
+    joints = [_keys(robot, i) for i in range(n)]
+    for joint, sign in zip(joints, signs, strict=False):
         if plain and sign < 0:
             joint["sign"] = -1
     gravity = robot.gravity
@@ -386,9 +387,11 @@ def _keys(robot: Robot, i: int, in_si: bool = False) -> dict[str, Any]:
             joint[f"{column}_{unit}"] = number
     if robot.joint_types[i] != "revolute":
         joint["type"] = robot.joint_types[i]
-    if np.isfinite(robot.limits[i]).any():
-        unit, pair = exact(robot.joint_dimensions[i], robot.limits[i], in_si)
-        joint[f"limits_{unit}"] = pair
+    for j, limits in zip(robot.leading, robot.limits, strict=True):
+        if j == i and np.isfinite(limits).any():
+            dimension = "angle" if robot.joint_types[i] == "revolute" else "length"
+            unit, pair = exact(dimension, limits, in_si)
+            joint[f"limits_{unit}"] = pair
     if robot.gravity.masses:
         joint["mass_kg"] = robot.gravity.masses[i]
         joint |= _centre_keys(robot.gravity.centres[i], "centre_", in_si)

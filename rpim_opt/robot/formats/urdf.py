@@ -62,8 +62,8 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     ``path`` is a URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults
     (``rpim-opt[xacro]``); ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the
     base. An error names the file, the element, what was found and what is accepted: document types and entities, links
-    or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints or
-    mimic joints between base and tip, no or several candidates for base or tip.
+    or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
+    between base and tip, no or several candidates for base or tip.
 
     Examples
     --------
@@ -76,16 +76,22 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     steps = urdf.path_between(base, tip)
     joints = [step.joint for step in steps if step.joint.kind]
     table, T_base, T_tool, G = describe(_chain(urdf, steps))
+    names, joint_map, offsets = _followed(urdf, joints)
     T_top_base = np.linalg.inv(_product([step.constant for step in steps if step.up]))
     robot = Robot(
         name=urdf.name,
-        mdh=table,
+        mdh=table + offsets,
         joint_types=tuple(joint.kind for joint in joints),
-        limits=np.array([joint.limits for joint in joints]),
+        joint_map=joint_map,
+        limits=np.array([urdf.joints[name].limits for name in names]),
         source=f"{urdf.path.name}, {steps[0].start} to {steps[-1].end}",
         gravity=_masses(urdf, steps, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
     )
-    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), tuple(joint.name for joint in joints))
+    for name, i in zip(names, robot.leading, strict=True):
+        if joints[i].kind != urdf.joints[name].kind:
+            found = f"motion that follows joint '{name}' of another kind, which is not between base and tip"
+            raise joints[i].error("mimic", found, "a joint of its own kind, or on the way")
+    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), names)
 
 
 def write_urdf(
@@ -133,10 +139,12 @@ def write_urdf(
     steps = urdf.path_between(base, tip)
     chain = _chain(urdf, steps)
     table, T_base, T_tool, G = describe(chain)
-    require_same_arm(robot, table, tuple(step.joint.kind for step in steps if step.joint.kind), urdf.path)
+    joints = [step.joint for step in steps if step.joint.kind]
+    _, joint_map, offsets = _followed(urdf, joints)
+    require_same_arm(robot, table + offsets, tuple(joint.kind for joint in joints), urdf.path, joint_map)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
-    origins, tail = corrected(G, robot.mdh, T_base, T_tool)
+    origins, tail = corrected(G, robot.mdh - offsets, T_base, T_tool)
     size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
     for between, old, new in zip(_rigid_parts(steps), [*chain.origins, chain.tail], [*origins, tail], strict=True):
@@ -202,15 +210,26 @@ def _rigid_parts(steps: Sequence[_Step]) -> list[list[_Step]]:
 def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:
     """Return the geometry of the joints that move."""
     moving = [step for step in steps if step.joint.kind]
-    for step in moving:
-        mimic = [e.attributes.get("joint", "") for e in step.joint.element.every("mimic")]
-        if mimic:
-            raise step.joint.error("mimic", f"motion that follows joint '{mimic[0]}'", "joints that move on their own")
     if not moving:
         raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint", urdf.path)
     *origins, tail = [_product([step.constant for step in part]) for part in _rigid_parts(steps)]
     axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
     return Chain(np.array(origins), np.array(axes), tail)
+
+
+def _followed(urdf: _Urdf, joints: Sequence[_Joint]) -> tuple[tuple[str, ...], Array, Array]:
+    """Return the joints that others follow by name, the joint map (n, k), and offsets (n, 5) of theta and d.
+
+    A mimic joint is at multiplier times the followed joint's value plus offset, which the table's row takes.
+    """
+    motions = [urdf.followed(joint) for joint in joints]
+    names = tuple(dict.fromkeys(name for name, _, _ in motions))
+    joint_map = np.zeros((len(joints), len(names)))
+    offsets = np.zeros((len(joints), 5))
+    for i, (joint, (name, multiplier, offset)) in enumerate(zip(joints, motions, strict=True)):
+        joint_map[i, names.index(name)] = multiplier
+        offsets[i, 2 if joint.kind == "revolute" else 3] = offset
+    return names, joint_map, offsets
 
 
 # Elements
@@ -278,6 +297,19 @@ class _Joint:
         if kind not in KINDS:
             raise self.error("type", f"'{kind}'", f"{', '.join(KINDS)} between base and tip")
         return KINDS[kind]
+
+    @property
+    def mimic(self) -> tuple[str, float, float] | None:
+        """The joint that it follows, the multiplier and the offset [rad or m]; None for one that moves on its own."""
+        element = self._only("mimic")
+        if element is None:
+            return None
+        multiplier, offset = (
+            float(self._numbers("mimic", *each, 1)[0]) for each in (("multiplier", "1"), ("offset", "0"))
+        )
+        if not 0 < abs(multiplier) <= LARGEST_NUMBER:
+            raise self.error("mimic multiplier", f"{multiplier:g}", "a number that is not zero")
+        return element.attributes.get("joint", ""), multiplier, offset
 
     @cached_property
     def origin(self) -> Array:
@@ -382,6 +414,26 @@ class _Urdf:
         joints = self._to_root(link)
         count = next((i for i, joint in enumerate(joints, start=1) if joint.parent in known), None)
         return None if count is None else joints[:count]
+
+    @cached_property
+    def joints(self) -> dict[str, _Joint]:
+        """All joints by name."""
+        return {joint.name: joint for joint in self.above.values()}
+
+    def followed(self, joint: _Joint) -> tuple[str, float, float]:
+        """Return the joint that moves on its own and by which one moves: its name, and multiplier and offset."""
+        factor, offset = 1.0, 0.0
+        seen = [joint]
+        while (mimic := seen[-1].mimic) is not None:
+            name, multiplier, more = mimic
+            offset += factor * more
+            factor *= multiplier
+            if name not in self.joints:
+                raise seen[-1].error("mimic", f"no joint '{name}'", choices(name, self.joints))
+            if self.joints[name] in seen or not self.joints[name].kind:
+                raise seen[-1].error("mimic", f"joint '{name}'", "a joint that moves, and does not follow this one")
+            seen.append(self.joints[name])
+        return seen[-1].name, factor, offset
 
     def _root(self) -> str:
         roots = [link for link in self.links if link not in self.above]

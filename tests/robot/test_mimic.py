@@ -1,0 +1,79 @@
+"""Joints that follow others: calibrated, written into every file, and back into the URDF."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.robot.kinematics import numeric_frame
+from tests.robot.test_exchange import reach
+
+URDF = """<robot name="palletizer"><link name="base"/><link name="column"/><link name="lift"/><link name="upper"/>
+<link name="wrist"/><link name="tip"/>
+<joint name="turn" type="revolute"><parent link="base"/><child link="column"/><origin xyz="0 0 0.3"/>
+<axis xyz="0 0 1"/><limit lower="-2" upper="2"/></joint>
+<joint name="slide" type="prismatic"><parent link="column"/><child link="lift"/><origin xyz="0.1 0 0"/>
+<axis xyz="0 0 1"/><mimic joint="slide2" multiplier="0.5" offset="0.05"/></joint>
+<joint name="slide2" type="prismatic"><parent link="lift"/><child link="upper"/><origin rpy="0.3 0 0"/>
+<axis xyz="0 1 0"/><limit lower="0" upper="0.6"/></joint>
+<joint name="bend" type="revolute"><parent link="upper"/><child link="wrist"/><origin xyz="0.4 0 0" rpy="1.2 0 0"/>
+<axis xyz="0 0 1"/><mimic joint="turn" multiplier="-0.7" offset="0.2"/></joint>
+<joint name="flange" type="fixed"><parent link="wrist"/><child link="tip"/><origin xyz="0.3 0.1 0"/></joint></robot>
+"""
+
+
+@pytest.fixture
+def arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ro.robot.Described:
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(URDF)
+    return ro.read_urdf("arm.urdf")
+
+
+def test_what_the_controller_moves_is_fewer_than_the_table_has(arm: ro.robot.Described) -> None:
+    robot = arm.robot
+    assert (robot.dof, len(robot.mdh), arm.names) == (2, 4, ("turn", "slide2"))
+    assert robot.joint_dimensions == ("angle", "length")
+    assert robot.joint_map.tolist() == [[1, 0], [0, 0.5], [0, 1], [-0.7, 0]]
+    assert robot.limits.tolist() == [[-2, 2], [0, 0.6]]
+    for name in ("robot.toml", "robot.json"):
+        ro.robot.write_robot(robot, name)
+        again = ro.read_robot(name)
+        for what in ("mdh", "joint_map", "limits"):
+            assert np.array_equal(getattr(again, what), getattr(robot, what))
+
+
+def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: ro.robot.Described) -> None:
+    rng = np.random.default_rng(0)
+    robot = arm.robot
+    parameters = ro.robot.model_parameters(robot, arm.base, {"": arm.tool}).identify(["d3", "a4", "theta4"])
+    q = rng.uniform(*robot.limits.T, (40, 2))
+    truth = np.array([-0.002, 0.003, 0.001])
+    empty = ro.CalibrationProblem(robot, parameters, ro.Dataset.of(q, np.zeros((40, 3)), 1e-5))
+    y = empty.modelled(truth)[0] + 1e-6 * rng.normal(size=(40, 3))
+    problem = empty.on(ro.Dataset.of(q, y, 1e-5))
+    result = ro.calibrate(problem, ro.tikhonov, weight=1e-6)
+    assert np.abs(result.x - truth).max() < 1e-5
+    assert ro.problem.inspect(problem)
+    ro.store.save_result(result, "result.json")
+    assert np.array_equal(ro.load_result("result.json").robot.joint_map, robot.joint_map)
+    ro.use.export_urdf(result, "arm.urdf", "identified.urdf")
+    written = ro.read_urdf("identified.urdf")
+    identified = ro.use.identified(result)
+    assert np.abs(reach(written, q) - reach(replace(identified, base=arm.base), q)).max() < 1e-12
+    assert Path("identified.urdf").read_text().count("<mimic") == 2
+
+
+def test_commands_of_joints_that_others_follow_are_corrected(arm: ro.robot.Described) -> None:
+    rng = np.random.default_rng(1)
+    robot = arm.robot
+    q = rng.uniform(*robot.limits.T, (30, 2))
+    y = (numeric_frame(arm.base) @ ro.robot.forward_kinematics(robot, q) @ numeric_frame(arm.tool))[:, :3, 3]
+    problem = ro.problem_from(arm, ro.Dataset.of(q, y + 1e-3 * np.array([0, 0, 1]), 1e-4), ["d[12]"], base=arm.base)
+    result = ro.calibrate(problem)
+    corrected = ro.use.compensate(result, q[:5])
+    assert corrected.q.shape == (5, 2)
+    assert result.verdict
