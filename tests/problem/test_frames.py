@@ -188,25 +188,5 @@ def test_where_some_markers_do_not_tell_the_base_all_are_asked(monkeypatch: pyte
     whole = locate(ARM, data, tools)
     assert "closed forms" not in whole.how
     monkeypatch.setattr(located, "MOST_PLACING", 2)
-    asked = []
-    started = located._started
-    monkeypatch.setattr(located, "_started", lambda *given: asked.append(len(given[3])) or started(*given))
     some = locate(ARM, data, tools)
-    assert asked == [2, 24]
     assert np.array_equal(some.base, whole.base)
-
-
-def test_markers_that_turn_place_the_base_however_few_their_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    some = np.arange(5)
-    blocks = [ro.load("markers").problem.data.blocks[0], ro.load("pose").problem.data.blocks[0].take(some, some)]
-    monkeypatch.setattr(located, "MOST_PLACING", 1)
-    asked: list[set[str]] = []
-
-    def refused(*given: Any) -> None:
-        asked.append(given[3])
-        raise ro.InputError("the data", "asked", "nothing")
-
-    monkeypatch.setattr(located, "_started", refused)
-    with pytest.raises(ro.InputError, match="asked"):
-        located._certified(blocks, [np.zeros((25, 4, 4)), np.zeros((5, 4, 4))], {"A": np.zeros(6), "": np.zeros(6)})
-    assert asked == [{"A", ""}, {"A", ""}]

@@ -61,165 +61,160 @@ class Located(NamedTuple):
     how: str
 
 
+class _Rows(NamedTuple):
+    """Rows of positions and poses."""
+
+    q: Array  # (N, dof) of the controller
+    flange: Array  # (N, 4, 4) of the nominal robot
+    measured: Array  # (N, 4, 4); rotations of positions are NaN
+    marker: np.ndarray  # (N,) names
+    variance: Array  # (N, 2) of the instrument's position [m^2] and orientation [rad^2]
+
+    @property
+    def turned(self) -> np.ndarray:
+        return ~np.isnan(self.measured[:, 0, 0])
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (N, 2) of the instrument and of the nominal robot together."""
+        return np.sqrt(self.variance + NOMINAL_ERROR**2)
+
+    def take(self, index: np.ndarray) -> _Rows:
+        return _Rows(*(each[index] for each in self))
+
+    @classmethod
+    def of(cls, robot: Robot, data: Dataset, most: int) -> _Rows | None:
+        """Return positions and poses, of each block no more than so many rows, evenly spread; None for none."""
+        parts = []
+        for block in data.blocks:
+            if block.measurement.name not in ("position", "pose"):
+                continue
+            count = len(block.row)
+            rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+            some = block.take(rows, rows)
+            T = np.tile(np.eye(4), (len(rows), 1, 1))
+            T[:, :3, :3] = np.nan
+            T[:, :3, 3] = some.y[:, :3]
+            variance = np.zeros((len(rows), 2))
+            variance[:, 0] = np.trace(some.covariance[:, :3, :3], axis1=1, axis2=2) / 3
+            if block.measurement.name == "pose":
+                T = transforms(some.y)
+                variance[:, 1] = np.trace(some.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+            q = some.q[:, 0]
+            parts.append((q, forward_kinematics(robot, q), T, np.full(len(rows), block.markers[0]), variance))
+        return cls(*map(np.concatenate, zip(*parts, strict=True))) if parts else None
+
+
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
 
     All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where that does
     not determine the rotations, closed forms say what they can.
     """
-    seen = _positions(data, ENOUGH)
-    if not seen:
+    rows = _Rows.of(robot, data, ENOUGH)
+    if rows is None:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
     places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
-    flanges = [forward_kinematics(robot, block.q[:, 0]) for block in seen]
     try:
-        return _certified(seen, flanges, places)
+        start = _certified(rows, places)
     except InputError as error:
-        return _closed_forms(seen, flanges, places, error.found)
+        return _closed_forms(rows, places, error.found)
+    base = start.bases[""]
+    for marker, place in places.items():
+        if marker in start.tools:
+            place[:3] = start.tools[marker][:3, 3]
+        else:  # where its positions are least off, seen from the base
+            own = rows.take(rows.marker == marker)
+            T = base @ own.flange
+            there = np.einsum("nji,nj->ni", T[:, :3, :3], own.measured[:, :3, 3] - T[:, :3, 3])
+            precision = own.sigma[:, 0] ** -2
+            total = place[:3] * TOOL_ERROR**-2 + precision @ there
+            place[:3] = total / (TOOL_ERROR**-2 + precision.sum())
+    _turn(places, base, rows)
+    verdict = "certified" if start.certified else "not certified"
+    return Located(frame_numbers(base), places, f"{verdict}: {start.reason}")
 
 
-def _positions(data: Dataset, most: int) -> list[Block]:
-    """Return the blocks of positions and poses, of each no more than so many rows, evenly spread."""
-    found = []
-    for block in data.blocks:
-        if block.measurement.name in ("position", "pose"):
-            count = len(block.row)
-            rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-            found.append(block.take(rows, rows))
-    return found
-
-
-def _certified(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]) -> Located:
+def _certified(rows: _Rows, places: Mapping[str, Array]) -> CertifiedStart:
     """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
-    rows = Counter(block.markers[0] for block in seen for _ in block.row)
-    posed_rows = Counter(b.markers[0] for b in seen if b.measurement.name == "pose" for _ in b.row)
-    turning = {marker for marker, _ in posed_rows.most_common(MOST_TURNING)}
-    some = turning | {marker for marker, _ in rows.most_common(MOST_PLACING)}
+    posed_rows = Counter(rows.marker[rows.turned].tolist())
+    turning = [marker for marker, _ in posed_rows.most_common(MOST_TURNING)]
+    some = [marker for marker, _ in Counter(rows.marker.tolist()).most_common(MOST_PLACING)]
     try:
-        start = _started(seen, flanges, places, some, turning)
+        return _started(rows, places, turning + some, turning)
     except InputError:  # where every configuration shows other markers, it takes all of them
         if len(places) <= MOST_PLACING:
             raise
-        start = _started(seen, flanges, places, set(places), turning)
-    base = start.bases[""]
-    found = _seen_from(base, seen, flanges, places)
-    for marker, tool in start.tools.items():
-        found[marker][:3] = tool[:3, 3]
-    _turn(found, base, seen, flanges)
-    verdict = "certified" if start.certified else "not certified"
-    return Located(frame_numbers(base), found, f"{verdict}: {start.reason}")
+        return _started(rows, places, list(places), turning)
 
 
-def _started(
-    seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], placing: set[str], turning: set[str]
-) -> CertifiedStart:
+def _started(rows: _Rows, places: Mapping[str, Array], placing: list[str], turning: list[str]) -> CertifiedStart:
     """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
-    chosen = [(block, flange) for block, flange in zip(seen, flanges, strict=True) if block.markers[0] in placing]
-    measured = []
-    for block, _ in chosen:
-        T = np.tile(np.eye(4), (len(block.y), 1, 1))
-        T[:, :3, :3] = np.nan  # where positions alone count
-        T[:, :3, 3] = block.y[:, :3]
-        turned = block.markers[0] in turning and block.measurement.name == "pose"
-        measured.append(transforms(block.y) if turned else T)
-    sigma = np.concatenate([_deviations(block) for block, _ in chosen])
+    chosen = rows.take(np.isin(rows.marker, placing))
+    chosen.measured[~np.isin(chosen.marker, turning), :3, :3] = np.nan
+    sigma = chosen.sigma[:, 0], chosen.sigma[:, 1]
+    names = chosen.marker.tolist()
     start = certified_hand_eye(
-        np.concatenate([flange for _, flange in chosen]),
-        np.concatenate(measured),
-        marker=[block.markers[0] for block, _ in chosen for _ in block.row],
-        sigma=(sigma[:, 0], sigma[:, 1]),
-        expected=places,
-        spread=TOOL_ERROR,
+        chosen.flange, chosen.measured, marker=names, sigma=sigma, expected=places, spread=TOOL_ERROR
     )
     if start.uncertainty > FREE:
         raise InputError("the data", start.reason, "turns about two axes")
     return start
 
 
-def _turn(tools: dict[str, Array], base: Array, seen: Sequence[Block], flanges: Sequence[Array]) -> None:
+def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
     """Give reflectors (6,) the orientations that poses show from a base (4, 4)."""
-    for block, flange in zip(seen, flanges, strict=True):
-        if block.measurement.name == "pose":
-            tool = np.eye(4)
-            turned = (base @ flange)[:, :3, :3].transpose(0, 2, 1) @ transforms(block.y)[:, :3, :3]
-            tool[:3, :3] = proper(turned.sum(axis=0))
-            tool[:3, 3] = tools[block.markers[0]][:3]
-            tools[block.markers[0]] = frame_numbers(tool)
+    posed_rows = rows.take(rows.turned)
+    for marker in np.unique(posed_rows.marker).tolist():
+        own = posed_rows.take(posed_rows.marker == marker)
+        tool = np.eye(4)
+        turned = (base @ own.flange)[:, :3, :3].transpose(0, 2, 1) @ own.measured[:, :3, :3]
+        tool[:3, :3] = proper(turned.sum(axis=0))
+        tool[:3, 3] = tools[marker][:3]
+        tools[marker] = frame_numbers(tool)
 
 
 def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located | None:
     """Return base and reflectors in closed form, from positions alone; None where they do not fit the nominal robot."""
-    seen = _positions(data, FEW // max(len(data.blocks), 1) + 3)
-    if not seen:
+    rows = _Rows.of(robot, data, FEW // max(len(data.blocks), 1) + 3)
+    if rows is None:
         return None
-    flanges = [forward_kinematics(robot, block.q[:, 0]) for block in seen]
     markers = list(tools)
-    flange = np.concatenate(flanges)
-    y = np.concatenate([block.y[:, :3] for block in seen])
-    marker = np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in seen])
+    marker = np.array([markers.index(name) for name in rows.marker.tolist()])
     places = np.array([tools[name][:3] for name in markers])
-    modelled = np.einsum("nij,nj->ni", flange[:, :3, :3], places[marker]) + flange[:, :3, 3]
-    register(modelled, y)  # refuses points on a line
-    q = np.concatenate([block.q[:, 0] for block in seen]) @ robot.joint_map.T
+    y = rows.measured[:, :3, 3]
+    register(np.einsum("nij,nj->ni", rows.flange[:, :3, :3], places[marker]) + rows.flange[:, :3, 3], y)
+    q = rows.q @ robot.joint_map.T  # and points on a line were refused
     spread = np.full(len(places), TOOL_ERROR)
     given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
     fit = fit_arms(robot, given, QUICK_STEPS)
     if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
         return None
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
-    _turn(found, fit.base[0], seen, flanges)
+    _turn(found, fit.base[0], rows)
     return Located(frame_numbers(fit.base[0]), found, "in closed form")
 
 
-def _seen_from(
-    base: Array, seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array]
-) -> dict[str, Array]:
-    """Return the reflectors (6,) by marker where their positions are least off, seen from a known base (4, 4)."""
-    certain = dict.fromkeys(places, TOOL_ERROR**-2)
-    total = {marker: place[:3] * TOOL_ERROR**-2 for marker, place in places.items()}
-    for block, flange in zip(seen, flanges, strict=True):
-        T = base @ flange
-        there = np.einsum("nji,nj->ni", T[:, :3, :3], block.y[:, :3] - T[:, :3, 3])
-        precision = _deviations(block)[:, 0] ** -2
-        certain[block.markers[0]] += precision.sum()
-        total[block.markers[0]] = total[block.markers[0]] + precision @ there
-    found = {marker: place.copy() for marker, place in places.items()}
-    for marker, place in found.items():
-        place[:3] = total[marker] / certain[marker]
-    return found
-
-
-def _deviations(block: Block) -> Array:
-    """Return standard deviations (N, 2) of a position [m] and a turn [rad]: the instrument's and the robot's."""
-    variance = np.full((len(block.row), 2), NOMINAL_ERROR**2)
-    covariance = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
-    variance[:, 0] += np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3
-    if block.measurement.name == "pose":
-        variance[:, 1] += np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
-    return np.sqrt(variance)
-
-
-def _closed_forms(seen: Sequence[Block], flanges: Sequence[Array], places: Mapping[str, Array], reason: str) -> Located:
+def _closed_forms(rows: _Rows, places: dict[str, Array], reason: str) -> Located:
     """Return the base and the reflectors: of the first poses that tell, or positions by distances and registration."""
-    found = {marker: place.copy() for marker, place in places.items()}
     how = f"by closed forms: {reason}"
     source, target, weight = [], [], []
-    for block, flange in zip(seen, flanges, strict=True):
-        marker = block.markers[0]
-        if block.measurement.name == "pose":
-            with suppress(InputError):  # too few turns: positions and the stated tool have to do
-                base, tool = hand_eye(flange, transforms(block.y), found[marker][:3])
-                found[marker] = frame_numbers(tool)
-                return Located(frame_numbers(base), found, how)
-        if len(flange) > 3:
-            found[marker][:3] = tool_from_distances(flange, block.y[:, :3], found[marker][:3], TOOL_ERROR)
-        source.append(flange[:, :3, :3] @ found[marker][:3] + flange[:, :3, 3])
-        target.append(block.y[:, :3])
-        variance = np.trace(block.covariance[:, :3, :3], axis1=1, axis2=2)
-        weight.append(1 / np.broadcast_to(variance, len(flange)))
+    for marker in dict.fromkeys(rows.marker.tolist()):
+        own = rows.take(rows.marker == marker)
+        place = places[marker]
+        turned = own.take(own.turned)
+        with suppress(InputError):  # too few turns: positions and the stated tool have to do
+            base, tool = hand_eye(turned.flange, turned.measured, place[:3])
+            return Located(frame_numbers(base), {**places, marker: frame_numbers(tool)}, how)
+        y = own.measured[:, :3, 3]
+        if len(y) > 3:
+            place[:3] = tool_from_distances(own.flange, y, place[:3], TOOL_ERROR)
+        source.append(own.flange[:, :3, :3] @ place[:3] + own.flange[:, :3, 3])
+        target.append(y)
+        weight.append(1 / own.variance[:, 0])
     q = np.concatenate(weight)
     base = register(np.concatenate(source), np.concatenate(target), q / q.max())
-    return Located(frame_numbers(base), found, how)
+    return Located(frame_numbers(base), places, how)
 
 
 APART = 0.1
