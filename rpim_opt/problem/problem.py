@@ -638,7 +638,7 @@ class CalibrationProblem(RobotModel):
                     joints[f"{name}.theta{i + 1}"] = i
         names = self.parameters.names
         chosen = np.array([name in joints for name in names])
-        found = np.zeros((len(self._equations.row), max(robot.dof for robot in self.arms.values())))
+        found = np.zeros((len(self._equations.row), max(len(robot.mdh) for robot in self.arms.values())))
         if chosen.any():
             J = np.concatenate(self._slopes_by(chosen, at))
             # the same joint of several robots: a row has slopes by those of its own robot alone
