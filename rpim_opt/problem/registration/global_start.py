@@ -268,18 +268,8 @@ def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Arr
 
 def _signed(robot: Robot, points: Points, sign: Array) -> Candidates:
     """Return candidates of the points with signs (B, dof) of their joints."""
-    one = Candidates.of(robot, [points])
-    q, y, marker = points.targets
-    B = len(sign)
-    return Candidates(
-        q=(sign[:, None] * q) @ robot.joint_map.T,
-        y=np.broadcast_to(y, (B, *y.shape)),
-        marker=np.broadcast_to(marker, (B, len(marker))),
-        zero=np.zeros((B, robot.dof)),
-        tools=np.repeat(one.tools, B, axis=0),
-        stated=one.stated,
-        spread=np.full(len(one.stated), 3.0 * one.spread.max()),
-    )
+    found = Candidates.of(robot, [replace(points, q=each * points.q) for each in sign])
+    return found._replace(spread=np.full(len(found.stated), 3.0 * found.spread.max()))
 
 
 def _round(robot: Robot, points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
