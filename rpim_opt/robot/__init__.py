@@ -1,4 +1,4 @@
-"""The machine as its drawing says, and its kinematics."""
+"""The nominal robot and its kinematics."""
 
 import lazy_loader
 

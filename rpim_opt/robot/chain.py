@@ -125,7 +125,7 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Ar
 def require_same_arm(
     robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path, joint_map: Array | None = None
 ) -> None:
-    """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints, or another drawing."""
+    """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints or numbers."""
     joint_map = np.eye(len(joint_types)) if joint_map is None else joint_map
     if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, joint_map):
         found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")

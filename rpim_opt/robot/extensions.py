@@ -25,7 +25,7 @@ SAME = 1e-2
 
 
 class Statics(Weight):
-    """What gravity does to an arm of nominal geometry in one configuration; nothing is made before it is asked for."""
+    """What gravity does to an arm of nominal geometry in one configuration, each quantity built at its first use."""
 
     def __init__(
         self,

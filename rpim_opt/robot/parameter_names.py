@@ -19,7 +19,7 @@ EXPANSION, REFERENCE = "expansion", "reference_temperature"
 JOINT_OFFSET = "joint_offset"
 """Stands in tables for every theta."""
 KNOWN = 2**14
-"""Names of which what they say is kept: those of a hundred robots, asked for again with every table."""
+"""Names whose meaning is cached: those of a hundred robots."""
 
 
 def own_name(name: str) -> str:

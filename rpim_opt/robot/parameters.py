@@ -376,7 +376,7 @@ def model_parameters(
     sessions
         Names of sessions, by which the robot's base is shifted and turned besides.
     temperature
-        At which the robot's lengths are as on the drawing [K], where temperatures are known: they grow by
+        At which the robot's lengths are nominal [K], where temperatures are known: they grow by
         ``expansion`` a kelvin.
 
     Examples

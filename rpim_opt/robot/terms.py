@@ -174,9 +174,9 @@ class Term:
         Further columns of the data that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a
         column ``temperature_K``, ``{"hours": ""}`` for one without unit.
     nominal
-        Values of the parameters on the drawing, keys as in ``scales``; zero by default.
+        Nominal values of the parameters, keys as in ``scales``; zero by default.
 
-    A term whose parameters are all zero must not move anything; it is not asked then.
+    A term whose parameters are all zero must not move anything; it is not evaluated then.
 
     Raises
     ------
@@ -318,7 +318,7 @@ def transmission(curve: Curve) -> Transmission:
         f(q) = sum_k c_k cos(k u) + s_k sin(k u),    u = 2 pi clip(q - centre, -period / 2, period / 2) / period
 
     Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
-    that f returns to what nobody measured beyond it, and stays there.
+    that f is constant beyond it.
 
     Examples
     --------

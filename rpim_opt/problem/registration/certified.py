@@ -52,7 +52,7 @@ class CertifiedStart:
 
     bases: Mapping[str, Array]  # (4, 4) transform of the robot's base in each instrument's frame [m], by instrument
     tools: Mapping[str, Array]  # (4, 4) of each target in the flange frame, by marker; not turned by positions alone
-    scale: float  # the metre's part that the instrument calls one; 1 unless it was asked for
+    scale: float  # the metre's part that the instrument calls one; 1 unless it is estimated
     cost: float
     bound: float
     gap: float

@@ -46,7 +46,7 @@ QUICK_STEPS = 12
 MISFIT = 3.0
 """Nominal errors of a robot up to which positions agree with a registration in closed form."""
 FREE = 0.1
-"""Standard deviation of a rotation [rad] from which closed forms are asked: they refuse what is not determined."""
+"""Standard deviation of a rotation [rad] from which closed forms are tried: they refuse what is not determined."""
 MOST_PLACING = 30
 """Markers that place the base, where there are more: the others follow from the base."""
 MOST_TURNING = 4
@@ -398,7 +398,7 @@ def own_frames(data: Dataset) -> tuple[str, ...]:
 
 
 def _require_reflectors(data: Dataset, tools: Mapping[str, Place]) -> None:
-    """Refuse rows of a reflector that nobody has stated."""
+    """Refuse rows of a reflector that is not stated."""
     for block in data.blocks:
         for marker in set(block.markers) - set(tools):
             where = f"row {data.label[block.row[0]]}, column marker"

@@ -179,10 +179,10 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
 def explained(robot: Robot, points: Points) -> bool:
     """Whether the nominal robot explains points but for gross errors."""
     few = points.evenly(FEW)
-    asked = Candidates.of(robot, [few])
+    candidates = Candidates.of(robot, [few])
 
     def left(steps: int) -> float:
-        return float(rms(fit_arms(robot, asked, steps, robust=True))[0])
+        return float(rms(fit_arms(robot, candidates, steps, robust=True))[0])
 
     # the registration alone tells it of most data, at a tenth of the cost
     return any(left(steps) <= UNEXPLAINED * few.extent for steps in (0, SHORT))
@@ -250,9 +250,11 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
     zero = np.concatenate([fit.zero for _, fit in pool])
     tools = np.concatenate([fit.tools for _, fit in pool])
     best = np.argsort(cost)[:KEPT]
-    asked = _signed(robot, points, np.vstack([np.ones((1, n)), sign[best]]))
-    asked = asked._replace(zero=np.vstack([near.zero, zero[best]]), tools=np.concatenate([near.tools, tools[best]]))
-    fits = fit_arms(robot, asked, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
+    candidates = _signed(robot, points, np.vstack([np.ones((1, n)), sign[best]]))
+    candidates = candidates._replace(
+        zero=np.vstack([near.zero, zero[best]]), tools=np.concatenate([near.tools, tools[best]])
+    )
+    fits = fit_arms(robot, candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
     return _judged(robot, points, np.vstack([np.ones((1, n)), sign[best]]), fits, starts, small, rng)
 
 
@@ -274,10 +276,10 @@ def _signed(robot: Robot, points: Points, sign: Array) -> Candidates:
 
 def _round(robot: Robot, points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
     """Return the best quarter of random starts, fitted: signs (B, dof) and fits."""
-    asked = _signed(robot, points, sign)._replace(zero=zero)
-    first = fit_arms(robot, asked, SHORT, zeros=True, noise=LEAST_NOISE)
+    candidates = _signed(robot, points, sign)._replace(zero=zero)
+    first = fit_arms(robot, candidates, SHORT, zeros=True, noise=LEAST_NOISE)
     best = np.argsort(first.cost)[: max(len(sign) // 4, 1)]
-    begun = asked.take(best)._replace(zero=first.zero[best], tools=first.tools[best])
+    begun = candidates.take(best)._replace(zero=first.zero[best], tools=first.tools[best])
     return sign[best], fit_arms(robot, begun, LONG, zeros=True, noise=LEAST_NOISE)
 
 

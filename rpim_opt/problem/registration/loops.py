@@ -30,8 +30,8 @@ FEWEST = 3
 """Measurements that have to have a weight."""
 MOST_PAIRED = 2000
 """Measurements up to which all pairs are compared."""
-ASKED, FEW = 40, 10
-"""Measurements, evenly spread, of which is asked what they go with, and sets that are begun with then."""
+TRIED, FEW = 40, 10
+"""Measurements, evenly spread, whose compatible sets are tried, and the most sets that are."""
 ROUNDING = 1e-7
 """Error of an angle from its cosine [rad]."""
 SURPRISE = 1e-4
@@ -276,7 +276,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
     most = max(each.weights.sum() for each in found)
     if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
         members = np.flatnonzero(first)
-        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // ASKED]]
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
         parts = [likeliest(some) for some in around]
         if len(members) <= FEW:  # turning alike, one may be wrong all the same
             parts += list(first & ~np.eye(len(first), dtype=bool)[members])

@@ -33,7 +33,7 @@ QUIET = 5
 """Steps in a row without a decrease that end a fit."""
 FIRST_DAMPING = 1e-2
 LARGEST_BATCH = 4_000_000
-"""Entries of the Jacobians that are held at once."""
+"""Entries of the Jacobians in memory at once."""
 SHORT = 1e-9
 """Relative decrease of the cost below which a fit has converged."""
 
@@ -167,7 +167,7 @@ class Candidates(NamedTuple):
 
 def fit_arms(
     robot: Robot,
-    asked: Candidates,
+    candidates: Candidates,
     steps: int,
     *,
     zeros: bool = False,
@@ -180,17 +180,17 @@ def fit_arms(
 
         minimize  sum_i w_i |y_i - Q (p_i + R_i tau_m(i)) - t|^2 + (noise |tau_m - stated_m| / spread_m)^2
 
-    over reflectors tau and, where asked, joint zeros o: (R_i, p_i) is the flange at q_i + o. At every step (Q, t) is
+    over reflectors tau and, if wanted, joint zeros o: (R_i, p_i) is the flange at q_i + o. At every step (Q, t) is
     the registration in closed form (`proper`), and the Jacobian loses its mean over the rows and carries three columns
     for a turn of the base, whose step is dropped.
 
     Joint zeros are fitted where ``zeros``; weights w fall as 1 / error beyond three medians of a candidate's errors
     where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
     """
-    B, N, _ = asked.y.shape
-    columns = 3 + 3 * len(asked.stated) + zeros * robot.dof
+    B, N, _ = candidates.y.shape
+    columns = 3 + 3 * len(candidates.stated) + zeros * robot.dof
     parts = np.array_split(np.arange(B), 1 + B * N * 3 * columns // LARGEST_BATCH)
-    fits = [_fitted(robot, asked.take(some), steps, zeros, robust, noise) for some in parts]
+    fits = [_fitted(robot, candidates.take(some), steps, zeros, robust, noise) for some in parts]
     return Fit(*(np.concatenate(each) for each in zip(*fits, strict=True)))
 
 
@@ -217,15 +217,15 @@ class _State(NamedTuple):
         return _State(*each)
 
 
-def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
-    B, N, _ = asked.y.shape
+def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
+    B, N, _ = candidates.y.shape
     damping = np.full(B, FIRST_DAMPING)
     weights = np.ones((B, N))
-    pull = (noise / asked.spread) ** 2
-    y = np.moveaxis(asked.y, -1, 0)
-    at = partial(_at, robot, asked, y, pull)
-    state = at(weights, asked.zero, asked.tools)
-    size = asked.tools[0].size
+    pull = (noise / candidates.spread) ** 2
+    y = np.moveaxis(candidates.y, -1, 0)
+    at = partial(_at, robot, candidates, y, pull)
+    state = at(weights, candidates.zero, candidates.tools)
+    size = candidates.tools[0].size
     quiet = 0
     for k in range(steps):
         if robust and k % REWEIGHTED == 0:
@@ -233,7 +233,7 @@ def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bo
             limit = TRUSTED * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
             state = at(weights, state.zero, state.tools)
-        step = _step(robot, asked, pull, weights, state, damping, zeros)
+        step = _step(robot, candidates, pull, weights, state, damping, zeros)
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
         if zeros:
@@ -250,15 +250,17 @@ def _fitted(robot: Robot, asked: Candidates, steps: int, zeros: bool, robust: bo
     base[:, :3, :3] = np.swapaxes(state.base, 1, 2)
     seen = np.einsum("bij,jbn->bni", base[:, :3, :3], state.points)
     weight = weights / weights.sum(axis=1, keepdims=True)
-    base[:, :3, 3] = np.einsum("bn,bni->bi", weight, asked.y - seen)
+    base[:, :3, 3] = np.einsum("bn,bni->bi", weight, candidates.y - seen)
     modelled = seen + base[:, None, :3, 3]
-    return Fit(modelled, np.linalg.norm(asked.y - modelled, axis=2), state.cost, base, state.tools, state.zero)
+    return Fit(modelled, np.linalg.norm(candidates.y - modelled, axis=2), state.cost, base, state.tools, state.zero)
 
 
-def _at(robot: Robot, asked: Candidates, y: Array, pull: Array, weights: Array, zero: Array, tools: Array) -> _State:
+def _at(
+    robot: Robot, candidates: Candidates, y: Array, pull: Array, weights: Array, zero: Array, tools: Array
+) -> _State:
     """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
-    turn, p, axes, origins = _flange(robot, asked.q + zero[:, None])
-    tau = np.moveaxis(tools[np.arange(len(tools))[:, None], asked.marker], -1, 0)
+    turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
+    tau = np.moveaxis(tools[np.arange(len(tools))[:, None], candidates.marker], -1, 0)
     points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
     share = weights / weights.sum(axis=1, keepdims=True)
     mean = (points * share).sum(axis=-1, keepdims=True)
@@ -266,7 +268,7 @@ def _at(robot: Robot, asked: Candidates, y: Array, pull: Array, weights: Array, 
     target = y - (y * share).sum(axis=-1, keepdims=True)
     base = proper(np.einsum("ibn,jbn->bij", weights * centred, target))
     residual = centred - np.einsum("bij,jbn->ibn", base, target)
-    off = tools - asked.stated
+    off = tools - candidates.stated
     cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
     return _State(zero, tools, base, cost, points, turn, axes, origins, mean, residual)
 
@@ -300,15 +302,15 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _step(
-    robot: Robot, asked: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool
+    robot: Robot, candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool
 ) -> Array:
     """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, a turn of the base."""
-    B, N, _ = asked.y.shape
-    M = len(asked.stated)
+    B, N, _ = candidates.y.shape
+    M = len(candidates.stated)
     dof = state.zero.shape[1] if zeros else 0
     J = np.zeros((B, 3 * M + dof + 3, 3, N))
     for m in range(M):
-        seen = asked.marker == m
+        seen = candidates.marker == m
         for k in range(3):
             J[:, 3 * m + k] = np.moveaxis(state.turn[k] * seen, 0, 1)
     for j in range(dof):
@@ -327,7 +329,7 @@ def _step(
     g = (A @ r)[..., 0]
     at = np.arange(3 * M)
     H[:, at, at] += np.repeat(pull, 3)
-    g[:, at] += (pull[:, None] * (state.tools - asked.stated)).reshape(B, -1)
+    g[:, at] += (pull[:, None] * (state.tools - candidates.stated)).reshape(B, -1)
     diagonal = np.einsum("bii->bi", H)
     largest = diagonal.max(axis=1, keepdims=True)
     extra = damping[:, None] * (diagonal + 1e-3 * largest) + 1e-12 * largest

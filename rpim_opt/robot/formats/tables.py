@@ -194,7 +194,7 @@ def _ending(path: Path) -> str:
 
 
 def read_sheet(path: Path, convention: str = "") -> Described:
-    """Return the robot of a table with a row a joint, as people have them, in the convention that it or somebody says.
+    """Return the robot of a table with a row a joint, in the convention that it or ``convention`` states.
 
     ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
     Hayati are converted exactly; what follows the last joint becomes the tool::

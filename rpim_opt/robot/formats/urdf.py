@@ -530,7 +530,7 @@ def _root_element(data: bytes, path: Path) -> _Element:
 def _urdf_text(path: Path) -> bytes:
     """Return the content of a URDF file, or what a xacro file says with its own defaults.
 
-    Expressions are carried out and other files included: problem folders, which may be somebody else's, name no xacro.
+    Expressions are carried out and other files included: problem folders, which may be untrusted, name no xacro.
     """
     content = read_bytes(path)
     if path.suffix.lower() != XACRO:
