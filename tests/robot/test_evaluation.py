@@ -45,7 +45,6 @@ def require_same(here: list[np.ndarray], there: list[np.ndarray]) -> None:
 def test_vectorized_functions_have_the_bits_of_one_after_the_other(N: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evaluation, "PAYS", 1)
     function = every_operation()
-    assert min(N, evaluation.WIDTH) <= evaluation._quickest(function, 2, N).width <= max(2 * N, evaluation.NARROW)
     require_same(evaluation.evaluate_rows(function, SHARED, table(N)), call_rows(function, SHARED, table(N)))
 
 
@@ -70,17 +69,9 @@ def test_threads_change_no_bit(cores: int, monkeypatch: pytest.MonkeyPatch) -> N
     require_same(evaluation.evaluate_rows(function, SHARED, rows), call_rows(function, SHARED, rows))
 
 
-def test_few_rows_are_evaluated_one_after_the_other() -> None:
-    function = every_operation()
-    assert evaluation._quickest(function, 2, evaluation.PAYS - 1) is None
-    assert evaluation._quickest(function, 2, 1) is not None  # as many in all
-    assert evaluation._quickest(every_operation(), 2, evaluation.PAYS) is not None
-
-
 def test_a_function_of_matrices_stays_as_it_is() -> None:
     x = ca.MX.sym("x", 3)
     function = ca.Function("matrices", [x], [ca.sum1(x) * x])
-    assert evaluation._quickest(function, 0, evaluation.PAYS) is None
     require_same(evaluation.evaluate_rows(function, [], table(2500)), call_rows(function, [], table(2500)))
 
 
