@@ -705,7 +705,7 @@ def _calibrated(
         changes["weight"] = named_weight(selector)
     if formulation:
         changes["formulation"] = named_formulation(formulation)
-    say("learning the prior's scales" if changes.get("weight", instance.weight) is None else "choosing the weight")
+    say("estimating the prior's scales" if changes.get("weight", instance.weight) is None else "choosing the weight")
     try:
         return instance.calibrate(
             **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")

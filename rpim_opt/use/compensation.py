@@ -507,10 +507,12 @@ class _Cell(NamedTuple):
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
         every = np.arange(len(poses))
+        low, high = self.robot.limits.T
+        limits = low, high
 
         def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
-            at = self.nominal, load[rows], poses[rows], start, tuple(self.robot.limits.T)
-            return nearest(*at, np.ones(self.robot.dof), W, np.zeros((1, self.robot.dof, self.robot.dof)))
+            no_cost = np.zeros((1, self.robot.dof, self.robot.dof))
+            return nearest(self.nominal, load[rows], poses[rows], start, limits, np.ones(self.robot.dof), W, no_cost)
 
         all_count = np.eye(len(self.kind.components))[None]
         starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]

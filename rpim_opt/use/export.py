@@ -126,9 +126,9 @@ def export_files(
     result, notes = geometry_alone(whole)
     note = result.verdict.require(despite_verdict)
     robot = _with_first_reflector(result, marker).robot
-    frames["marker"] = marker
+    frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
-        (urdf, lambda source, target: _write_urdf(result, source, target, **frames)),
+        (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
         (ur_kinematics, lambda source, target: write_ur_kinematics(source, robot, target)),
         (ur_calibration, lambda source, target: export_ur_calibration(result, source, target)),
     ]
@@ -203,7 +203,7 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
         rows = zip(np.degrees(q), correction, std, strict=True)
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
     write_text(target, "\n".join(lines) + "\n")
-    return [f"Transmission errors (RMS, mrad): {joined(sizes)}. They belong to the geometry of this very result."]
+    return [f"Transmission errors (RMS, mrad): {joined(sizes)}. They belong to the geometry of this result."]
 
 
 def export_urdf(
@@ -253,20 +253,6 @@ def export_urdf(
     np.float64(0.001)
     """
     note = result.verdict.require(despite_verdict)
-    options = {"root": root, "tip": tip, "base": base, "tool": tool, "marker": marker}
-    return write_all([(Path(target), lambda path: _write_urdf(result, source, path, **options))], note)
-
-
-def _write_urdf(
-    result: Calibration,
-    source: str | Path,
-    target: Path,
-    root: str | None = None,
-    tip: str | None = None,
-    base: bool | None = None,
-    tool: bool | None = None,
-    marker: str | None = None,
-) -> list[str]:
     arm = _with_first_reflector(result, marker)
     own = read_urdf(source, root, tip)
     names = result.problem.parameters.names
@@ -284,8 +270,12 @@ def _write_urdf(
         elif free:
             where = f"the identified {name} is not there, but at {placed(place)}"
             notes.append(f"URDF: its {link} stays where it was; {where}.")
-    write_urdf(source, arm.robot, target, root, tip, *written)
-    return notes
+
+    def write(path: Path) -> list[str]:
+        write_urdf(source, arm.robot, path, root, tip, *written)
+        return notes
+
+    return write_all([(Path(target), write)], note)
 
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
@@ -319,7 +309,7 @@ def noted(text: str, ending: str, note: str) -> str:
     >>> noted("a: 1\n", ".yaml", "Not delivered.").splitlines()
     ['# Not delivered.', 'a: 1']
     """
-    if not note:
+    if not note or note in text:
         return text
     if ending == ".json":
         content = json.loads(text)
@@ -351,7 +341,7 @@ def write_all(writers: Sequence[Writer], note: str = "") -> list[str]:
                 notes += write(path) or ()
             except InputError as error:
                 file = target if error.file == path else error.file
-                raise type(error)(error.where, error.found, error.accepted, file) from None
+                raise InputError(error.where, error.found, error.accepted, file) from None
             contents[target] = read_bytes(path)
             if note:
                 contents[target] = noted(contents[target].decode(), path.suffix.lower(), note).encode()

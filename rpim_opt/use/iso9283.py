@@ -150,7 +150,7 @@ def iso9283(
         S_l  = sqrt(sum (l_j - mean(l))^2 / (n - 1))
         RP_l = mean(l) + 3 S_l                RP_a = 3 S_a,  and the same for b and c
 
-    (ISO 9283:1998, 7.2.1 and 7.2.2.) Attained positions are those that the instrument reads: its own scatter is in
+    (ISO 9283:1998, 7.2.1 and 7.2.2.) Attained positions are those that the instrument reads: measurement noise is in
     them. Angles count within half a turn of the command, or of the first approach.
 
     Parameters
