@@ -230,24 +230,17 @@ def headline(summary: Summary) -> str:
 
 def _medians(rows: Rows, summary: Summary, problems: list[str]) -> Table:
     """Return every method's median on every problem, shaded by how near it is to the best."""
-    of: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
-        if row.get(summary.metric) is not None:
-            of.setdefault((row["method"], row["problem"]), []).append(row[summary.metric])
-    medians = {key: float(np.median(values)) for key, values in of.items()}
-    best: dict[str, float] = {}
-    for (_, problem), value in medians.items():
-        best[problem] = max(min(value, best.get(problem, np.inf)), np.finfo(float).tiny)
-    table = []
-    for each in summary.standings:
-        cells: list[Any] = [each.method]
-        for problem in problems:
-            value = medians.get((each.method, problem))
-            if value is None:
-                cells.append(("-", "none"))
-            else:
-                cells.append((number(value), f"shade{np.searchsorted(SHADES, value / best[problem])}"))
-        table.append(cells)
+    of = figures(rows, summary.metric)
+    table: list[list[Any]] = [[each.method] for each in summary.standings]
+    for problem in problems:
+        values = [[v for pair, v in of[each.method].items() if pair[0] == problem] for each in summary.standings]
+        medians = [float(np.median(each)) if each else None for each in values]
+        best = max(min((m for m in medians if m is not None), default=1.0), np.finfo(float).tiny)
+        for cells, median in zip(table, medians, strict=True):
+            shade = ("-", "none")
+            if median is not None:
+                shade = (number(median), f"shade{np.searchsorted(SHADES, median / best)}")
+            cells.append(shade)
     caption = f"Median {summary.metric} by problem; darker is farther from the best"
     return Table(caption, ["method", *problems], table)
 
