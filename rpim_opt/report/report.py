@@ -205,7 +205,6 @@ def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure
 
 def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
-        map_.sentence(),
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
         "of the configurations that reach it, at any depth. Axes of the robot's base.",
@@ -214,6 +213,8 @@ def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block
     if result.record.requirement is not None:
         limit = 1e3 * map_.requirement.limit
         notes.append("The search for the maximum goes on between these configurations, and may end above the map's.")
+    else:
+        notes.insert(0, map_.sentence())
     yield "text", notes
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.machine, map_.q, map_.region.marker)

@@ -239,7 +239,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
     accepted = acceptance(result)
-    uncertainty = workspace(result)
+    uncertainty = workspace(result) if accepted is None else None  # whose search ends above the drawn maximum
     remarks = [
         *([] if uncertainty is None else [uncertainty.sentence()]),
         *weight_lines(result),
