@@ -186,6 +186,16 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"problems": 3}, "problems: found a int"),
         ({"problems": POSITION.calibrate().program}, "ro.select.compare compares selectors on a program"),
         ({"workers": 0}, "workers: found 0"),
+        ({"problems": []}, "problems: found none"),
+        ({"problems": ROOT / "tests" / "study"}, "no problem.toml in"),
+        ({"splits": []}, r"splits: found \[\]"),
+        ({"selectors": ["reml", ro.reml]}, "'tikhonov, reml' twice"),
+        ({"selectors": [lambda _: 1.0, lambda _: 2.0]}, "'tikhonov, <lambda>' twice"),
+        ({"selectors": [{"length": 1.0, "angle": 2.0}]}, "weights of groups by a name"),
+        ({"formulations": (), "selectors": "reml"}, "formulations: found none"),
+        ({"methods": 3}, "methods: found 3"),
+        ({"metrics": []}, "metrics: found none"),
+        ({"metrics": {"a": 3}}, "metrics: found 3"),
     ],
 )
 def test_what_cannot_be_asked_is_said_before_anything_is_computed(asked: dict, said: str) -> None:

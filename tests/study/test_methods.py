@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import METRICS, Answer, Fitted, answer_of, measure, methods_of, metrics_of
+from rpim_opt.study.methods import METRICS, Answer, Fitted, answer_of, measure, methods_of
 
 POSITION = ro.load("position")
 OWN = ro.Formulation("squares", penalty=cp.sum_squares)
@@ -35,31 +35,6 @@ def test_methods_are_called_as_a_person_calls_them() -> None:
     assert labels("tikhonov", [ro.reml, by_hand]) == ["tikhonov, reml", "tikhonov, by_hand"]
     assert labels({"mine": OWN}, {"by groups": GROUPS}, {"own": by_hand}) == ["mine, by groups", "own"]
     assert labels((), (), [by_hand, "nominal"]) == ["by_hand", "nominal"]
-
-
-@pytest.mark.parametrize(
-    ("formulations", "selectors", "functions", "said"),
-    [
-        ("tikhonov", ["reml", ro.reml], (), "'tikhonov, reml' twice"),
-        ("tikhonov", [lambda _: 1.0, lambda _: 2.0], (), "'tikhonov, <lambda>' twice"),
-        ((), "reml", (), "found none"),
-        ("tikhonov", True, (), "found True"),
-        ("tikhonov", [GROUPS], (), "weights of groups by a name"),
-        ((), (), 3, "found 3"),
-    ],
-)
-def test_what_is_no_method_is_refused(formulations: Any, selectors: Any, functions: Any, said: str) -> None:
-    with pytest.raises(ro.InputError, match=said):
-        methods_of(formulations, selectors, functions, {})
-
-
-def test_metrics_are_called_by_their_functions() -> None:
-    assert list(metrics_of("rms_mm")) == ["rms_mm"]
-    assert list(metrics_of(by_hand)) == ["by_hand"]
-    assert list(metrics_of([by_hand, "seconds"])) == ["by_hand", "seconds"]
-    for stated, said in (([], "found none"), ({"a": 3}, "found 3"), (["rms"], "found 'rms'")):
-        with pytest.raises(ro.InputError, match=said):
-            metrics_of(stated)
 
 
 def test_what_a_method_predicts_is_measured_as_what_it_calibrates() -> None:

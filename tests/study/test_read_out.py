@@ -124,10 +124,7 @@ def test_problems_come_as_a_pair_or_as_a_file() -> None:
     assert file.label == "position"
 
 
-def test_what_is_no_problem_is_said(tmp_path: Path) -> None:
-    for given, said in (([], "problems: found none"), (tmp_path, "no problem.toml in")):
-        with pytest.raises(ro.InputError, match=said):
-            sources_of(given)
+def test_a_family_returns_problems() -> None:
     (family,) = sources_of({"mine": lambda seed: seed})
     with pytest.raises(ro.InputError, match=r"problem mine: found a function of a seed that returns no problem \(7\)"):
         family.instance(7)
@@ -139,8 +136,6 @@ def test_folds_need_as_many_configurations() -> None:
     few = data.take(np.flatnonzero(data.configuration < 4))
     with pytest.raises(ro.InputError, match="splits: found 4 configurations, accepted: at least 5 for 5 folds"):
         five.held_out(few, 1, 0)
-    with pytest.raises(ro.InputError, match=r"splits: found \[\]"):
-        splits_of([])
 
 
 def test_a_scheduler_is_an_address_or_a_client() -> None:
