@@ -149,20 +149,8 @@ CAMERAS = {m.name: m for m in TYPES}
 def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
     """Return the points (3,) of a chessboard or a grid of circles, numbered from 0 row by row as OpenCV finds them.
 
-    Parameters
-    ----------
-    columns, rows
-        Inner corners along x and along y.
-    spacing
-        From one to the next [m].
+    ``columns`` and ``rows`` are inner corners along x and along y, ``spacing`` is from one to the next [m].
 
-    Raises
-    ------
-    InputError
-        For fewer than two columns or rows or more than three hundred, and a spacing that is not positive.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> board = ro.data.grid_board(9, 6, 0.025)
     >>> len(board), board["10"]
@@ -180,18 +168,8 @@ def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
 def read_board(source: Any) -> dict[str, Array]:
     """Return the points (3,) [m] of a board by name, from a table with columns point, x_mm, y_mm and perhaps z_mm.
 
-    Parameters
-    ----------
-    source
-        A file, a data frame, or a mapping from column names to cells.
+    The source is a file, a data frame, or a mapping from column names to cells.
 
-    Raises
-    ------
-    InputError
-        For columns that are missing or unknown, and a point that is there twice.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.data.read_board({"point": ["a", "b"], "x_mm": [0, 25], "y_mm": [0, 0]})["b"]
     array([0.025, 0.   , 0.   ])

@@ -82,22 +82,8 @@ UNNAMED = (revisit_plane, *KNOWN)
 class KnownDistance:
     """A distance between two touched points, or two touched planes that are parallel.
 
-    Parameters
-    ----------
-    between
-        The names of the two.
-    value
-        What it is [m].
-    sigma
-        Its standard deviation [m].
+    ``between`` are their names, ``value`` [m] is greater than zero, ``sigma`` is its standard deviation [m].
 
-    Raises
-    ------
-    InputError
-        For lengths that are not greater than zero, and twice the same name.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.data.KnownDistance(("left", "right"), 0.3, 5e-6).measurement.name
     'known_distance'
@@ -120,24 +106,10 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class KnownAngle:
-    """Two touched planes that are parallel, or at right angles.
+    """Two touched planes that are parallel, or at right angles where they are not.
 
-    Parameters
-    ----------
-    between
-        The names of the two.
-    parallel
-        Whether they are parallel; at right angles otherwise.
-    sigma
-        Standard deviation of the angle [rad].
+    ``between`` are their names, ``sigma`` is the standard deviation of the angle [rad].
 
-    Raises
-    ------
-    InputError
-        For a deviation that is not greater than zero, and twice the same name.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> known = ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5)
     >>> known.measurement.name, known.value  # by how much the angle differs from that [rad]
@@ -173,22 +145,9 @@ def _require_sound(known: Known) -> None:
 def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     """Return measurements with rows that state what is known of touched points and planes.
 
-    Points that a distance joins belong together from then on: cross-validation leaves out all of them or none.
+    Points that a distance joins belong together from then on: cross-validation leaves out all of them or none. Names
+    that no row touches are refused, and points where planes are wanted.
 
-    Parameters
-    ----------
-    data
-        With rows that touch them.
-    known
-        Distances and angles.
-
-    Raises
-    ------
-    InputError
-        For a name that no row touches, and for points where planes are wanted.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> q = np.linspace(0, 1, 24).reshape(4, 6)
@@ -270,11 +229,6 @@ def touches(
         N row labels; numbers from 1 by default.
     planes
         Whether planes were touched.
-
-    Raises
-    ------
-    InputError
-        As for `Dataset.of`, and for another number of names than of rows.
 
     Examples
     --------
