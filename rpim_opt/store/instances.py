@@ -406,7 +406,9 @@ def _relation(table: DistanceTable | AngleTable, where: str, path: Path) -> tupl
     sigma = table.sigma
     if sigma is None:
         if not table.validation:
-            raise InputError(where, "nothing", "the standard deviation of what the drawing states", path)
+            unit = "mm" if isinstance(table, DistanceTable) else "mrad"
+            accepted = "the standard deviation of what the drawing states"
+            raise InputError(f"{where}.sigma_{unit}", "nothing", accepted, path)
         sigma = UNSTATED
     return (first, second), sigma
 
