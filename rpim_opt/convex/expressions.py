@@ -24,7 +24,8 @@ else:
         def __getattr__(self, name: str) -> Any:
             if name.startswith("__"):  # what doctest and inspect ask of every module is no use of it
                 raise AttributeError(name)
-            return getattr(import_module(self.__name__), name)
+            value = vars(self)[name] = getattr(import_module(self.__name__), name)
+            return value
 
     cp = _Late("cvxpy")
 
