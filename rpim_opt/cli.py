@@ -152,10 +152,12 @@ UrdfBase = Annotated[Text, Option(help="Link where the chain starts, if not the 
 UrdfTip = Annotated[Text, Option(help="Link where it ends, if there are several.")]
 Workers = Annotated[int, Option(help="Processes on this machine.")]
 Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute on.")]
-Resume = Annotated[Choice, Option(help="Go on where an interrupted run was, or begin anew in spite of it.")]
+Resume = Annotated[Choice, Option(help="Continue an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
 Folder = Annotated[File, Option(help="Folder for result.json.")]
-Despite = Annotated[bool, Option("--despite-verdict", help="Also where the robot is not delivered, with a note.")]
+Despite = Annotated[
+    bool, Option("--despite-verdict", help="Write the file although the robot is not delivered, with a note in it.")
+]
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout, errors as JSON on stderr.")]
 
 
@@ -417,7 +419,7 @@ def update(
     units: Units = "",
     measurement: Type = None,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
-    reset: Annotated[str, Option(help="Parameters that are unknown anew: 'base_*' of a moved instrument.")] = "",
+    reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     out: Folder = None,
     as_json: Json = False,
 ) -> None:
@@ -595,7 +597,7 @@ def study(
     workers: Workers = 1,
     scheduler: Scheduler = None,
     resume: Resume = None,
-    redraw: Annotated[bool, Option("--redraw", help="Only write the report anew, from the last replicates.")] = False,
+    redraw: Annotated[bool, Option("--redraw", help="Only write the report again, from the last replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
     as_json: Json = False,

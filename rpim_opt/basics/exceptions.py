@@ -105,7 +105,7 @@ class Conflict(NamedTuple):
         """Return it as a sentence, empty where nothing is known."""
         parts = []
         if self.constraints:
-            parts.append(f"these cannot hold together: {', '.join(self.constraints)}")
+            parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
         bounds = _by(self.parameters)
         rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in self.configurations.items())
         if bounds and rows:

@@ -215,7 +215,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def undoing() -> Iterator[ExitStack]:
-    """Collect what takes steps back; it is carried out, the last first, only when what follows fails."""
+    """Collect what takes steps back; it is executed, the last first, only when what follows fails."""
     with ExitStack() as steps:
         yield steps
         steps.pop_all()

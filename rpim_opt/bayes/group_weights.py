@@ -42,7 +42,7 @@ COMMON = 41
 AROUND = 1e2
 """Factors from the corner of the L-curve within which that of several weights is sought: rules of one weight differ
 by no more, and further out a deviation's logarithm falls without end."""
-SIDES = ("the data want no penalty", "the data want no deviation")
+SIDES = ("the data support no penalty", "the data support no deviation")
 """What it means that a group is at the lower or at the upper bound."""
 FACTORS = np.geomspace(1e-3, 1e3, 61)
 """By which all weights together are multiplied, to show how sharp a choice is."""
@@ -247,7 +247,7 @@ def reml_groups(grouped: Grouped) -> Selection:
     The optimum where all is noise counts only if there is no other, and then the weights are 1.
     """
     if grouped.model.constrained:
-        note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
+        note = "points on a plane or sphere do not determine it: stated noise and scales are used"
         weights = {**dict.fromkeys(grouped.names, 1.0), **grouped.told}
         return Selection(1.0, "reml by group", FACTORS, np.zeros(len(FACTORS)), False, note, weights)
     objective = restricted_likelihood(grouped)
@@ -255,7 +255,7 @@ def reml_groups(grouped: Grouped) -> Selection:
     t = _least(objective, bounds, len(grouped.names), EXACT)
     if (t < bounds[1] - EDGE).any():
         return _selection(grouped, "reml", objective, t, bounds, "largest restricted likelihood")
-    note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
+    note = "the data do not determine the scale of the deviations: stated noise and scales are used"
     return replace(_selection(grouped, "reml", objective, np.zeros_like(t), bounds, note), interior=False)
 
 
@@ -289,7 +289,7 @@ def k_fold_groups(grouped: Grouped, folds: int = 10, seed: int = 0) -> Selection
     """
     model = grouped.model
     if model.stands_for is not None:
-        found = f"{model.equations} equations of which only the triangle is kept"
+        found = f"{model.equations} equations in blocks, of which only the QR factor is kept"
         raise InputError("selector k_fold", found, "reml, l_curve, or a number")
     groups = np.unique(model.group)
     if len(groups) < folds:

@@ -72,17 +72,17 @@ class Checked:
         """Return why the rows do not bear the intervals out, a sentence each."""
         lines: list[str] = []
         if self.rows < FEWEST:
-            lines.append(f"Lacking: at least {FEWEST} rows that the calibration did not see; there are {self.rows}.")
+            lines.append(f"Lacking: at least {FEWEST} held-out rows; there are {self.rows}.")
         if self.beyond:
             lines.append(
-                f"Lacking: intervals that hold. Beyond what the prediction's uncertainty allows: "
+                f"Lacking: valid prediction intervals. Rows outside theirs: "
                 f"{listed(list(self.beyond), MOST)}. Measure again, or find what the model lacks."
             )
         # coordinates of a row are not independent of each other: a row counts once
         if self.coverage is not None and bdtr(np.floor(self.coverage * self.rows), self.rows, CONFIDENCE) < UNLIKELY:
             lines.append(
-                f"Lacking: intervals that hold. Only {100 * self.coverage:.0f} % of the coordinates lie in their "
-                "95 % intervals."
+                f"Lacking: valid prediction intervals. Only {100 * self.coverage:.0f} % of the coordinates lie in "
+                "their 95 % intervals."
             )
         return lines
 
@@ -194,8 +194,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     """Return whether the calibrated robot keeps a limit at every configuration of a region.
 
     What is held against the limit is the position that the robot will reach, as `Calibration.predict` has it: with the
-    uncertainty of the parameters and the robot's own scatter, without the instrument's. Its distance from the predicted
-    position stays below the bound with the confidence that is required (`distance_quantile`); the bound is taken at
+    uncertainty of the parameters and the robot's repeatability, without the instrument's noise. Its distance from the
+    predicted position stays below the bound with the required confidence (`distance_quantile`); the bound is taken at
     2048 configurations of the region, and a search goes on from the worst.
 
     A bound is as good as its covariance. Rows that the calibration did not see check it: they have to lie in their
@@ -318,19 +318,22 @@ def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: fl
 def _wide(limit: float, bound: float, scatter: float) -> list[str]:
     """Say what would lower a bound that is above the limit."""
     if not np.isfinite(bound):
-        return ["Lacking: measurements of directions that neither data nor penalty decide, and that move the robot."]
+        return [
+            "Lacking: measurements that identify combinations which neither data nor penalty determine, and which move "
+            "the robot."
+        ]
     if bound <= limit:
         return []
     if scatter > limit:
         return [
-            f"Lacking: a better known scatter. The robot's own, which this calibration takes for up to "
-            f"{1e3 * scatter:.3f} mm, may be above the limit or not: approach some poses repeatedly "
+            f"Lacking: a more precise repeatability. Its upper bound, "
+            f"{1e3 * scatter:.3f} mm, may exceed the limit: approach some poses repeatedly "
             "(`rpim-opt iso9283`)."
         ]
     return [
-        f"Lacking: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's own scatter "
-        f"would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` names the "
-        "configurations that help most."
+        f"Lacking: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's "
+        f"repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` "
+        "names the configurations that help most."
     ]
 
 
@@ -346,7 +349,7 @@ def _against(requirement: Requirement, least: float, seen: Checked | None) -> li
             )
     if least > requirement.limit:
         reasons.append(
-            f"The robot's own scatter alone is {1e3 * least:.3f} mm at the least: no calibration lowers that."
+            f"The robot's repeatability alone contributes {1e3 * least:.3f} mm at least: no calibration lowers that."
         )
     return reasons
 
@@ -358,9 +361,7 @@ def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[
     if fit is not None and fit.alarming:
         lines.append(f"Lacking: a model that fits. {fit}")
     if seen is None:
-        lines.append(
-            "Lacking: rows that the calibration did not see (`new --hold-out`, or a table for `accept --data`)."
-        )
+        lines.append("Lacking: held-out rows (`new --hold-out`, or a table for `accept --data`).")
     else:
         lines += seen.lacking()
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)

@@ -48,20 +48,20 @@ def ending(ended: Ended, most: int) -> str:
     """Say how the loop ended, and why."""
     state = ended.state
     count = len(state.history)
-    passes = f"{count} passes" if count != 1 else "1 pass"
+    iterations = f"{count} iterations" if count != 1 else "1 iteration"
     if not ended.settled:
         what = "the positions that constraints bound still change; give a larger weight"
         return f"Not converged: after {ROUNDS} rounds {what}."
     if ended.converged and ended.rounds > 1:
-        return f"Converged after {passes} in {ended.rounds} rounds, positions linear about the solution."
+        return f"Converged after {iterations} in {ended.rounds} rounds, positions linear about the solution."
     if ended.converged:
-        text = f"Converged after {passes}."
+        text = f"Converged after {iterations}."
     elif state.outcome == "rest":
         text = f"Not converged: {uncertified(ended.certificate)}"
     elif state.outcome == "stuck":
         text = (
             "Not converged: no step lowers the nonlinear objective, however short; "
-            "the formulation may have no minimum here, or the start be far off."
+            "the formulation may have no minimum here, or the start is far away."
         )
     else:
         text = f"Not converged: {unfinished(state, most)}"
@@ -71,20 +71,21 @@ def ending(ended: Ended, most: int) -> str:
 def uncertified(certificate: Certificate) -> str:
     """Say why a loop at rest has not converged."""
     if certificate.decrease is None:
-        return "the convex program at the end could not be solved again, so that nothing certifies it."
+        return "the convex program at the end could not be solved again, so that the solution is not certified."
     if certificate.decrease > 1e-6:
-        return f"the convex program at the end still promises {certificate.decrease:.1g} of the objective."
-    return f"the constraints are missed by {certificate.violation:.1g} scales."
+        return (
+            f"the convex program at the end still predicts a decrease by {certificate.decrease:.1g} of the objective."
+        )
+    return f"the constraints are violated by {certificate.violation:.1g} scales."
 
 
 def unfinished(state: State, most: int) -> str:
     """Say what the loop was doing when its iterations ran out."""
-    passes = f"{most} passes were" if most != 1 else "1 pass was"
+    iterations = f"{most} iterations were" if most != 1 else "1 iteration was"
     last = [iteration.objective for iteration in state.history[-5:]]
     if len(last) == 5 and last[0] - last[-1] <= LEVEL * abs(last[-1]):
-        return (
-            f"{passes} not enough, though the objective hardly changes: the data hardly decide, give a larger weight."
-        )
+        hardly = "though the objective hardly changes: the data hardly determine the solution; use a larger weight."
+        return f"{iterations} not enough, {hardly}"
     if state.choice.weight == 0 and most > 1:
-        return f"{passes} not enough: what the data hardly see runs away without a penalty; give one, with a weight."
-    return f"{passes} not enough; give more (max_iterations)."
+        return f"{iterations} not enough: poorly identifiable combinations diverge without a penalty; add one."
+    return f"{iterations} not enough; allow more (max_iterations)."

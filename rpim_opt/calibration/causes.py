@@ -35,8 +35,8 @@ LARGEST = {"length": 0.02, "angle": 0.05}
 """A machined and assembled robot deviates by less than this [m, rad]."""
 
 NOTHING = (
-    "No mistake that was tried explains it: another drawing, or a robot that bends and repeats worse than the "
-    "instrument measures? Look at rpim-opt inspect."
+    "None of the tested mistakes explains it. Check the nominal parameters; the arm may be compliant, or less "
+    "repeatable than stated. See rpim-opt inspect."
 )
 
 

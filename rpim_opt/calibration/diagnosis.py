@@ -65,9 +65,9 @@ class Price(NamedTuple):
     def sentence(self) -> str:
         """Say what it costs."""
         if not self.holds:
-            return f"'{self.text}' is met with {self.slack:.3g} {self.unit} to spare."
+            return f"'{self.text}' is inactive, with {self.slack:.3g} {self.unit} of slack."
         return (
-            f"'{self.text}' holds the fit back: loosening it by {self.step:.3g} {self.unit} would lower the misfit "
+            f"'{self.text}' is active: loosening it by {self.step:.3g} {self.unit} would lower the objective "
             f"by {self.gain:.3g} of {self.misfit:.4g}."
         )
 

@@ -115,9 +115,9 @@ def calibrate(
     >>> instance = ro.load("position")
     >>> result = ro.calibrate(instance.problem)
     >>> print(f"{1e3 * result.errors(instance.validation).mean():.3f} mm. {result.message}")
-    0.024 mm. Converged after 2 passes.
+    0.024 mm. Converged after 2 iterations.
     >>> print(ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml).message)
-    Converged after 4 passes.
+    Converged after 4 iterations.
     >>> ro.calibrate(instance.problem, "robust", "reml").formulation.name  # ready ones by their names
     'Huber'
     """

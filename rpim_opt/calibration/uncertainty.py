@@ -165,7 +165,7 @@ class Uncertainty(Tabled):
         head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
         lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.freedom:.1f}."]
         if self.at_bound:
-            lines.append("* at an active bound, of which the interval does not know.")
+            lines.append("* at an active bound: the interval is conditional on it.")
         return "\n".join(lines)
 
     def _short(self) -> str:
@@ -188,7 +188,7 @@ class Uncertainty(Tabled):
     def _notes(self) -> list[str]:
         lines = [self.noise_test().verdict, f"k = {self.coverage_factor:.2f}; {self.freedom:.1f} degrees of freedom."]
         if self.at_bound:
-            lines.append("Parameters at an active bound have an interval that does not know of it.")
+            lines.append("Intervals of parameters at an active bound are conditional on it.")
         return lines
 
 

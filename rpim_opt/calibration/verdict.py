@@ -55,7 +55,7 @@ class Verdict:
     >>> ro.calibrate(ro.load("position").problem).verdict.delivered
     True
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
-    Not delivered. Not converged: 1 pass was not enough; give more (max_iterations).
+    Not delivered. Not converged: 1 iteration was not enough; allow more (max_iterations).
     """
 
     reasons: tuple[str, ...] = ()

@@ -124,15 +124,15 @@ class WeightChoice:
             return None
         weight = self.inside.weight
         note = (
-            f"The rule {selection.name} wants ever less penalty, {before:.2g} and then {selection.weight:.2g}: "
-            f"its last answer inside the weights that it tried, {weight:.2g}, is used."
+            f"The rule {selection.name} decreases the weight at every iteration, {before:.2g} and then "
+            f"{selection.weight:.2g}: its last choice inside the range of weights, {weight:.2g}, is used."
         )
         return replace(self, weight=weight, selection=self.inside, settled=True, final=True, note=note)
 
     def _settled_between(self, one: float, other: float) -> WeightChoice:
         low, high = sorted((one, other))
         name = self.selection.name if self.selection else "selector"
-        weight, which = high, "the larger one, which holds back more, is used"
+        weight, which = high, "the larger one is used"
         if low > 0 and high <= 10 * low:
             weight = float(np.sqrt(low * high))
             which = f"their geometric mean, {weight:.2g}, is used"

@@ -452,7 +452,7 @@ class Parsed:
         if missed > FAR * float(np.max(made.size)):
             unit, si = self.unit
             accepted = "one near it; 'nominal' where the nominal value is meant"
-            raise self._wrong(f"a demand that nominal misses by {missed / si:.4g} {unit}", accepted)
+            raise self._wrong(f"a constraint that the nominal parameters violate by {missed / si:.4g} {unit}", accepted)
 
     def _wrong(self, found: str, accepted: str) -> InputError:
         return InputError(f"constraint {self.name}", found, accepted)

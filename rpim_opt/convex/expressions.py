@@ -120,7 +120,7 @@ def reason(stated: Any) -> str:
     if inner:
         return reason(inner[0])
     within = ", ".join(f"{_short(argument)} {argument.curvature.lower()}" for argument in stated.args)
-    return f"found {_short(stated)}, of which CVXPY cannot tell that it is convex (of {within})"
+    return f"found {_short(stated)}, whose convexity CVXPY cannot verify (of {within})"
 
 
 def _short(expression: Any) -> str:

@@ -164,9 +164,9 @@ def advice(structure: Structure, status: str, found: Conflict | None) -> str:
     if found is not None:
         return ""
     if status.startswith("unbounded"):
-        return "loss and penalty seem to fall without end: give it a larger weight, or a start nearer to the data"
+        return "the objective appears to be unbounded below: use a larger weight, or a start nearer to the data"
     if structure.constrained and status.startswith(("infeasible", "optimal")):
         return (
-            "its constraints can be met, but not to the solver's accuracy: check their units, or loosen them a little"
+            "its constraints are feasible, but not to the solver's accuracy: check their units, or loosen them slightly"
         )
-    return "the solver did not reach its accuracy: give a larger weight, or another solver (solver=..., settings=...)"
+    return "the solver did not reach its accuracy: use a larger weight, or another solver (solver=..., settings=...)"

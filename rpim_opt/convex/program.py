@@ -650,7 +650,7 @@ class Program(Brief):
         point = np.array(z.value)
         if not self.meets(point):
             missed = self.violation(point)
-            raise self._failure(f"{problem.status}, but outside the constraints by {missed:.1e}", weight)
+            raise self._failure(f"{problem.status}, but violates the constraints by {missed:.1e}", weight)
         values = [[np.ravel(np.asarray(c.dual_value, dtype=float)) for c in group] for group in groups]
         iterations = int(problem.solver_stats.num_iters or 0)
         return replace(self._at(point, weight, self._by_function(values), iterations), status=problem.status)

@@ -488,7 +488,7 @@ def _for_triangle(formulation: Formulation, equations: int) -> Formulation:
     """
     if not invariant(formulation, lambda: equations):
         found = f"formulation '{formulation.name}'"
-        raise InputError(found, "equations of which only the triangle is kept", "a squared loss")
+        raise InputError(found, "equations in blocks, of which only the QR factor is kept", "a squared loss")
     form = None
     if formulation.loss not in INVARIANT:
         form = _loss_form(formulation, equations)

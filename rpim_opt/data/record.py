@@ -126,7 +126,7 @@ class HeldOut:
         missed = f"{1e3 * np.nanmean(self.error):.4f} mm"
         return (
             f"Validated on {len(self.label)} held-out rows: parameters from the {self.used} others missed "
-            f"them by {missed} in the mean. The parameters given here come from all {rows}."
+            f"them by {missed}. The parameters given here are from all {rows}."
         )
 
 

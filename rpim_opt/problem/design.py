@@ -372,7 +372,7 @@ class Observability(Brief):
         (n,) of the whitened Jacobian in units of the scales: how many standard deviations of the noise a
         deviation of one scale along that direction moves the data. Zeros are unseen directions.
     rank
-        Number of directions that the data see.
+        Number of identifiable combinations.
     configurations
         Number of configurations.
     unseen
@@ -411,11 +411,11 @@ class Observability(Brief):
     raw_condition: float
 
     def _short(self) -> str:
-        return f"{self.rank} of {len(self.names)} directions seen, condition {self.condition:.3g}"
+        return f"{self.rank} of {len(self.names)} combinations identifiable, condition {self.condition:.3g}"
 
     @property
     def indices(self) -> dict[str, float]:
-        """Observability indices O1 to O5 on the directions that the data see, larger is better.
+        """Observability indices O1 to O5 on the identifiable combinations, larger is better.
 
         With singular values s_1 >= ... >= s_r and N configurations (Sun and Hollerbach 2008, ICRA)::
 

@@ -108,7 +108,7 @@ class Inspection(Tabled):
 
     def _short(self) -> str:
         o = self.observability
-        seen = f"{o.rank} of {len(o.names)} directions seen"
+        seen = f"{o.rank} of {len(o.names)} combinations identifiable"
         return f"{self.problem.data._short()}, {seen}, {counted(len(self.warnings), 'warning')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
@@ -213,17 +213,17 @@ class Inspection(Tabled):
         o = self.observability
         weak = int(np.count_nonzero(o.singular_values[: o.rank] < 1))
         lines = [
-            f"{len(o.names)} parameters to identify, {o.rank} directions that the data see; {weak} of them weaker "
-            "than the prior.",
+            f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {weak} of them less precisely "
+            "than by the prior.",
             f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; "
             + ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
             + ".",
         ]
         if o.unseen:
-            lines.append(f"Not seen at all: {', '.join(o.unseen)}.")
+            lines.append(f"Unidentifiable: {', '.join(o.unseen)}.")
         if o.redundant:
             named = "; ".join(combination(terms) for terms in o.redundant)
-            lines.append(f"Free to move without any effect (mm, mrad): {named}.")
+            lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
         return "\n".join(lines)
 
 
@@ -343,7 +343,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
             yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
         if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
-            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are hardly seen."
+            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are poorly identifiable."
     turning = [i for i, dimension in enumerate(robot.joint_dimensions) if dimension == "angle"]
     if turning:
         largest = np.abs(q[:, turning]).max()
@@ -404,7 +404,7 @@ def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
     if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
-            f"{listed(copies)}. Its error says less than it seems: draw them apart (rpim-opt new --hold-out)."
+            f"{listed(copies)}. Its error is too optimistic: separate the sets (rpim-opt new --hold-out)."
         )
 
 
@@ -491,8 +491,8 @@ def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
         made = step / np.sqrt(12) * float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
-                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone makes "
-                f"{three_digits(1e3 * made)} mm, the fit is off by {three_digits(1e3 * error)} mm: "
+                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone contributes "
+                f"{three_digits(1e3 * made)} mm, the residual RMS is {three_digits(1e3 * error)} mm: "
                 "export them with more decimals."
             )
             return
@@ -668,25 +668,26 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
     kinds = {"points": touches.planar.count(False), "planes": touches.planar.count(True)}
     things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
     yield (
-        f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} directions are "
-        "seen better than the scales say. Where the robot stands and how its first joint is counted no touch shows."
+        f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} parameter "
+        "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
+        "offset of the first joint."
     )
     drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
     known = {problem.labels[i] for block in drawn for i in block.row}
     alone = _scale(problem, problem.without(known).linearize(x).A)
     if alone is None:
-        yield "All that was touched is in one place: the robot's scale is that of the drawing."
+        yield "All touched points are in one place: the size of the robot rests on its nominal lengths."
         return
     by_touches = f"{1e3 * alone:.2g} mm in a metre"
     if not known:
         yield (
             f"Distances between touched places: known to {by_touches} by touches and the scales of the file; a known "
-            "distance between two of them ([[known_distance]]) would show how large the robot is."
+            "distance between two of them ([[known_distance]]) would determine the size of the robot."
         )
         return
     yield (
         f"Distances between touched places: known to {1e3 * (_scale(problem, model.A) or alone):.2g} mm in a metre, "
-        f"and to {by_touches} without what the drawing knows of them."
+        f"and to {by_touches} without the stated distances."
     )
 
 

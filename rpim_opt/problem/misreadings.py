@@ -138,7 +138,7 @@ class Better(NamedTuple):
         """Say it with the figures."""
         alike = ""
         if ", or " in self.what:
-            alike = " These fit alike, and differ in what the data do not show: change what the set-up confirms."
+            alike = " These explain the data equally well: apply the one that the set-up confirms."
         figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
         times = three_digits(self.stated / max(self.left, EXACT))
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"

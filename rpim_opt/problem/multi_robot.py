@@ -100,7 +100,7 @@ def _require_parts(parts: Mapping[str, CalibrationProblem], count: int) -> None:
         if len(part.arms) > 1:
             raise InputError(where, "several robots", "one; give all problems in one call")
         if part.scatter is not None:
-            accepted = "none: it is learned, or stated of the whole by .scattered()"
+            accepted = "none: it is estimated, or stated for the whole problem by .scattered()"
             raise InputError(where, "the robot's scatter", accepted)
 
 

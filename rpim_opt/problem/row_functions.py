@@ -222,7 +222,7 @@ def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: S
     for name in measurement.sees:
         if name not in known:
             where = f"measurement {measurement.name}"
-            raise InputError(where, f"data without '{name}', which it sees", "data that state it in every row")
+            raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
         own[name] = known[name]
     return own
 
@@ -326,8 +326,8 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
     """Return what commands state that are to be compensated: torques, or a payload where those of gravity count."""
     needs = Needs.of(robot, parameters)
     if needs.columns:
-        accepted = "a calibration without it: nothing says what it will be where commands are to be corrected"
-        raise InputError("compensation", f"a term that sees column '{min(needs.columns)}'", accepted)
+        accepted = "a calibration without it: its value at the corrected commands is unknown"
+        raise InputError("compensation", f"a term that depends on column '{min(needs.columns)}'", accepted)
     weighs = needs.torques and not measured_torques(data)
     gravity = robot.gravity if weighs or needs.moments else None
     return Loads(torques=torques, payload=weighs or needs.payload, gravity=gravity, weighs=weighs)
@@ -361,7 +361,7 @@ def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
     for block in data.blocks:
         for name in sorted({*needed, *block.measurement.extra} - {*block.columns}):
             accepted = f"a column '{name}' of the table, or Dataset.of(..., columns={{'{name}': ...}})"
-            raise InputError("data", f"no column '{name}', which a term or a measurement sees", accepted)
+            raise InputError("data", f"no column '{name}', on which a term or a measurement depends", accepted)
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:

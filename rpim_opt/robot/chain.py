@@ -74,7 +74,7 @@ def describe(
     """Return the MDH table (n, 5), base (4, 4), tool (4, 4), and what ties the chain's frames to the table's.
 
     Joint i+1 is reached from joint i by Rot(z, theta_i) Trans(z, d_i) Rot(y, beta_i) Rot(x, alpha_i+1)
-    Trans(x, a_i+1): six numbers for a line have one freedom to spare. Where the axes cross at more than
+    Trans(x, a_i+1): six numbers for a line have one degree of freedom to spare. Where the axes cross at more than
     ``parallel`` [rad], beta_i = 0 and x is the common normal (Craig). Otherwise d_i = 0 and x is the perpendicular
     from frame i's origin to the next axis, which beta_i tilts out of the plane (Hayati 1983): every number stays
     finite and changes little with the axes. Of the two directions of x the one nearer to theta_i = 0 is taken.

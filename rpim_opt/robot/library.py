@@ -15,7 +15,7 @@ from rpim_opt.robot.formats.tables import read_robot, read_sheet
 READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
 REFUSED = {
-    XACRO: "a xacro file, which only a command or a script may name: it is carried out",
+    XACRO: "a xacro file, which only a command or a script may name: it is executed",
     ".xml": "an XML file, of MuJoCo or others",
     ".mjcf": "a model of MuJoCo",
     ".sdf": "an SDF file",
@@ -57,7 +57,7 @@ def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = No
     if file.suffix == ".csv":
         return read_sheet(file, convention)
     if convention:
-        raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files say their convention")
+        raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files state their convention")
     return Described(read_robot(file), np.zeros(6), np.zeros(6))
 
 

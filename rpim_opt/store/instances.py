@@ -407,7 +407,7 @@ def _relation(table: DistanceTable | AngleTable, where: str, path: Path) -> tupl
     if sigma is None:
         if not table.validation:
             unit = "mm" if isinstance(table, DistanceTable) else "mrad"
-            accepted = "the standard deviation of what the drawing states"
+            accepted = "the standard deviation of the stated value"
             raise InputError(f"{where}.sigma_{unit}", "nothing", accepted, path)
         sigma = UNSTATED
     return (first, second), sigma

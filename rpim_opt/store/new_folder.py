@@ -129,7 +129,7 @@ def new_problem(
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
     tables = {IDENTIFICATION: columns}
-    said = f'# validation = "{VALIDATION}"   # a table that no choice may see; none was given'
+    said = f'# validation = "{VALIDATION}"   # a table that is used for no choice; none was given'
     if validation is not None:
         other = understand_of(arm, [validation], kind.name, found.options)
         try:
@@ -138,7 +138,7 @@ def new_problem(
             raise error.within(validation) from None
         tables[VALIDATION] = other.columns
         notes += other.sentences
-        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; no choice sees it'
+        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; used for no choice'
     elif hold_out is not None:
         held = _held_out(rows, hold_out, seed)
         tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}

@@ -168,7 +168,7 @@ def _round_ticks(ax: Any) -> None:
 CAPTION = (
     "Left: every replicate's figure over the reference's on the same data, and the geometric mean with its interval "
     "(green or red where that leaves 1 out). Right: the share of replicates on which a method is within a ratio of the "
-    "best one; a method without a figure never is."
+    "best one; a method without a figure counts as never."
 )
 
 
@@ -221,7 +221,7 @@ def headline(summary: Summary) -> str:
     between = ""
     if best.low is not None and best.high is not None:
         between = f" (95 % interval {number(best.low)} to {number(best.high)})"
-    chance = "" if best.different else " That is no difference that these replicates can tell from none."
+    chance = "" if best.different else " These replicates do not show a significant difference."
     return (
         f"{best.method} has the lowest {summary.metric}: {number(best.ratio)} times that of {summary.reference} in the "
         f"geometric mean{between}.{chance}"

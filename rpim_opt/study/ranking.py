@@ -280,10 +280,11 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if len(problems) < ENOUGH:
             of_family = problems <= drawn
             scope = "other arms of the same family" if of_family else "these problems alone, with other seeds or folds"
-        text = f"Intervals speak of {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
+        text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
         if compared > 1:
             chance = (1 - CONFIDENCE) * compared
-            text += f" Each is for itself: where nothing differs, {chance:.2g} of {compared} would be marked by chance."
+            text += " No correction for multiple comparisons: without any difference, "
+            text += f"{chance:.2g} of {compared} would be marked by chance."
         said.append(text)
     elif len(standings) > 1:
         few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"

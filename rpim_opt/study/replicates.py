@@ -92,11 +92,11 @@ def _resumed(
         base.executemany("INSERT INTO code VALUES (?, ?)", list(code.items()))
         return {}
     if resume is None:
-        accepted = "resume, to go on with them, or no-resume, to begin anew"
+        accepted = "resume, to continue with them, or no-resume, to start again"
         raise InputError("resume", f"{len(stored)} replicates of an interrupted run", accepted, path)
     for part in [*code, *known]:
         if code.get(part) != known.get(part):
-            accepted = "what began, or no-resume, to begin anew"
+            accepted = "what began, or no-resume, to start again"
             raise InputError("resume", f"replicates of another {part}", accepted, path)
     for key, text, digest in stored:
         if digest != _digest(code, key, text):
@@ -161,7 +161,9 @@ def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[t
     try:
         yield from finished
     except BrokenExecutor as error:
-        raise RpimError(f"A process ended before its replicate was done: {error} What was finished is kept.") from None
+        raise RpimError(
+            f"A process ended before its replicate was done: {error} Finished replicates are kept."
+        ) from None
 
 
 def _on_cluster(tasks: Sequence[tuple[str, Work]], scheduler: Any) -> Iterator[tuple[str, Row]]:
@@ -182,4 +184,4 @@ def _on_cluster(tasks: Sequence[tuple[str, Work]], scheduler: Any) -> Iterator[t
                 yield future.result()
         except (KilledWorker, CancelledError) as error:  # whoever computes it dies, or the scheduler has
             said = next(iter(str(error).splitlines()), type(error).__name__)
-            raise RpimError(f"Dask gave a replicate up: {said} What was finished is kept.") from None
+            raise RpimError(f"Dask gave a replicate up: {said} Finished replicates are kept.") from None

@@ -141,7 +141,7 @@ class Monitoring:
         count = f"{len(self.label)} checks"
         lines = [f"No drift in {count}."]
         if self.drifts:
-            lines = [f"The robot is not where its calibration says, in {count}."]
+            lines = [f"The robot deviates from its calibration in {count}."]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")

@@ -168,7 +168,7 @@ class Update:
         elif self.before.likely:
             lines = [f"The robot has not changed, as far as {count} can tell: {self.before}."]
         else:
-            lines = [f"{count} miss the last calibration by more than it allows: {self.before}."]
+            lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
         for cause in self.changes:
             end = ", left out" if cause.kind == "reading" else ""
             figures = f"chi-squared falls by {cause.gain:.1f}, probability {cause.probability:.2g}"
@@ -177,13 +177,13 @@ class Update:
             lines.append(f"Moved since: {joined([str(each) for each in self.moved])}.")
         rivals = [c.name for c in self.causes[1:] if self.changes and c.probability > RIVAL]
         if rivals:
-            lines.append(f"These readings do not tell it apart from a change of {joined(rivals)}: measure more.")
+            lines.append(f"These readings do not distinguish it from a change of {joined(rivals)}: measure more.")
         if self.changes:
             lines.append(f"With these changes: {self.after}.")
         if not self.explained:
             lines.append(
-                "No few changes of parameters, frames or readings explain the rest: is it the same robot? "
-                "If so, calibrate it without the previous result."
+                "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
+                "robot; if so, calibrate it without the previous result."
             )
         rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
@@ -315,7 +315,7 @@ def _record(result: Calibration, inflation: float, released: Sequence[str], left
         tuple(released),
         tuple(left_out),
     )
-    excluded = dict.fromkeys(left_out, "far from what the last calibration allows")
+    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
     earlier = (*old.earlier, last)
     return Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier)
 

@@ -128,14 +128,14 @@ class Validation:
 
     def _judgement(self) -> str:
         if not np.isfinite(self.sigmas).any():
-            return "The calibration has no covariance for these rows: how large errors may be is not known."
+            return "The calibration has no covariance for these rows: there are no prediction intervals."
         covered = ""
         if self.coverage is not None:
             covered = f" {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals of a reading."
         if not self.beyond:
-            return f"No row is beyond what the prediction's uncertainty allows.{covered}"
+            return f"No row is outside its prediction interval.{covered}"
         named = [f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
-        return f"Beyond what the prediction's uncertainty allows: {listed(named)}.{covered}"
+        return f"Outside their prediction intervals: {listed(named)}.{covered}"
 
     def _rows(self) -> dict[str, Sequence[Any]]:
         columns = {"nominal_mm": 1e3 * self.nominal, "error_mm": 1e3 * self.error}

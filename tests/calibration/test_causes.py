@@ -113,7 +113,7 @@ def test_a_robot_that_bends_is_no_mistake() -> None:
     noisy = values(lambda y: y + 2e-3 * rng.normal(size=y.shape))(problem)
     causes = likely_causes(calibrated(noisy))
     assert len(causes) == 2
-    assert causes[1].startswith("No mistake that was tried explains it")
+    assert causes[1].startswith("None of the tested mistakes explains it")
 
 
 def test_validation_rows_that_are_identification_rows_are_named() -> None:

@@ -233,23 +233,24 @@ def test_three_idle_passes_are_enough_and_two_are_not() -> None:
 
 def test_why_passes_ran_out() -> None:
     falling = tuple(Iteration(100.0 - k, 1.0, 1.0, 0.0) for k in range(8))
-    assert unfinished(state(history=falling), 8) == "8 passes were not enough; give more (max_iterations)."
+    assert unfinished(state(history=falling), 8) == "8 iterations were not enough; allow more (max_iterations)."
     level = tuple(Iteration(100.0 - 2e-8 * k, 1.0, 1.0, 0.0) for k in range(8))
     flat = unfinished(state(history=level), 8)
     assert flat == (
-        "8 passes were not enough, though the objective hardly changes: the data hardly decide, give a larger weight."
+        "8 iterations were not enough, though the objective hardly changes: the data hardly determine the solution; "
+        "use a larger weight."
     )
-    assert unfinished(state(history=level[:4]), 1) == "1 pass was not enough; give more (max_iterations)."
+    assert unfinished(state(history=level[:4]), 1) == "1 iteration was not enough; allow more (max_iterations)."
     slowly = tuple(Iteration(100.0 - 1e-6 * k, 1.0, 1.0, 0.0) for k in range(8))
-    assert "give more" in unfinished(state(history=slowly), 8)
+    assert "allow more" in unfinished(state(history=slowly), 8)
     late = (*falling, *level)
-    assert "hardly decide" in unfinished(state(history=late), 16)
-    assert "give more" in unfinished(state(history=(*level, *falling)), 16)
+    assert "hardly determine" in unfinished(state(history=late), 16)
+    assert "allow more" in unfinished(state(history=(*level, *falling)), 16)
 
 
 def test_why_a_loop_at_rest_has_not_converged() -> None:
-    assert "still promises 0.002 of the objective" in uncertified(Certificate(None, 1.0, 0.0, 0.002))
-    assert "constraints are missed by 3e-05 scales" in uncertified(Certificate(None, 1.0, 3e-5, 1e-9))
+    assert "still predicts a decrease by 0.002 of the objective" in uncertified(Certificate(None, 1.0, 0.0, 0.002))
+    assert "constraints are violated by 3e-05 scales" in uncertified(Certificate(None, 1.0, 3e-5, 1e-9))
     assert "nothing certifies it" in uncertified(Certificate(None, 1.0, 0.0, None))
 
 

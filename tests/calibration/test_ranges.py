@@ -1,4 +1,4 @@
-"""Rows beyond the measured joint ranges are counted, by joint, with a tenth of the range to spare."""
+"""Rows beyond the measured joint ranges are counted, by joint, with a tenth of the range of slack."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ def test_a_selector_that_settles_is_not_said_to_alternate() -> None:
 def test_too_few_passes_are_the_cause_that_is_named() -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0, max_iterations=1)
     assert not result.converged
-    assert re.search(r"\b(1|one) pass\b", result.message)
+    assert re.search(r"\b(1|one) iteration\b", result.message)
     assert "weight" not in result.message  # no larger weight helps against a limit of one pass
 
 

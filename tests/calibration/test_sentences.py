@@ -56,9 +56,9 @@ def test_rows_that_were_kept_apart_may_say_little() -> None:
 def test_a_bound_above_the_limit_says_what_would_lower_it() -> None:
     assert _wide(1e-4, 1e-4, 5e-5) == []
     (open_directions,) = _wide(1e-4, np.inf, 5e-5)
-    assert "directions that neither data nor penalty decide" in open_directions
+    assert "combinations which neither data nor penalty determine" in open_directions
     (scatter,) = _wide(1e-4, 3e-4, 2e-4)
-    assert scatter.startswith("Lacking: a better known scatter.")
+    assert scatter.startswith("Lacking: a more precise repeatability.")
     (more,) = _wide(1e-4, 3e-4, 5e-5)
     assert more.startswith("Lacking: measurements. The bound is 0.300 mm")
 

@@ -133,11 +133,11 @@ def test_a_lower_end_that_runs_away_is_left_for_the_last_answer_inside() -> None
     assert end.selection is not None
     assert (end.selection.weight, end.selection.interior) == (30.0, True)
     assert end.note == (
-        "The rule mine wants ever less penalty, 0.001 and then 1e-09: "
-        "its last answer inside the weights that it tried, 30, is used."
+        "The rule mine decreases the weight at every iteration, 0.001 and then 1e-09: "
+        "its last choice inside the range of weights, 30, is used."
     )
     assert end.confirmed(DEAR) is end
-    still = followed(30.0, -1e-3, -0.9e-3)  # the end that it was: the data want no penalty
+    still = followed(30.0, -1e-3, -0.9e-3)  # the end that it was: the data support no penalty
     assert (still.weight, still.final, still.note) == (0.9e-3, False, "")
     assert followed(30.0, -1e-3, -0.995e-3).final
 
@@ -150,9 +150,7 @@ def test_a_lower_end_with_no_answer_inside_before_it_is_followed() -> None:
 def test_an_answer_that_comes_back_from_the_lower_end_is_an_alternation() -> None:
     end = followed(-1e-3, 30.0, -1e-9, 30.1)
     assert (end.weight, end.settled, end.final) == (30.1, True, True)
-    assert end.note == (
-        "The rule mine alternates between 30 and 1e-09: the larger one, which holds back more, is used."
-    )
+    assert end.note == ("The rule mine alternates between 30 and 1e-09: the larger one is used.")
     assert not followed(-1e-3, 30.0, -1e-9, 40.0).final
 
 
@@ -200,7 +198,7 @@ def test_answers_more_than_a_decade_apart_end_at_the_larger(low: float, high: fl
         end = asked(4, one, other, one, other)
         assert end.weight == pytest.approx(used, rel=1e-12)
         assert end.final
-        assert ("the larger one, which holds back more, is used" in end.note) == (used == high)
+        assert ("the larger one is used" in end.note) == (used == high)
 
 
 def test_answers_that_repeat_are_no_turn() -> None:

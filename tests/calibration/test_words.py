@@ -97,7 +97,7 @@ def test_a_weight_is_said_with_where_it_came_from() -> None:
     assert (RESULT.selector, RESULT.penalty_weight) == ("given", 1e-3)
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, "0 passes"), (1, "1 pass"), (2, "2 passes")])
+@pytest.mark.parametrize(("count", "said"), [(0, "0 iterations"), (1, "1 iteration"), (2, "2 iterations")])
 def test_passes_are_counted(count: int, said: str) -> None:
     good, bad = Certificate(None, 0.0, 0.0, 0.0), Certificate(None, 0.0, 0.0, 0.5)
     before = state(history=(None,) * count, outcome="rest")
@@ -109,9 +109,9 @@ def test_passes_are_counted(count: int, said: str) -> None:
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
     assert said_of(noted) == f"Converged after {said}. It alternates."
     assert "no step lowers the nonlinear objective" in said_of(replace(before, outcome="stuck"))
-    assert "still promises 0.5 of the objective" in said_of(before, bad)
+    assert "still predicts a decrease by 0.5 of the objective" in said_of(before, bad)
     ended = said_of(replace(before, outcome="", history=()), most=7)
-    assert ended == "Not converged: 7 passes were not enough; give more (max_iterations)."
+    assert ended == "Not converged: 7 iterations were not enough; allow more (max_iterations)."
 
 
 def test_turns_of_frames_are_no_differences() -> None:

@@ -64,7 +64,7 @@ def test_a_triangle_stands_for_its_equations_where_the_loss_sees_their_length() 
         whole, reduced = (ro.convex.pose(formulation, m).solve(0.7).objective for m in (MODEL, triangle))
         assert reduced == pytest.approx(whole, rel=1e-7)
     for formulation in (ro.robust, ro.Formulation("l1", loss=cp.norm1)):
-        with pytest.raises(ro.InputError, match="equations of which only the triangle is kept"):
+        with pytest.raises(ro.InputError, match="equations in blocks, of which only the QR factor is kept"):
             ro.convex.pose(formulation, triangle)
 
 

@@ -75,7 +75,7 @@ def test_what_cannot_be_meant_is_named(what: str) -> None:
 
 
 def test_the_innermost_part_that_breaks_the_rules_is_named() -> None:
-    with pytest.raises(ro.InputError, match="CVXPY cannot tell that it is convex") as error:
+    with pytest.raises(ro.InputError, match="convexity CVXPY cannot verify") as error:
         posed(constraints=lambda z, p: 1 + cp.sqrt(cp.sum_squares(z)) <= 2).solve(1.0)
     assert "1 +" not in str(error.value)
 

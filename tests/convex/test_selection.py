@@ -138,4 +138,4 @@ def test_reml_says_what_it_cannot_choose() -> None:
     sphere = ro.load("sphere").problem
     chosen = ro.reml(ro.convex.pose(ro.tikhonov, sphere.linearize(np.zeros(len(sphere.parameters.free)))))
     assert (chosen.weight, chosen.interior) == (1.0, False)
-    assert "taken at their word" in chosen.note
+    assert "stated noise and scales are used" in chosen.note

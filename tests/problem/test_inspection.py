@@ -18,7 +18,7 @@ CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axi
 def test_good_data_raise_no_suspicion(name: str) -> None:
     found = inspect(ro.load(name).problem)
     assert not [text for text in found.warnings if "better" in text or "?" in text]
-    assert "directions that the data see" in str(found)
+    assert "parameter combinations are identifiable" in str(found)
 
 
 def changed(name: str, q=lambda q: q, y=lambda y: y) -> ro.CalibrationProblem:
@@ -107,8 +107,8 @@ def test_the_command(monkeypatch, capsys) -> None:
     out = capsys.readouterr().out
     for part in (
         "joint 6 moves only 0.00 deg",
-        "Not seen at all",
-        "Free to move without any effect",
+        "Unidentifiable",
+        "Redundant combinations",
         "O1",
         "typical sigma",
     ):

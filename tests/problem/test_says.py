@@ -13,7 +13,7 @@ from tests.simulate import simulated
 
 
 def sockets(names: tuple[str, ...], stated: bool = False) -> ro.CalibrationProblem:
-    """Return touches of some sockets of a plate, with or without what the drawing knows of them."""
+    """Return touches of some sockets of a plate, with or without the stated distances."""
     problem = ro.load("contact").problem
     data = problem.data
     kept = [
@@ -30,9 +30,9 @@ def sockets(names: tuple[str, ...], stated: bool = False) -> ro.CalibrationProbl
 def test_the_scale_that_touches_show_is_said() -> None:
     many = " ".join(contact_sentences(sockets(("A", "B", "C", "D"))))
     assert "24 touches of 4 points" in many
-    assert "a known distance between two of them ([[known_distance]]) would show how large the robot is." in many
+    assert "a known distance between two of them ([[known_distance]]) would determine the size of the robot." in many
     single = list(contact_sentences(sockets(("A",))))
-    assert single[1] == "All that was touched is in one place: the robot's scale is that of the drawing."
+    assert single[1] == "All touched points are in one place: the size of the robot rests on its nominal lengths."
     planes = " ".join(contact_sentences(ro.load("datum_cube").problem))
     assert " planes: " in planes
     assert " points" not in planes.partition(":")[0]

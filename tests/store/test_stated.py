@@ -52,7 +52,7 @@ def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
     assert [price["text"] for price in prices] == [price.text for price in result.prices]
     assert [price["multiplier"] for price in printed["prices"]] == [price["multiplier"] for price in prices]
     sentence = next(price for price in result.prices if price.holds).sentence()
-    assert "would lower the misfit by" in sentence
+    assert "would lower the objective by" in sentence
     assert sentence in printed["remarks"]
     assert sentence in str(result)
 
@@ -86,7 +86,7 @@ four = { x_mm = [400, 500], y_m = [-0.3, 0.3], z_mm = [-200, 200] }
     [
         ('stated = ["a3 = 425 kg"]', "unit 'kg'"),
         ('stated = ["a3 = 425 deg"]', "unit deg"),
-        ('stated = ["a3 = 425 m"]', "misses by 424.6 m"),
+        ('stated = ["a3 = 425 m"]', "violate by 424.6 m"),
         ('stated = ["a33 = 425 mm"]', "'a33'"),
         ('stated = "a3 = 425 mm"', "'a3 = 425 mm'"),
         ("stated = [3]", "3"),
@@ -113,5 +113,5 @@ def test_a_contradiction_is_named(folder: Path) -> None:
     stating(folder, '\n[variant.no.constraints]\nstated = ["a3 = 425 mm", "a3 >= 426 mm", "a5 <= 0 mm"]\n')
     with pytest.raises(ro.NoSolutionFound) as error:
         ro.load(folder, "no").calibrate()
-    assert "these cannot hold together: 'a3 = 425 mm', 'a3 >= 426 mm'" in str(error.value)
+    assert "these constraints contradict each other: 'a3 = 425 mm', 'a3 >= 426 mm'" in str(error.value)
     assert "a5" not in str(error.value)

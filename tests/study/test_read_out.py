@@ -41,7 +41,7 @@ def test_a_better_method_is_named_with_its_interval() -> None:
 def test_a_difference_that_may_be_chance_is_said_to_be_none() -> None:
     sizes = [0.2, 5.0, 0.3, 2.0, 0.4, 1.0]
     found = compared({"a": even(1.0), "b": dict(zip(SIX, sizes, strict=True))})
-    assert headline(found.summary()).endswith("That is no difference that these replicates can tell from none.")
+    assert headline(found.summary()).endswith("These replicates do not show a significant difference.")
 
 
 def test_without_intervals_none_is_said() -> None:

@@ -60,15 +60,15 @@ def test_an_update_says_what_came_out() -> None:
     assert str(found).startswith("The robot has not changed, as far as 8 readings can tell: chi-squared")
     assert found.explained
     lost = replace(found, before=unlikely(found.before), after=unlikely(found.after), changes=())
-    assert "8 readings miss the last calibration by more than it allows" in str(lost)
-    assert "No few changes of parameters, frames or readings explain the rest: is it the same robot?" in str(lost)
+    assert "8 readings lie outside the prediction intervals of the last calibration" in str(lost)
+    assert "No small set of changed parameters, frames or readings explains the rest." in str(lost)
     wrong = replace(found, before=unlikely(found.before), changes=(READING,), causes=(READING,))
     assert str(wrong).startswith("The robot has not changed, but readings are wrong: ")
     assert "reading c1: chi-squared falls by 40.0, probability 0.9, left out." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
     assert str(moved).startswith("The robot has changed: ")
-    assert "These readings do not tell it apart from a change of theta3: measure more." in str(moved)
+    assert "These readings do not distinguish it from a change of theta3: measure more." in str(moved)
     assert "left out" not in str(moved)
     sure = replace(moved, causes=(JOINT,))
     assert "do not tell it apart" not in str(sure)
@@ -89,7 +89,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     sums = np.array([0.0, 0.0, 1.0, 2.0, 9e9, 9e9, 9e9, 9e9])
     found = replace(quiet, sums=sums, drift=drift)
     lines = str(found).splitlines()
-    assert lines[0] == "The robot is not where its calibration says, in 8 checks."
+    assert lines[0] == "The robot deviates from its calibration in 8 checks."
     assert lines[1] == "Cumulative sum above its limit: alarm at '5', since '3'."
     assert said in lines[2]
     assert found.content()["since"] == "3"
@@ -223,7 +223,7 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
 
 def test_validation_says_what_it_knows_and_what_not() -> None:
     bare = str(ro.use.validate(calibrated("lasso"), checks()))
-    assert "has no covariance for these rows: how large errors may be is not known." in bare
+    assert "has no covariance for these rows: there are no prediction intervals." in bare
     assert "orientation" not in bare
     pose = ro.load("pose")
     assert pose.validation is not None

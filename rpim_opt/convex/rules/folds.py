@@ -120,7 +120,9 @@ def two_step(program: Program) -> Selection:
     interior = 0 < best < len(fine) - 1
     note = "the paper's two steps: residual norm, then held-out error"
     if not interior:
-        note += "; the held-out error is smallest at an edge of the ten weights, so a wider search would go on"
+        note += (
+            "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
+        )
     return Selection(float(fine[best]), "two_step", fine, score, interior, note)
 
 

@@ -112,7 +112,7 @@ def reml(program: Program) -> Selection:
     Points on a plane or sphere are met by a robot shrunk to nothing, so that their fit tells no noise level: the
     weight is 1, declared noise and scales at their word. With few data a second maximum may lie at infinite
     weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
-    at the lower edge means that the data want no penalty. Constraints are left out of the likelihood.
+    at the lower edge means that the data support no penalty. Constraints are left out of the likelihood.
 
     InputError for another penalty than a quadratic.
 
@@ -123,13 +123,13 @@ def reml(program: Program) -> Selection:
     """
     if program.model.constrained and program.penalty_form is not None:
         weights = weight_grid(program)
-        note = "points on a plane or sphere do not tell it: declared noise and scales are taken at their word"
+        note = "points on a plane or sphere do not determine it: stated noise and scales are used"
         return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
     rule = Rule("reml", _restricted_likelihood, "largest restricted likelihood", local=True)
     chosen = linear_rule(program, rule)
     if chosen.interior or chosen.weight < 1.0:
         return chosen
-    note = "the data do not tell how large deviations are: declared noise and scales are taken at their word"
+    note = "the data do not determine the scale of the deviations: stated noise and scales are used"
     return replace(chosen, weight=1.0, note=note)
 
 
@@ -220,11 +220,11 @@ def discrepancy(program: Program) -> Selection:
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
     if not len(fits):
-        note = "no weight fits as well as the declared noise promises: it is too small, or the model lacks something"
+        note = "no weight fits as well as the stated noise implies: it is too small, or the model lacks an effect"
         return replace(chosen, weight=float(weights[0]), interior=False, note=note)
     k = int(fits[-1])
     if k == len(weights) - 1:
-        note = "every weight fits better than the declared noise: it is stated too large"
+        note = "every weight fits better than the stated noise: it is stated too large"
         return replace(chosen, weight=float(weights[k]), interior=False, note=note)
     # between the last weight that fits and the next, where the score crosses zero
     share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])

@@ -131,8 +131,8 @@ SAME_WEIGHT = 1.1
 """Ratio of weights up to which a search does not tell them apart."""
 
 EDGES = {
-    "lower": "the smallest weight of the grid is best: the data want no penalty",
-    "upper": "the largest weight of the grid is best: the data want no deviation",
+    "lower": "the smallest weight of the grid is best: the data support no penalty",
+    "upper": "the largest weight of the grid is best: the data support no deviation",
 }
 """What it means that a rule chooses an edge of its grid."""
 
@@ -145,7 +145,7 @@ def edge(best: int) -> str:
 def with_rows(program: Program, name: str) -> LinearModel:
     """Return the model for a rule that leaves rows out, if it has its rows."""
     if program.model.stands_for is not None:
-        found = f"{program.model.equations} equations of which only the triangle is kept"
+        found = f"{program.model.equations} equations in blocks, of which only the QR factor is kept"
         raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
     return program.model
 
