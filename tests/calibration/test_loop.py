@@ -251,7 +251,7 @@ def test_why_passes_ran_out() -> None:
 def test_why_a_loop_at_rest_has_not_converged() -> None:
     assert "still predicts a decrease by 0.002 of the objective" in uncertified(Certificate(None, 1.0, 0.0, 0.002))
     assert "constraints are violated by 3e-05 scales" in uncertified(Certificate(None, 1.0, 3e-5, 1e-9))
-    assert "nothing certifies it" in uncertified(Certificate(None, 1.0, 0.0, None))
+    assert "the solution is not certified" in uncertified(Certificate(None, 1.0, 0.0, None))
 
 
 @pytest.mark.parametrize(
