@@ -293,7 +293,7 @@ def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp
     arguments = ["validate", str(made / "results"), str(cell / "later.csv"), "--units", "rad,m"]
     assert run(monkeypatch, *arguments, "--limit", "0.1", "--out", str(tmp_path / "rows.csv")) == 0
     said = capsys.readouterr().out
-    assert "No row is beyond" in said
+    assert "No row is outside" in said
     assert "touches by point" not in said
     result, rows = ro.load_result(made / "results"), table(cell / "later.csv")[1]
     error = np.linalg.norm(rows[:, :3] - result.forward(rows[:, 3:])[:, :3, 3], axis=1)
@@ -314,7 +314,7 @@ def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, 
     assert json.loads(capsys.readouterr().out)["beyond"] == ["8"]
     assert run(monkeypatch, *arguments) == 0
     said = capsys.readouterr().out
-    assert "allows: 8 (" in said
+    assert "intervals: 8 (" in said
     assert "left out: temperature." in said
 
 

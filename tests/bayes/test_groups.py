@@ -185,7 +185,7 @@ def test_points_on_a_surface_and_pure_noise_leave_the_weights_at_one() -> None:
     noise = replace(simulated(1, {}), b=1e3 * rng.standard_normal(150))
     found = reml_groups(Grouped.of(noise, {"*": ro.reml}))
     if found.groups["*"] == 1.0:
-        assert "the data do not tell" in found.note
+        assert "the data do not determine" in found.note
 
 
 def test_statements_hold_what_has_no_penalty() -> None:

@@ -124,14 +124,14 @@ def test_the_three_verdicts(result) -> None:
     assert "design PROBLEM --augment" in between.reasons[0]
     few = accept(result, Requirement(0.1 * bound))
     assert few.verdict == "undecided"  # nothing shows that a better calibration would not do
-    assert "scatter" in few.reasons[0]
+    assert "repeatability" in few.reasons[0]
 
 
 def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
     problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
     found = accept(ro.calibrate(problem), Requirement(2e-4))
     assert found.verdict == "rejected"
-    assert "own scatter alone" in found.reasons[0]
+    assert "repeatability alone" in found.reasons[0]
     assert found.scatter > 2e-4
 
 
@@ -152,10 +152,10 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda r: replace(r, record=ro.data.Record()), "rows that the calibration did not see"),
+        (lambda r: replace(r, record=ro.data.Record()), "Lacking: held-out rows"),
         (
             lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
-            "at least 5 rows",
+            "at least 5 held-out rows",
         ),
         (lambda r: replace(r, record=replace(r.record, validation=moved(r.record.validation, [7], 6e-4))), "intervals"),
     ],

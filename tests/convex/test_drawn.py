@@ -147,7 +147,7 @@ def test_a_contradiction_is_named() -> None:
     conflict = error.value.conflict
     assert conflict is not None
     assert set(conflict.constraints) == {f"'{text}'" for text in (sum_, link, other)}
-    assert "these cannot hold together" in str(error.value)
+    assert "these constraints contradict each other" in str(error.value)
     (name, by), *rest = conflict.stated.items()
     assert not rest
     assert name == f"'{sum_}'"  # or one of the others: alike, and the first
