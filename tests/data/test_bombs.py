@@ -17,6 +17,7 @@ import pytest
 from pyarrow import parquet
 
 import rpim_opt as ro
+from rpim_opt.data.tables.formats.registry import read_raw
 from tests.data.test_tables import ARM2, GOOD, HEAD, NOISE
 
 PATIENCE = 10.0
@@ -52,6 +53,24 @@ def test_wide_and_long_texts(tmp_path: Path, case: str) -> None:
     path = tmp_path / "data.csv"
     path.write_text(CSV[case])
     refused(path)
+
+
+PROGRAMS = {
+    "data.dtx": "<Value " * WIDE,
+    "data.src": "PTP{" * WIDE,
+    "data.dat": "POS a={" * WIDE,
+    "data.jbi": f"///POSTYPE ANGLE\nC1=1{' ' * WIDE}x\n",
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_programs_whose_targets_do_not_end(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_text(PROGRAMS[name])
+    began = time.perf_counter()
+    with pytest.raises(ro.InputError):
+        read_raw(path)
+    assert time.perf_counter() - began < PATIENCE
 
 
 @pytest.mark.parametrize("kind", ["fifo", "/dev/zero", "/dev/full", "folder", "socket-like", "nothing"])

@@ -7,7 +7,7 @@ import re
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
-POINT = re.compile(r"^\s*([BCP]+\d+)\s*=\s*([-+\d.,\s]+?)\s*$", re.MULTILINE)
+POINT = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
 POSE = ("commanded x [mm]", "commanded y [mm]", "commanded z [mm]")
 
 

@@ -6,7 +6,7 @@ import re
 
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
-TARGET = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^}]*)\}", re.IGNORECASE)
+TARGET = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
 AXES = re.compile(r"\bA1\b", re.IGNORECASE)
 FIELD = re.compile(r"\b([A-Z]\d?)\s+([+-]?[\d.]+(?:E[+-]?\d+)?)", re.IGNORECASE)
 NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **{axis: f"commanded {axis} [mm]" for axis in "XYZ"},

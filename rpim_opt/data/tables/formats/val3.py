@@ -6,7 +6,7 @@ import re
 
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
-VALUE = re.compile(r"<Value\s([^>]*?)/?>")
+VALUE = re.compile(r"<Value\s([^<>]{0,2000})>")
 FIELD = re.compile(r'\b(\w+)\s*=\s*"([^"]*)"')
 
 
