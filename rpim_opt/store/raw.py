@@ -173,9 +173,7 @@ def understand_of(
     """Return what raw tables of an arm say, as `understand_tables` does."""
     options = options or TableOptions()
     known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
-    sheets = options.sheet.split(",")
-    every = [(Path(each), replace(options, sheet=sheet.strip())) for each in data for sheet in sheets]
-    files = [(path, read_raw(path, stated)) for path, stated in every]
+    files = [(path, raw) for path in map(Path, data) for raw in _sheets(path, options)]
     if known is None:
         columns = [raw.columns for _, raw in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
@@ -190,6 +188,16 @@ def understand_of(
     accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
     accepted += "".join(f"; {note.rstrip('.')}" for _, raw in files for note in raw.notes if note.startswith("sheet '"))
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
+
+
+def _sheets(path: Path, options: TableOptions) -> list[RawTable]:
+    """Return the tables of a file: of the sheet that is called as stated, commas and all, or of several."""
+    try:
+        return [read_raw(path, replace(options, sheet=options.sheet.strip()))]
+    except InputError as error:
+        if error.where != "--sheet" or "," not in options.sheet:
+            raise
+    return [read_raw(path, replace(options, sheet=sheet.strip())) for sheet in options.sheet.split(",")]
 
 
 def _tables(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> list[Understood]:

@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
-from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, cells, text
+from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, book, cells, text
 from tests.test_cli import run
 
 NOT_READ = {"ROS, rostopic echo as YAML", "MELFA joint variables"}
@@ -108,6 +108,11 @@ def test_what_is_ambiguous_is_asked_in_one_sentence(monkeypatch, capsys, empty, 
     error = capsys.readouterr().err.strip()
     assert "\n" not in error
     assert said in error
+
+
+def test_a_sheet_may_have_a_comma_in_its_name(monkeypatch, capsys, empty) -> None:
+    book(empty, {"Notes": [["warm", "up"]], "Day 1, cold": [HEAD, *ROWS]})
+    assert new(monkeypatch, "raw.xlsx", sheet="Day 1, cold") == 0, capsys.readouterr().err
 
 
 def test_a_units_line_between_blanks_has_no_cell_for_the_label(monkeypatch, empty) -> None:
