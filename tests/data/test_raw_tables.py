@@ -58,6 +58,10 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "a sheet of a text": (HEAD + ROWS, {"sheet": "1"}, "an Excel workbook"),
     "angles that no file has": (HEAD + ROWS, {"rotation": "euler"}, "--rotation: found 'euler'"),
     "no row with values": (HEAD + "P1,1,2,-,-,-\nP2,-,-,3,4,5\n", {}, "no row with values"),
+    "one axis of an instrument": (
+        HEAD.replace("Point", "tracker_x_mm") + ROWS.replace("P", "40"), {},
+        "columns 'tracker_x_mm' and 'X [mm]' for x_mm",
+    ),
     "a quote that does not end": (HEAD + 'P1,1,2,3,4,"5\nP2,1,2,3,4,5\n', {}, "line "),
 }  # fmt: skip
 
@@ -85,6 +89,17 @@ def test_the_first_sheet_with_cells_is_read_and_another_one_by_name_or_number(tm
         read(path, sheet="poinst")
     with pytest.raises(ro.InputError, match="an empty file"):
         read(path, sheet="notes")
+
+
+def test_three_axes_of_an_instrument_are_measured_where_others_are_there_too(tmp_path: Path) -> None:
+    head = HEAD.replace("X [mm],Y [mm],Z [mm]", "tracker_x_mm,tracker_y_mm,tracker_z_mm,x_mm,y_mm,z_mm")
+    found = read(write(tmp_path, head + "P1,1,2,401,5,6,7,8,9\nP2,3,4,402,6,7,8,9,9\n"))
+    assert [float(found.columns[f"{axis}_mm"][0]) for axis in "xyz"] == [401, 5, 6]
+
+
+def test_an_object_with_an_empty_list_is_a_row(tmp_path: Path) -> None:
+    row = '{"label": "P1", "q1_deg": 1, "q2_deg": 2, "x_mm": 401, "y_mm": 5, "z_mm": 6, "tags": []}'
+    assert list(read(write(tmp_path, row, "raw.json")).columns["x_mm"]) == ["401"]
 
 
 def test_a_workbook_that_is_none_is_one_sentence(tmp_path: Path) -> None:

@@ -308,7 +308,7 @@ def _left_out(read: Readings, targets: bool) -> dict[str, str]:
     why: dict[str, str] = {}
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
-    by_instrument = named & {"x", "y", "z"}
+    by_instrument = {"x", "y", "z"} if named >= {"x", "y", "z"} else set()  # one alone is of another frame
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
     for name, each in list(read.items()):
         if each.kind == "derived":

@@ -26,7 +26,7 @@ def read(text: str) -> Rows:
             raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
         found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
     elif isinstance(found, dict):
-        inner = [value for value in found.values() if isinstance(value, list) and all(map(_is_object, value))]
+        inner = [value for value in found.values() if isinstance(value, list) and value and all(map(_is_object, value))]
         found = inner[0] if len(inner) == 1 else [found]
     if not all(map(_is_object, found)):
         raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
