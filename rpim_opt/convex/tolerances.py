@@ -181,31 +181,35 @@ class _Reader:
 
     def combination(self) -> Combination:
         known = self._sum()
-        equals = self._next("=")
-        if equals:
-            right = self._sum()
-            if right.names:
-                raise self._wrong(f"'{right.names[0]}' where a number should stand")
-            known = self._difference(known, right)
-        spread = self._next("+-")
-        sd = self._constant(self._sum()) if spread else 0.0
-        self._require_end()
         self._checked(known)
         patterns = [name for name in known.names if not _PARAMETER.fullmatch(name)]
         if patterns:
             raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
+        if known.constant or known.nominal:
+            raise self._wrong("a number or nominal before =", "a sum of parameters, its value behind =")
+        equals = self._next("=")
+        stated = self._sum() if equals else Sum(nominal=1)
+        spread = self._next("+-")
+        wide = self._item(self._next("+", "-")) if spread else Sum()
+        self._require_end()
+        for name in (*stated.names, *wide.names):
+            raise self._wrong(
+                f"'{name}' where a number should stand", f"a number with a unit: {choices(name, units())}"
+            )
         if not spread:
-            if equals:
+            if equals or self.unit:
                 raise self._wrong("no standard deviation")
             return Combination(known.names, known.factors)
         if not self.unit:
             raise self._wrong("no unit", f"one of {', '.join(units())} at the end")
+        unit = UNITS[self.unit]
+        sd = self._constant(wide)
         if not sd >= SMALLEST:
-            raise self._wrong(f"a standard deviation of {sd:g}", "one above zero; [constraints] fixes parameters")
-        dimension = UNITS[self.unit].dimension
-        if equals and not known.nominal:
-            return Combination(known.names, known.factors, -known.constant, 0.0, sd, dimension)
-        return Combination(known.names, known.factors, None, -known.constant, sd, dimension)
+            found = f"a standard deviation of {sd / unit.si:g} {self.unit}"
+            raise self._wrong(found, "one above zero; [constraints] fixes parameters")
+        if stated.nominal:
+            return Combination(known.names, known.factors, None, stated.constant, sd, unit.dimension)
+        return Combination(known.names, known.factors, stated.constant, 0.0, sd, unit.dimension)
 
     def sentence(self) -> Sentence:
         sides = [self._side()]

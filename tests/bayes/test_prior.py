@@ -236,6 +236,9 @@ def test_the_parser_reads_numbers_signs_and_units() -> None:
         ("a2 = nominally +- 1 mm", "'nominally'"),
         ("a2 +- 1 N m", "'1 N m'"),
         ("a2", "sd None"),
+        ("a2 - 5 mm +- 1 mm", "before ="),
+        ("a2 - nominal +- 1 mm", "before ="),
+        ("a2 +- 0.1 mm + 0.05 mm", "+ 0.05 mm"),
     ],
 )
 def test_the_parser_refuses_what_is_no_statement(text: str, names: str) -> None:
