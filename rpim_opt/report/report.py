@@ -151,13 +151,12 @@ def _accuracy(content: Content) -> Iterator[Block]:
         yield "heading", "Acceptance"
         yield "bullets", _acceptance(result, content.accepted)
     yield "heading", "Accuracy"
-    used = "Identification rows were used to identify the parameters"
-    if record.validation is not None:
-        used += "; validation rows were not used for anything"
-    notes = [summary.nominal_note(result), f"{used}."]
+    used = "Parameters are identified from the identification rows alone."
+    if record.held_out is not None:
+        used = "Errors of held-out rows are those of a fit without them; the delivered parameters use all rows."
+    notes = [summary.nominal_note(result), used]
     covered = None
     if record.held_out is not None:
-        notes.append("Rows held out were not, when they were judged; they are among the identification rows now.")
         covered = record.held_out.coverage
     elif record.validation is not None:
         covered = predicted(result, record.validation).coverage
