@@ -33,16 +33,17 @@ def worst(problem: str, more: Annotated[int, typer.Option(help="How many.")] = 1
 def run(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), **variables}
     command = [sys.executable, "-m", "rpim_opt", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "mine.py").write_text(MINE)
-    about = tmp_path / "mine-1.0.dist-info"
+    (tmp_path / "strangers_rows.py").write_text(MINE)
+    about = tmp_path / "strangers_rows-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[rpim_opt.commands]\nworst = mine:worst\nrobots = mine:worst\n")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: strangers_rows\nVersion: 1.0\n")
+    points = [f"{name} = strangers_rows:worst" for name in ("worst", "robots")]
+    (about / "entry_points.txt").write_text("\n".join(["[rpim_opt.commands]", *points]))
     return tmp_path
 
 
