@@ -47,7 +47,8 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names."""
-        return [*super().list_commands(ctx), *sorted(_others())]
+        own = super().list_commands(ctx)
+        return [*own, *sorted(set(_others()) - set(own))]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command of a name; one of ours goes before another's."""
@@ -59,10 +60,16 @@ class Commands(TyperGroup):
         return typer.main.get_command(alone)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands."""
-        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        """Write the list of commands; one of another package that cannot be loaded does not hide the others."""
+        rows = []
+        for name in self.list_commands(ctx):
+            try:
+                text = self.get_command(ctx, name).help or ""
+            except Exception as error:  # code of somebody else may raise anything
+                text = f"cannot be loaded: {str(error) or type(error).__name__}"
+            rows.append((name, text.partition("\n\n")[0]))
         with formatter.section("Commands"):
-            formatter.write_dl([(name, (command.help or "").partition("\n\n")[0]) for name, command in commands])
+            formatter.write_dl(rows)
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)

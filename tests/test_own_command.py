@@ -48,11 +48,21 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_command_of_another_package_is_one_function(folder: Path) -> None:
-    assert run(folder, "worst", "paper_arm", "--more", "2").stdout.split() == ["T2-9", "T2-8"]
+    done = run(folder, "worst", "paper_arm", "--more", "2")
+    assert done.stdout.split() == ["T2-9", "T2-8"], (done.returncode, done.stderr)
     said = run(folder, "--help").stdout
     assert "Name the rows of a problem that the nominal robot misses most." in said
     assert "ur5e" in run(folder, "robots").stdout  # ours go before others
     assert run(folder, "worst", "no such problem").returncode == 2
+
+
+def test_a_command_that_cannot_be_loaded_does_not_hide_the_others(folder: Path) -> None:
+    (folder / "mine.py").write_text("import no_such_module\n")
+    done = run(folder, "--help")
+    assert done.returncode == 0, done.stderr
+    assert "cannot be loaded: No module named 'no_such_module'" in done.stdout
+    assert sum(line.startswith("  robots ") for line in done.stdout.splitlines()) == 1
+    assert run(folder, "robots").returncode == 0
 
 
 def test_an_interrupt_while_commands_are_loaded_is_one_word(tmp_path: Path) -> None:

@@ -205,7 +205,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 os.fsync(stream.fileno())
         for place, file in made.items():
             if len(contents) > 1:
-                _keep_old(place, file.with_name("old"), renames)
+                _keep_old(place, file, renames)
             file.replace(place)
         for path, data in streams.items():
             path.write_bytes(data)
@@ -235,13 +235,23 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _keep_old(place: Path, old: Path, steps: ExitStack) -> None:
+def _keep_old(place: Path, file: Path, steps: ExitStack) -> None:
     """Keep what is at a place beside the file that replaces it, for the case that a later one cannot be replaced."""
+    old = file.with_name("old")
     try:
-        shutil.copy2(place, old)
-        steps.callback(old.replace, place)
+        os.link(place, old)
     except FileNotFoundError:
-        steps.callback(place.unlink, missing_ok=True)
+        steps.callback(_take_away, place, file)
+        return
+    except OSError:  # a file system without links
+        shutil.copy2(place, old)
+    steps.callback(old.replace, place)
+
+
+def _take_away(place: Path, file: Path) -> None:
+    """Remove a file that was put where none was; another's, if ours was never put there, stays."""
+    if not file.exists():
+        place.unlink(missing_ok=True)
 
 
 def _is_stream(path: Path) -> bool:

@@ -519,6 +519,9 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
 
 def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: str) -> Dataset:
     """Return data with the measurement types that their blocks name."""
+    rows = sorted(row for block in data.blocks for row in block.row.tolist())
+    if not rows == list(range(len(data))) == list(range(len(data.configuration))):
+        raise InputError(where, f"rows {str(rows)[:40]}", f"0 to {len(data) - 1}, each once, with its configuration")
     blocks = []
     for number, block in enumerate(data.blocks, start=1):
         name = str(block.measurement)

@@ -222,3 +222,25 @@ def test_a_folder_in_the_place_is_refused_before_anything_is_written(tmp_path: P
     with pytest.raises(IsADirectoryError):
         write_files({tmp_path / "a": NEW, tmp_path / "b": NEW})
     assert names(tmp_path) == ["b"]
+
+
+def test_what_is_taken_back_is_the_old_file_itself_and_never_another_writers(tmp_path: Path, monkeypatch) -> None:
+    old, absent = tmp_path / "old", tmp_path / "absent"
+    old.write_bytes(OLD)
+    (tmp_path / "linked").hardlink_to(old)
+    number = old.stat().st_ino
+    replace = Path.replace
+
+    def somebody_was_faster(self: Path, target: Path) -> Path:
+        if target == absent:
+            absent.write_bytes(b"another's")
+            raise OSError(13, "Permission denied")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", somebody_was_faster)
+    with pytest.raises(OSError, match="Permission denied"):
+        write_files({old: NEW, absent: NEW})
+    assert (old.read_bytes(), absent.read_bytes()) == (OLD, b"another's")
+    assert old.stat().st_ino == number
+    assert old.samefile(tmp_path / "linked")
+    assert names(tmp_path) == ["absent", "linked", "old"]

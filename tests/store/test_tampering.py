@@ -127,6 +127,19 @@ def test_what_follows_from_the_data_is_refused_in_spite_of_a_new_digest(tmp_path
     assert "key digest" not in message
 
 
+@pytest.mark.parametrize("key", ["dimensions", "nominal", "scale", "tolerance", "identified"])
+def test_a_column_of_the_model_that_is_too_short_is_named(tmp_path: Path, text: str, key: str) -> None:
+    content = json.loads(text)
+    edited = put(content, ("model", key), content["model"][key][:-1])
+    assert f"key model, {key}: found" in said(tmp_path, edited | {"digest": digest(edited)})
+
+
+def test_rows_that_are_none_or_twice_there_are_refused(tmp_path: Path, text: str) -> None:
+    for row in (0, -1, 99):
+        edited = put(json.loads(text), ("data", "identification", "blocks", 0, "row", 2), row)
+        assert "key data.identification: found rows" in said(tmp_path, edited | {"digest": digest(edited)})
+
+
 def test_a_file_may_be_laid_out_anew(tmp_path: Path, text: str) -> None:
     content = json.loads(text)
     turned = {key: content[key] for key in reversed(content)}

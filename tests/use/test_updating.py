@@ -12,6 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
+from rpim_opt.store.problem_file import problems_folder
 from rpim_opt.store.serialize import digest
 from tests.simulate import simulated
 from tests.test_cli import run
@@ -165,6 +166,16 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     assert last.digest in page
     assert "changed since: theta4" in page
     assert "What each selector takes" not in page  # weight 1 joins both sets of data, no other one does
+
+
+def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> None:
+    validation = str(problems_folder() / "position" / "validation.csv")
+    out = str(tmp_path / "new")
+    assert run(monkeypatch, "calibrate", "position", "--out", str(tmp_path)) == 0
+    assert run(monkeypatch, "update", str(tmp_path), validation, "--out", out) == 0
+    assert run(monkeypatch, "report", out) == 0
+    page = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
+    assert "changed since: nothing that these measurements show" in page
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
