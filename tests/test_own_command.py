@@ -57,7 +57,7 @@ def test_a_command_of_another_package_is_one_function(folder: Path) -> None:
 
 
 def test_a_command_that_cannot_be_loaded_does_not_hide_the_others(folder: Path) -> None:
-    (folder / "mine.py").write_text("import no_such_module\n")
+    (folder / "strangers_rows.py").write_text("import no_such_module\n")
     done = run(folder, "--help")
     assert done.returncode == 0, done.stderr
     assert "cannot be loaded: No module named 'no_such_module'" in done.stdout
