@@ -100,7 +100,7 @@ def _structure(problem: CalibrationProblem) -> dict[str, Any]:
         "parameters": len(seen.names),
         "rank": seen.rank,
         "condition": seen.condition,
-        "unseen": ", ".join(seen.unseen),
+        "unseen": ", ".join(seen.unidentifiable),
         "redundant": "; ".join(combination(terms) for terms in seen.redundant),
         "smallest": float(seen.singular_values[seen.rank - 1]),
     }

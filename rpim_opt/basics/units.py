@@ -82,7 +82,7 @@ DISPLAY = {
 
 _LONGEST_UNIT = max(map(len, UNITS))
 LONGEST = 200
-"""Characters of a pattern or a name: longer ones, which nobody writes, would take for ever to be matched."""
+"""Characters of a pattern or a name: longer ones would take too long to match."""
 
 
 @cache

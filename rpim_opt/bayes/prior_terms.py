@@ -126,7 +126,7 @@ class Stated:
         if formulation.penalty is not None and formulation.penalty_over is not None:
             groups = [listed(np.asarray(D, dtype=float)) for D in formulation.penalty_over(self.parameters)]
         parts = (keep.tolist(), self.centre.tolist(), listed(self.rows), self.values.tolist(), groups)
-        return replace(formulation, penalty=believed(formulation.penalty, *parts), penalty_over=None)
+        return replace(formulation, penalty=prior_penalty(formulation.penalty, *parts), penalty_over=None)
 
 
 Vector = tuple[float, ...]
@@ -156,7 +156,7 @@ class _Penalty:
         return sum(terms[1:], terms[0])
 
     def __reduce__(self) -> Any:
-        return believed, tuple(getattr(self, each.name) for each in fields(self))
+        return prior_penalty, tuple(getattr(self, each.name) for each in fields(self))
 
     def _own(self, y: Any) -> Any:
         penalty: Any = self.penalty
@@ -172,7 +172,7 @@ class _Penalty:
 class _ReadyPenalty(_Penalty, Ready):
     """The same of a ready penalty: equal in content is equal in meaning, and a file holds it."""
 
-    maker = "believed"
+    maker = "prior_penalty"
 
     @property
     def stated(self) -> list[Any]:
@@ -210,7 +210,7 @@ def _reduced(L: Array, c: Array) -> Quadratic:
     return Quadratic(R[:n, :n], R[:n, n], float(R[n, n] ** 2))
 
 
-def believed(
+def prior_penalty(
     penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
 ) -> Callable[[Any], Any]:
     """Return the penalty of a prior."""

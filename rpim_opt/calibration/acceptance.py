@@ -355,7 +355,7 @@ def _against(requirement: Requirement, least: float, seen: Checked | None) -> li
 
 
 def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[str]:
-    """Return what keeps a bound from being believed."""
+    """Return what invalidates a bound."""
     lines: list[str] = []
     fit = judged_fit(result)
     if fit is not None and fit.alarming:

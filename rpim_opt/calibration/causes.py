@@ -83,7 +83,7 @@ def likely_causes(result: Outcome) -> list[str]:
     if result.learned is not None:
         shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
     if result.mapping is not None:
-        shared += result.mapping.doubts
+        shared += result.mapping.ambiguities
     kept = kept_rows(result)
     errors, pixels = (np.where(kept, problem.errors(result.x, of), np.nan) for of in ("length", "pixel"))
     ratios = noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")

@@ -57,7 +57,7 @@ ATOMS = (SQUARES, SUM, LARGEST, NORM1, NORM2)
 def named(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
     """Return the `Atom` that a function of CVXPY is; any other function as it is."""
     module = sys.modules.get("cvxpy")
-    if module is None:  # then nobody can have taken a function of it
+    if module is None:  # then no function of it is in use
         return function
     for atom in ATOMS:
         if function is getattr(module, atom.name, None):

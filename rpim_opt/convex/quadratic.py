@@ -163,7 +163,8 @@ class Ridge:
 
     Directions that neither A nor L see stay where the penalty's centre, or nominal, has them. beta, s (p,), s below
     `RANK_TOLERANCE` times the largest zero; B (n, p); offset (n,) is z at infinite weight; perp the square that no z
-    explains; free (n, f) the seen directions that L leaves free, with covariance free free'; unseen (n, u) the others.
+    explains; free (n, f) the identifiable directions that L leaves free, with covariance free free'; null (n, u) the
+    others.
     """
 
     beta: Array
@@ -172,7 +173,7 @@ class Ridge:
     offset: Array
     perp: float
     free: Array
-    unseen: Array
+    null: Array
 
     @property
     def fixed(self) -> int:
@@ -186,7 +187,7 @@ class Ridge:
 
     @property
     def filters(self) -> tuple[Array, Array, float]:
-        """beta^2 and s^2 of the seen directions, and what no weight explains."""
+        """beta^2 and s^2 of the identifiable directions, and what no weight explains."""
         seen = self.seen
         return self.beta[seen] ** 2, self.s[seen] ** 2, self.perp
 
@@ -217,8 +218,8 @@ class Ridge:
     def undecided(self, weight: float) -> Array:
         """Return the directions (n, u) that neither data nor penalty decide."""
         if weight > 0:
-            return self.unseen
-        return np.hstack([self.unseen, self.B[:, ~self.seen]])
+            return self.null
+        return np.hstack([self.null, self.B[:, ~self.seen]])
 
     def hat_rows(self, A: Array) -> tuple[Array, Array]:
         """Return Q (m, p') and Q0 (m, f) of the influence matrix Q diag(s^2 / (s^2 + weight)) Q' + Q0 Q0'; A (m, n)."""
@@ -227,7 +228,7 @@ class Ridge:
 
 
 def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
-    """Decompose a linear model and a squared penalty; without a penalty, unseen directions stay nominal."""
+    """Decompose a linear model and a squared penalty; without a penalty, directions of the null space stay nominal."""
     R = model.triangle
     n = R.shape[1] - 1
     A, b = R[:n, :n], R[:n, n]
@@ -325,5 +326,5 @@ def ridge_within(model: LinearModel, penalty: Quadratic | None, moves: Array, z:
         B=moves @ inside.B,
         offset=z + moves @ inside.offset,
         free=moves @ inside.free,
-        unseen=moves @ inside.unseen,
+        null=moves @ inside.null,
     )

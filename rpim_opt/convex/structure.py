@@ -547,7 +547,7 @@ class Lost(Structure):
 
     @property
     def constraints(self) -> list[list[Any]]:
-        """None: nobody can call the functions again."""
+        """None: the functions cannot be called again."""
         return []
 
 

@@ -82,7 +82,7 @@ class Block(Brief):
 
     @property
     def session_names(self) -> np.ndarray:
-        """(N,) names of the rows' sessions, ``""`` where nobody says."""
+        """(N,) names of the rows' sessions, ``""`` where none is stated."""
         if self.session is None:
             return np.full(len(self.row), "", dtype=object)
         return self.session
@@ -177,7 +177,7 @@ class Dataset(Tabled):
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """The sessions in which they were measured, sorted; those that nobody named are not among them."""
+        """The sessions in which they were measured, sorted; unnamed ones are not among them."""
         return tuple(sorted({str(name) for block in self.blocks for name in block.session_names} - {""}))
 
     @property

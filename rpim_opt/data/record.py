@@ -18,7 +18,7 @@ from rpim_opt.data.dataset import Dataset
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 Side = tuple[float, float]
 CONFIDENCE = 0.95
-"""Probability with which a limit is to be kept, where nobody states another."""
+"""Probability with which a limit is to be kept, where no other is stated."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Record:
     details
         Who measured, when, with which instrument, ... as somebody stated it, by name.
     requirement
-        What the robot is accepted by; None where nobody demanded anything.
+        What the robot is accepted by; None without a requirement.
     held_out
         Rows that were held out and judged before they were used; None where validation data are still unused.
     earlier

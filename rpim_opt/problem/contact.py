@@ -1,4 +1,4 @@
-"""Touched points and planes that nobody measured, eliminated from the equations."""
+"""Unmeasured points and planes that were touched, eliminated from the equations."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ class Tie(NamedTuple):
 class Touches:
     """Which equations touch which point or plane, and how these are eliminated.
 
-    Touches at p_i have the equations c - p_i ~ 0 with a point c that nobody wants, or n'(p_i - c) ~ 0 with a plane.
+    Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
     Their best values follow from the touches (`touched.Point`, `touched.Plane`), and what the equations say of the
     robot alone are contrasts, which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two
     of them is an equation of these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin

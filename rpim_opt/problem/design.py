@@ -370,12 +370,12 @@ class Observability(Brief):
         The n identified parameters.
     singular_values
         (n,) of the whitened Jacobian in units of the scales: how many standard deviations of the noise a
-        deviation of one scale along that direction moves the data. Zeros are unseen directions.
+        deviation of one scale along that direction moves the data. Zeros are unidentifiable directions.
     rank
         Number of identifiable combinations.
     configurations
         Number of configurations.
-    unseen
+    unidentifiable
         Parameters that no measurement depends on.
     redundant
         Combinations, name to coefficient [mm, mrad], along which the parameters may change without changing any
@@ -393,7 +393,7 @@ class Observability(Brief):
     --------
     >>> import rpim_opt as ro
     >>> found = ro.problem.observe(ro.load("rank_deficient").problem)
-    >>> len(found.names), found.rank, len(found.redundant), found.unseen
+    >>> len(found.names), found.rank, len(found.redundant), found.unidentifiable
     (45, 30, 12, ('beta5', 'theta6', 'ratio6'))
     >>> found = ro.problem.observe(ro.load("scara").problem)
     >>> {name: f"{value:.2g}" for name, value in found.indices.items()}
@@ -404,7 +404,7 @@ class Observability(Brief):
     singular_values: Array
     rank: int
     configurations: int
-    unseen: tuple[str, ...]
+    unidentifiable: tuple[str, ...]
     redundant: tuple[dict[str, float], ...]
     base: tuple[dict[str, float], ...]
     condition: float
@@ -468,7 +468,7 @@ def observe(problem: Source, x: Array | None = None) -> Observability:
         singular_values=s,
         rank=rank,
         configurations=configurations,
-        unseen=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
+        unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
         redundant=redundant,
         base=base,
         condition=float(s[0] / s[rank - 1]),

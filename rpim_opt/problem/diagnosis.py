@@ -166,8 +166,8 @@ class Inspection(Tabled):
             "repeatability_mm": None if self.repeatability is None else 1e3 * self.repeatability,
             "observability": {
                 "parameters": o.names, "rank": o.rank, "weak": int(np.count_nonzero(o.singular_values[: o.rank] < 1)),
-                "condition": o.condition, "raw_condition": o.raw_condition, **o.indices, "unseen": o.unseen,
-                "redundant": o.redundant,
+                "condition": o.condition, "raw_condition": o.raw_condition, **o.indices,
+                "unidentifiable": o.unidentifiable, "redundant": o.redundant,
             },
             "contact": self.contact,
             "warnings": self.warnings,
@@ -219,8 +219,8 @@ class Inspection(Tabled):
             + ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
             + ".",
         ]
-        if o.unseen:
-            lines.append(f"Unidentifiable: {', '.join(o.unseen)}.")
+        if o.unidentifiable:
+            lines.append(f"Unidentifiable: {', '.join(o.unidentifiable)}.")
         if o.redundant:
             named = "; ".join(combination(terms) for terms in o.redundant)
             lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")

@@ -60,7 +60,7 @@ class Stack:
 
     ``index`` (N, k) numbers of the equations; ``instrument`` (N, k, k) covariance as the rows state it [SI]; ``length``
     and ``angle`` (N, k) which are such; ``joint`` (N, k, dof) slopes by the revolute joints' angles [SI], dof columns a
-    stop of the joints, none where nobody asks; ``unit`` (N, k, k) covariance of a unit scatter of every measured
+    stop of the joints, none where not requested; ``unit`` (N, k, k) covariance of a unit scatter of every measured
     position where equations mix several, or a camera sees several points of one, else None: 1 for lengths.
     """
 

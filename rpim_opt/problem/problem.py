@@ -330,7 +330,7 @@ class CalibrationProblem(RobotModel):
         absent = (p.nominal == 0) & ~p.identified
         robot = self.arms[block.robot]
         names = p.names
-        if block.robot:  # those of other robots keep their long names, which nobody asks for
+        if block.robot:  # those of other robots keep their long names, which no formulation asks for
             names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
         loads = loads_of(robot, Needs.of(robot, p.of_robot(block.robot)), self.data, block)
         return Structure(
@@ -530,7 +530,7 @@ class CalibrationProblem(RobotModel):
 
     @cached_property
     def touches(self) -> Touches | None:
-        """Points and planes that rows touched and nobody measured; None where there are none."""
+        """Unmeasured points and planes that rows touched; None where there are none."""
         return Touches.of(self.data)
 
     @cached_property
@@ -688,8 +688,8 @@ def _times(L: Array, values: Array, scale: float | Array = 1.0, out: Array | Non
         return np.multiply(values, np.diagonal(L[0])[:, None] * scale, out=out)
     found = np.empty_like(values) if out is None else out
     found[:] = 0.0
-    for j in range(L.shape[1]):
-        found += L[:, :, j, None] * scale * values[:, j, None]
+    for i, j in zip(*np.nonzero(L.any(axis=0)), strict=True):  # a triangle, often with few entries
+        found[:, i] += L[:, i, j, None] * scale * values[:, j]
     return found
 
 

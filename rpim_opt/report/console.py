@@ -31,7 +31,7 @@ def fail(text: str, code: int) -> None:
     """Print an error on stderr, as JSON with ``--json``, and end with an exit code."""
     try:
         _print({"error": text} if "--json" in sys.argv else text, sys.stderr)
-    except OSError:  # nobody reads it
+    except OSError:  # the reader has closed it
         _close(sys.stderr)
     sys.exit(code)
 

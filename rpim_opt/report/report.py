@@ -360,8 +360,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
         text += " The others are known from the calibrations that are this one's prior."
         redundant = []
     elif found.rank < len(found.names):
-        if found.unseen:
-            text += f" No measurement depends on {', '.join(found.unseen)}."
+        if found.unidentifiable:
+            text += f" No measurement depends on {', '.join(found.unidentifiable)}."
         text += (
             " At the nominal parameters no measurement changes along the following combinations [mm, mrad]: the "
             "penalty decides there, and predictions do not depend on it."

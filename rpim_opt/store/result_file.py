@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.basics.text import version_of
 from rpim_opt.bayes.hyperparameters import Learned
-from rpim_opt.bayes.prior_terms import believed
+from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Held, Price
 from rpim_opt.calibration.identify import calibrate, mapped_as
@@ -63,7 +63,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 """Functions of a formulation that a file names; those that the next ones make are named with their arguments."""
 MAKERS: dict[str, Callable[..., Any]] = {
     "huber": huber,
-    "believed": believed,
+    "prior_penalty": prior_penalty,
     "at_nominal": constraints.at_nominal,
     "signed": constraints.signed,
     "equal": constraints.equal,
@@ -421,7 +421,7 @@ def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:
         if ready == function:
             return name
     stated = getattr(function, "stated", None)
-    if stated is None or stated[0] != believed.__name__:
+    if stated is None or stated[0] != prior_penalty.__name__:
         return stated
     maker, penalty, *numbers = stated
     return [maker, _name(penalty), *numbers]
@@ -435,7 +435,7 @@ def _function(stated: str | list[Any] | None, name: str) -> Any:
     if isinstance(stated, str):
         return pick(FUNCTIONS, stated, "key definition")
     maker, *arguments = stated
-    if maker == believed.__name__:
+    if maker == prior_penalty.__name__:
         arguments[0] = _function(arguments[0], name)
     return pick(MAKERS, str(maker), "key definition")(*arguments)
 
@@ -534,7 +534,7 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
 
 
 def _kept(file: Stored, program: Program) -> Kept:
-    """Return what the functions of a script said when they were there; nobody can call them again."""
+    """Return the values of a script's functions as they were saved; they cannot be called again."""
     if file.trust is None:
         return Kept(file.held, None, prices=file.prices)
     keep = np.ones(len(program.model.b), dtype=bool)

@@ -347,7 +347,7 @@ class _Table:
         y = world.on(data).modelled(self.x)[0] + self._errors(data.blocks[0])
         return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
 
-    # --- touches of points and planes that nobody measures -------------------------------------------------------
+    # --- touches of unmeasured points and planes -------------------------------------------------------
 
     def _touched(self) -> Columns:
         """Return a table of touches, by tools that take turns."""

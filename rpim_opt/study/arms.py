@@ -36,7 +36,7 @@ class SimulatedArm:
     problem
         Identification data, with generic scales.
     true
-        Positions of unseen configurations as they are [m].
+        Positions of validation configurations as they are [m].
     read
         The same as the tracker reads them.
 
@@ -75,7 +75,7 @@ def simulated_arm(
     physics
         Angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
         their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as
-        much as the one behind it or more, by a factor that nobody is told.
+        much as the one behind it or more, by an unknown factor.
 
     Examples
     --------

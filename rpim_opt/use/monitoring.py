@@ -37,7 +37,7 @@ TESTS = 3
 MOMENTS = 40
 """Checks before which a change is looked for; of more so many, evenly."""
 SMALLEST = 1e-12
-"""Probabilities are taken as no smaller: beyond 7 standard deviations nobody asks how far."""
+"""Probabilities are taken as no smaller: 7 standard deviations."""
 ALLOWANCE = 0.5
 """CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much."""
 CELLS = 150

@@ -191,7 +191,7 @@ def test_no_view_tells_the_size_of_the_board() -> None:
     assert np.abs(J @ x).max() < 1e-6 * np.abs(J[:, lengths] @ x[lengths]).max()
     known = p.identify(["alpha?", "a?", "theta?", "d?", "beta[23]", "base_*", "tool_*"])
     seen_with = ro.problem.observe(problem.with_parameters(known))
-    assert "a3" not in seen_with.unseen
+    assert "a3" not in seen_with.unidentifiable
 
 
 def test_corners_that_were_not_found_and_those_that_vary() -> None:

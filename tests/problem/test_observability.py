@@ -21,13 +21,13 @@ def test_indices_are_those_of_the_singular_values() -> None:
     want = [np.prod(s) ** (1 / 7) / np.sqrt(15), s[-1] / s[0], s[-1], s[-1] ** 2 / s[0], 1 / np.sum(1 / s)]
     assert list(o.indices.values()) == pytest.approx(want, rel=1e-9)
     assert o.condition == pytest.approx(s[0] / s[-1])
-    assert o.redundant == o.unseen == ()
+    assert o.redundant == o.unidentifiable == ()
 
 
 def test_a_redundant_combination_changes_nothing_and_base_parameters_say_everything() -> None:
     problem, _ = simulated()
     o, free = observe(problem), problem.parameters.free
-    assert o.rank + len(o.redundant) + len(o.unseen) == len(free)
+    assert o.rank + len(o.redundant) + len(o.unidentifiable) == len(free)
     J = problem.jacobian(np.zeros(len(free)))
     for terms in o.redundant:
         x = np.array([terms.get(name, 0.0) for name in free.names])
@@ -60,7 +60,7 @@ def test_names_do_not_depend_on_rounding(seed: int) -> None:
 def test_what_no_measurement_sees_is_named() -> None:
     problem, _ = simulated(("a[23]", "tool_r?"))
     o = observe(problem)
-    assert set(o.unseen) == {"tool_rx", "tool_ry", "tool_rz"}
+    assert set(o.unidentifiable) == {"tool_rx", "tool_ry", "tool_rz"}
 
 
 def test_the_papers_condition_number_is_that_of_a_singular_matrix() -> None:

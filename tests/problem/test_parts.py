@@ -102,7 +102,11 @@ def test_dropping_everything_is_refused(whole: ro.CalibrationProblem) -> None:
 def test_observability_of_parts_is_that_of_the_whole() -> None:
     problem = ro.load("rank_deficient").problem
     there, here = ro.problem.observe(problem), ro.problem.observe(apart(problem))
-    assert (here.rank, here.unseen, here.configurations) == (there.rank, there.unseen, there.configurations)
+    assert (here.rank, here.unidentifiable, here.configurations) == (
+        there.rank,
+        there.unidentifiable,
+        there.configurations,
+    )
     np.testing.assert_allclose(
         here.singular_values, there.singular_values, rtol=0, atol=1e-9 * there.singular_values[0]
     )

@@ -33,8 +33,8 @@ DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
-FACES = 8
-"""Faces that are tried before Clarabel is asked for one."""
+MOST_ACTIVE_SETS = 8
+"""Active sets that are tried before Clarabel is asked for one."""
 
 
 class Canonical:
@@ -319,8 +319,8 @@ class Small:
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        faces = p.polyhedral and not p.own and len(p.b) * p.size <= DENSE  # own variables: Clarabel is quicker
-        if squares is None or self.loss is not None or not faces:
+        by_active_set = p.polyhedral and not p.own and len(p.b) * p.size <= DENSE  # own variables: Clarabel is quicker
+        if squares is None or self.loss is not None or not by_active_set:
             return self._by_cones(squares, weight, A, b)[0]
         found = self._on_faces(squares, weight, self.face, self.near)
         if found is not None:
@@ -339,7 +339,7 @@ class Small:
         A = p.dense[0]
         inequalities = np.arange(p.zero, p.linear)
         seen: set[bytes] = set()
-        for _ in range(FACES):
+        for _ in range(MOST_ACTIVE_SETS):
             if face.tobytes() in seen:
                 return None
             seen.add(face.tobytes())

@@ -1,4 +1,4 @@
-"""Touches of points and planes that nobody measured, and what a drawing states of two of them."""
+"""Touches of unmeasured points and planes, and stated relations of two of them."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ revisit_plane = Measurement(
         columns={"point": "point that was touched", "plane": "plane that was touched"},
     ),
 )
-"""A touch of a plane that nobody measured: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
+"""A touch of an unmeasured plane: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
 
 revisit = replace(
     revisit_plane, name="revisit", planar=False, variants={"plane": revisit_plane}, shown_by=names_touches
 )
-"""A touch of a point that nobody measured: r_i = c - p_i, with c the mean of the positions of all touches of it."""
+"""A touch of an unmeasured point: r_i = c - p_i, with c the mean of the positions of all touches of it."""
 
 known_distance = replace(distance, name="known_distance")
 """The distance that a drawing states between two touched points or parallel planes: r = y - |c2 - c1|."""
@@ -215,7 +215,7 @@ def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
 def touches(
     q: Array, point: Sequence[str], sigma: float | Array, label: tuple[str, ...] = (), planes: bool = False
 ) -> Dataset:
-    """Return touches of points, or of planes, that nobody measured.
+    """Return touches of unmeasured points or planes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Points on a plane that nobody measured beyond that they lie on it."""
+"""Unmeasured points on a plane of unknown place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points on a sphere that nobody measured beyond that they lie on it."""
+"""Unmeasured points on a sphere."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
         if match:
             meaning = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(each.meaning))
             return Reading(meaning, "", each.why, kind)
-    # u(x) is a standard uncertainty, U(x) an expanded one whose coverage factor nobody knows
+    # u(x) is a standard uncertainty, U(x) an expanded one of unknown coverage factor
     match = re.fullmatch(r"u[\s_(]*([xyzXYZ])\)?", stem.strip())
     if match:
         return Reading(f"sigma_{match[1].lower()}", "", "u: standard uncertainty", kind)

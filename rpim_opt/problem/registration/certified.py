@@ -76,7 +76,7 @@ def _judged(
     radius = best.radius(float(chdtri(loops.unknowns, AS_WELL)))
     full = int(np.sum(solved.weights))
     several = solved.weights.min() < 1 and not solved.alone
-    doubts = {
+    causes = {
         f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
             uncertainty > UNKNOWN
         ),
@@ -86,7 +86,7 @@ def _judged(
         "the weights of the loss did not converge": not solved.settled,
         f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
     }
-    doubt = next((text for text, true in doubts.items() if true), "")
+    cause = next((text for text, true in causes.items() if true), "")
     return CertifiedStart(
         bases=bases,
         tools=tools,
@@ -98,8 +98,8 @@ def _judged(
         uncertainty=uncertainty,
         radius=radius,
         weights=solved.weights,
-        certified=not doubt,
-        reason=doubt or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
+        certified=not cause,
+        reason=cause or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
     )
 
 

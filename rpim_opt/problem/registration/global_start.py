@@ -66,7 +66,7 @@ class Alternative:
 
     sign: Array
     zero: Array
-    apart: float  # RMS distance of their predictions at unseen configurations [m]
+    apart: float  # RMS distance of their predictions at other configurations [m]
     told_by: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
 
 
@@ -103,10 +103,10 @@ class JointMapping:
             f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
             f"with a probability of {self.missed:.1g})."
         )
-        return " ".join([text, *self.doubts])
+        return " ".join([text, *self.ambiguities])
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def ambiguities(self) -> tuple[str, ...]:
         """Say what fits as well, and what would tell."""
         said = []
         if self.mirrored:
@@ -300,14 +300,14 @@ def _judged(
     near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     turning = _turning(robot)
     low, high = points.q.min(axis=0), points.q.max(axis=0)
-    unseen = np.where(
+    elsewhere = np.where(
         turning, rng.uniform(-np.pi, np.pi, (UNSEEN, robot.dof)), rng.uniform(low, high, (UNSEEN, robot.dof))
     )
     zeros = [_gauged(robot, fits.zero[i]) for i in range(len(sign))]
     classes: list[list[int]] = []
     said: list[Array] = []
     for i in near:
-        there = _predicted(robot, sign[i], fits.take(np.array([i])), unseen)
+        there = _predicted(robot, sign[i], fits.take(np.array([i])), elsewhere)
         gaps = [_apart(there, other) for other in said]
         if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
             classes[int(np.argmin(gaps))].append(i)
@@ -318,7 +318,7 @@ def _judged(
     others = []
     for i, there in zip(plainest, said[1:], strict=True):
         far = np.linalg.norm(there - said[0], axis=-1).max(axis=-1)
-        others.append(Alternative(sign[i], zeros[i], _apart(there, said[0]), unseen[int(np.argmax(far))]))
+        others.append(Alternative(sign[i], zeros[i], _apart(there, said[0]), elsewhere[int(np.argmax(far))]))
     nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
     left_handed = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), SHORT, zeros=True, robust=True)
     small_zeros = np.abs(_gauged(robot, left_handed.zero[0])).max() < NEAR_ZERO
