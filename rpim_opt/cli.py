@@ -168,6 +168,16 @@ Despite = Annotated[
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout, errors as JSON on stderr.")]
 
 
+def _with_code(context: typer.Context, allowed: bool) -> None:
+    if allowed:
+        from rpim_opt.store.own_code import allow_code
+
+        context.with_resource(allow_code())
+
+
+Code = Annotated[bool, Option("--allow-code", help="Run the Python files that the folder names.", callback=_with_code)]
+
+
 @app.command()
 def new(
     folder: Annotated[Path, Argument(help="The problem folder to make; it must not exist.")],
@@ -271,6 +281,7 @@ def calibrate(
     box: Box = None,
     out: Folder = None,
     profile: Annotated[bool, Option("--profile", help="Print the time of each phase.")] = False,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
@@ -317,6 +328,7 @@ def calibrate(
 def report(
     result: Result,
     out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Write the calibration report: one HTML page that works offline, in the order in which it is signed."""
@@ -341,6 +353,7 @@ def validate(
     measurement: Type = None,
     limit: Largest = None,
     out: Table = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
@@ -371,6 +384,7 @@ def accept(
     data: Annotated[File, Option(help="New measurements that check it, instead of those it has.")] = None,
     units: Units = "",
     measurement: Type = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
@@ -428,6 +442,7 @@ def update(
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     out: Folder = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Recalibrate with the previous result as prior: say whether the robot changed, and which parameters did.
@@ -456,6 +471,7 @@ def monitor(
     units: Units = "",
     measurement: Type = None,
     out: Annotated[File, Option(help="The chart over time: .html, or its points as .csv.")] = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Look for drift in check readings over time, each and together against the interval of a new reading.
@@ -491,6 +507,7 @@ def export(
     tool: Annotated[Choice, Option(help="Make its tip the reflector; by default if it is near.")] = None,
     marker: Marker = None,
     despite_verdict: Despite = False,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Write the identified robot for other tools: all files that are asked for, or none.
@@ -522,6 +539,7 @@ def compensate(
     limit: Annotated[Number, Option(help="Largest residual error [mm]; exit code 1 above.")] = None,
     out: Table = None,
     despite_verdict: Despite = False,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Correct joint commands so that the real robot goes where the nominal one would.
@@ -551,6 +569,7 @@ def simulate(
     problem: Annotated[str, Argument(help="A problem folder with a [simulation] table.")],
     seed: Annotated[int | None, Option(min=0, help="Instead of the file's.")] = None,
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Make the tables of a simulated problem and the truth they come from."""
@@ -573,6 +592,7 @@ def design(
     seed: Annotated[int, Option(min=0, help="Of the random candidates.")] = 0,
     augment: Annotated[bool, Option("--augment", help="Choose in addition to the measured configurations.")] = False,
     out: Table = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Choose the configurations to measure next, from candidates, by optimal design."""

@@ -180,6 +180,8 @@ class Record:
         Of the file that it was read from; empty where there is none.
     reading
         How the tables were read, as `TableOptions.stated` takes it: later ones are read alike.
+    terms
+        Names of the model's terms in a Python file of the problem's folder, ``mine:droop``.
 
     Examples
     --------
@@ -203,6 +205,7 @@ class Record:
     earlier: tuple[Earlier, ...] = ()
     digest: str = ""
     reading: Mapping[str, str] = field(default_factory=dict)
+    terms: tuple[str, ...] = ()
 
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""

@@ -113,6 +113,7 @@ class Instance(Tabled):
     details: Mapping[str, str] = field(default_factory=dict)
     requirement: Requirement | None = None
     reading: Mapping[str, str] = field(default_factory=dict)
+    terms: Sequence[str] = ()
     held_out: bool = False
 
     def _short(self) -> str:
@@ -157,6 +158,7 @@ class Instance(Tabled):
             details=self.details,
             requirement=self.requirement,
             reading=self.reading,
+            terms=tuple(self.terms),
         )
 
 
@@ -226,6 +228,7 @@ def load(
         details=details,
         requirement=requirement,
         reading=table.reading,
+        terms=table.terms if model is None else (),
         held_out=table.held_out,
     )
 

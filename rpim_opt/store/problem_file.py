@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -29,6 +29,8 @@ from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel
+from rpim_opt.robot.terms import Term
+from rpim_opt.store.own_code import is_own, own_object
 from rpim_opt.store.prior_file import PriorTable
 from rpim_opt.store.statements import Constraints
 
@@ -173,7 +175,9 @@ class ProblemTable(Table):
     celsius: float | None = Field(default=None, alias="temperature_C")
     """Temperature at which the lengths are nominal [degC]."""
     measurement: str = "position"
-    """Measurement type."""
+    """Measurement type; one of your own is mine:height, the Measurement `height` in mine.py (--allow-code)."""
+    terms: list[str] = Field(default_factory=list)
+    """Terms of your own: mine:droop is the Term `droop` in mine.py (--allow-code)."""
     layout: Layout = "named"
     """named: columns by name; robodk: RoboDK's export."""
     identification: str | None = None
@@ -267,6 +271,8 @@ def read_problem(
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
+    for kind in filter(is_own, _stated(content, "measurement")):
+        kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
     table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is asked for
     if variant is not None:
         variants = content.get("variant", {})
@@ -287,6 +293,8 @@ def read_problem(
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
+    if table.terms and model is None:
+        model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
     if model is not None:
         if not isinstance(model, KinematicModel):
             accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
@@ -306,6 +314,16 @@ def read_problem(
         base=base,
         board=_board(table, path),
     )
+
+
+def _stated(content: Any, key: str) -> Iterator[Any]:
+    """Yield the values of a key, in whichever table it stands."""
+    if isinstance(content, dict):
+        yield from (value for name, value in content.items() if name == key)
+        content = list(content.values())
+    if isinstance(content, list):
+        for each in content:
+            yield from _stated(each, key)
 
 
 def _checked(

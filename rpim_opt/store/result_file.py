@@ -40,7 +40,8 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
+from rpim_opt.robot.terms import Curve, Model, Term, Transmission, transmission
+from rpim_opt.store.own_code import is_own, own_object
 from rpim_opt.store.serialize import digest, plain, structured
 
 FORMAT = "rpim-opt result"
@@ -144,7 +145,13 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     try:
         _require_format(stored)
         file = structured(stored, Stored)
-        result = _calibration(file, {**READY, **{m.name: m for m in measurements}}, model or Model())
+        known = {**READY, **{m.name: m for m in measurements}}
+        kinds = {str(block.measurement) for part in file.data.values() for block in part.blocks}
+        for kind in filter(is_own, kinds - set(known)):
+            known[kind] = replace(own_object(kind, Measurement, "key data", path), name=kind)
+        if model is None:
+            model = Model([own_object(term, Term, "key record.terms", path) for term in file.record.terms])
+        result = _calibration(file, known, model)
         found = derived(result)
         if file.record.versions.get("rpim-opt", version_of("rpim-opt")) != version_of("rpim-opt"):
             found = {"rows": found["rows"]}  # another version may define figures differently

@@ -317,7 +317,7 @@ def _record(result: Calibration, inflation: float, released: Sequence[str], left
     )
     excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
     earlier = (*old.earlier, last)
-    return Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier)
+    return Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier, terms=old.terms)
 
 
 # --- the previous result as a prior ------------------------------------------------------------------------

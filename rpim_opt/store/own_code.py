@@ -1,0 +1,66 @@
+"""Measurement types and terms in Python files of a problem folder: code that runs only where the caller allows it."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TypeVar
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import inside
+
+T = TypeVar("T")
+_ALLOWED: ContextVar[bool] = ContextVar("allow_code", default=False)
+
+
+@contextmanager
+def allow_code() -> Iterator[None]:
+    """Allow that problem folders and results that are read meanwhile run the Python files that they name.
+
+    Examples
+    --------
+    >>> import rpim_opt as ro
+    >>> with ro.store.allow_code():
+    ...     problem = ro.load("position").problem  # its file could name a measurement type "mine:height"
+    """
+    token = _ALLOWED.set(True)
+    try:
+        yield
+    finally:
+        _ALLOWED.reset(token)
+
+
+def is_own(name: object) -> bool:
+    """Tell whether a name is that of an object in a Python file, ``mine:height`` for ``height`` in ``mine.py``."""
+    return isinstance(name, str) and ":" in name
+
+
+def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
+    """Return an object of a Python file that lies beside ``file``, which names it as the value of ``where``.
+
+    Raises
+    ------
+    InputError
+        Where code is not allowed, the Python file is missing or cannot be run, or the object is of another kind.
+    """
+    module, _, attribute = name.partition(":")
+    source = inside(file.parent, f"{module}.py", where, file)
+    if not _ALLOWED.get():
+        accepted = "a name that comes with the package; or --allow-code, which runs that file with your rights"
+        raise InputError(where, f"'{name}', code of {source.name}", accepted, file)
+    spec = importlib.util.spec_from_file_location(module, source)
+    if spec is None or spec.loader is None or not source.is_file():
+        raise InputError(where, f"'{name}', but no file {source.name}", "a file beside this one", file)
+    content = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(content)
+    except Exception as error:  # code of somebody else may raise anything
+        raise InputError(where, f"{type(error).__name__}: {error}", "code that runs", source) from error
+    found = getattr(content, attribute, None)
+    if not isinstance(found, kind):
+        article = "a" if kind.__name__[0] not in "AEIOU" else "an"
+        raise InputError(where, f"{attribute} = {found!r}"[:80], f"{article} {kind.__name__} of that name", source)
+    return found

@@ -1,0 +1,109 @@
+"""A measurement type and a term in a Python file of the problem's folder, which run only where that is allowed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot.kinematics import forward_kinematics
+from tests.simulate import ARM
+
+MINE = '''
+"""A gauge that reads heights, and the droop of a link."""
+
+from pathlib import Path
+
+import rpim_opt as ro
+
+height = ro.data.Measurement(
+    "height", model=lambda T: T[2, 3], columns={"height": "length"}, noise={"height": "length"}
+)
+creep = ro.robot.Term(
+    lambda base, rate: [0, 0, rate * base.column("hours"), 0, 0, 0],
+    {"creep_um": 50},
+    at="base",
+    columns={"hours": ""},
+)
+Path(__file__).with_name("ran").touch()
+'''
+PROBLEM = """
+title = "Heights"
+measurement = "mine:height"
+terms = ["mine:creep"]
+identification = "heights.csv"
+identify = ["theta[2-5]", "creep"]
+selector = "1"
+[noise]
+height_mm = 0.01
+"""
+RATE = 0.03
+"""mm an hour."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-2, 2, (60, 6))
+    hours = np.linspace(0, 8, 60)
+    z = 1e3 * forward_kinematics(ARM, q)[:, 2, 3] + RATE * hours + 0.01 * rng.normal(size=60)
+    rows = [
+        ",".join([f"P{i}", *map(str, np.degrees(row)), str(hour), str(height)])
+        for i, (row, hour, height) in enumerate(zip(q, hours, z, strict=True))
+    ]
+    header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "hours", "height_mm"])
+    (tmp_path / "heights.csv").write_text("\n".join([header, *rows]))
+    (tmp_path / "problem.toml").write_text(PROBLEM)
+    (tmp_path / "mine.py").write_text(MINE)
+    write_robot(ARM, tmp_path / "robot.toml")
+    return tmp_path
+
+
+def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "rpim_opt", *map(str, arguments)], capture_output=True, text=True)
+
+
+def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path) -> None:
+    refused = command("calibrate", folder)
+    assert refused.returncode == 2
+    assert "'mine:height', code of mine.py, accepted" in refused.stderr
+    assert "--allow-code" in refused.stderr
+    assert not (folder / "ran").exists()
+    done = command("calibrate", folder, "--allow-code", "--out", folder, "--json")
+    assert done.returncode == 0, done.stderr
+    creep = next(each for each in json.loads(done.stdout)["parameters"] if each["name"] == "creep")
+    assert creep["identified"] == pytest.approx(RATE, rel=0.03)  # 0.01 mm of noise, 60 rows over eight hours
+
+    assert "--allow-code" in command("report", folder).stderr
+    assert command("report", folder, "--allow-code").returncode == 0
+    with pytest.raises(ro.InputError, match="allow-code"):
+        ro.load(folder)
+    with ro.store.allow_code():
+        again = ro.load_result(folder)
+        assert np.abs(again.x - ro.load(folder).calibrate().x).max() < 1e-12
+    with pytest.raises(ro.InputError, match="allow-code"):
+        ro.load_result(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "stated", "said"),
+    [
+        ("height = 3\n", "mine:height", "height = 3, accepted: a Measurement of that name"),
+        ("1 / 0\n", "mine:height", "ZeroDivisionError: division by zero"),
+        (MINE, "other:height", "no file other.py"),
+        (MINE, "../mine:height", "the name of a file in the folder"),
+        (MINE, "mine:width", "width = None, accepted: a Measurement"),
+    ],
+)
+def test_what_is_wrong_with_own_code_is_one_sentence(folder: Path, text: str, stated: str, said: str) -> None:
+    (folder / "mine.py").write_text(text)
+    (folder / "problem.toml").write_text(PROBLEM.replace("mine:height", stated))
+    with ro.store.allow_code(), pytest.raises(ro.InputError) as refused:
+        ro.load(folder)
+    assert said in str(refused.value)
