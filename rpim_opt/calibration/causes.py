@@ -24,7 +24,7 @@ from rpim_opt.problem.diagnosis import (
     shared_rows,
     transmission,
 )
-from rpim_opt.problem.misreadings import EXACT, Better, better_reading, lost_row
+from rpim_opt.problem.misreadings import Better, better_reading, lost_row
 from rpim_opt.problem.problem import CalibrationProblem
 
 HOPELESS = 20.0
@@ -122,8 +122,7 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
         return tuple(map(Cause, _of_rows(problem)))
     better = better_reading(problem) or lost_row(_in_table_order(result, problem))
     if better is not None:
-        factor = better.stated / max(better.left, EXACT)
-        return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, factor))
+        return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, better.factor))
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
     if not found:
         found += transmission(problem, result.x)

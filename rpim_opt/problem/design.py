@@ -410,6 +410,11 @@ class Observability(Brief):
     condition: float
     raw_condition: float
 
+    @property
+    def weak(self) -> int:
+        """Number of identifiable combinations that the data tell less precisely than the prior."""
+        return int(np.count_nonzero(self.singular_values[: self.rank] < 1))
+
     def _short(self) -> str:
         return f"{self.rank} of {len(self.names)} combinations identifiable, condition {self.condition:.3g}"
 

@@ -17,10 +17,11 @@ from rpim_opt.basics.text import Tabled, counted, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, combination, observe
-from rpim_opt.problem.misreadings import better_reading, lever_arms, misfit, placed
+from rpim_opt.problem.misreadings import better_reading, misfit, placed
+from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import Fit, points_of
+from rpim_opt.problem.registration.points import points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 
@@ -106,6 +107,11 @@ class Inspection(Tabled):
     observability: Observability
     contact: tuple[str, ...] = ()
 
+    @property
+    def _mm(self) -> dict[str, float]:
+        """Errors of the rows by label [mm]."""
+        return dict(zip(self.problem.data.label, (1e3 * self.residual).tolist(), strict=True))
+
     def _short(self) -> str:
         o = self.observability
         seen = f"{o.rank} of {len(o.names)} combinations identifiable"
@@ -131,41 +137,43 @@ class Inspection(Tabled):
         """Return everything as a person reads it."""
         joints = []
         for r in self._frame_rows():
-            limits = f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}" if r["limits"] else "-"
-            share = f"{100 * r['share']:.0f} %" if r["limits"] else "-"
             figures = [f"{value:.2f}" for value in (r["from"], r["to"], r["to"] - r["from"])]
+            limits, share = "-", "-"
+            if r["limits"]:
+                limits = f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}"
+                share = f"{100 * r['share']:.0f} %"
             joints.append([r["joint"], r["unit"], *figures, limits, share])
         measured = []
         for r in self._measured():
             figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
             of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
             measured.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
+        notes = self._notes()
         parts = [
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
             table(["measured", "unit", "from", "to", "typical sigma"], measured),
             self._rows(),
             self._identifiable(),
             "\n".join(self.contact),
-            "\n".join(self._notes()[: len(self.warnings)]),
-            "\n".join(self._notes()[len(self.warnings) :]),
+            "\n".join(notes[: len(self.warnings)]),
+            "\n".join(notes[len(self.warnings) :]),
         ]
-        return "\n\n".join(part for part in parts if part)
+        return "\n\n".join(filter(None, parts))
 
     def content(self) -> dict[str, Any]:
         """Return the same as a document; joints and measured values in the unit that they name."""
-        o, mm = self.observability, (1e3 * self.residual).tolist()
-        error = dict(zip(self.problem.data.label, mm, strict=True))
+        o = self.observability
         return {
             "joints": self._frame_rows(),
             "measured": self._measured(),
-            "rows": len(mm),
+            "rows": len(self.residual),
             "configurations": len(np.unique(self.problem.data.configuration)),
             "nominal": statistics(self.residual),
-            "standing_out": [{"label": label, "error_mm": error[label]} for label in self.standing_out],
+            "standing_out": [{"label": label, "error_mm": self._mm[label]} for label in self.standing_out],
             "repeated": self.repeated,
             "repeatability_mm": None if self.repeatability is None else 1e3 * self.repeatability,
             "observability": {
-                "parameters": o.names, "rank": o.rank, "weak": int(np.count_nonzero(o.singular_values[: o.rank] < 1)),
+                "parameters": o.names, "rank": o.rank, "weak": o.weak,
                 "condition": o.condition, "raw_condition": o.raw_condition, **o.indices,
                 "unidentifiable": o.unidentifiable, "redundant": o.redundant,
             },
@@ -194,35 +202,33 @@ class Inspection(Tabled):
         return list(rows.values())
 
     def _rows(self) -> str:
-        data, mm = self.problem.data, 1e3 * self.residual
+        data = self.problem.data
         lines = [
             f"{len(data)} rows in {len(np.unique(data.configuration))} configurations. Nominal error "
-            f"{np.nanmean(mm):.3f} mm mean, {np.nanmax(mm):.3f} mm max ({data.label[int(np.nanargmax(mm))]})."
+            f"{1e3 * np.nanmean(self.residual):.3f} mm mean, {1e3 * np.nanmax(self.residual):.3f} mm max "
+            f"({data.label[int(np.nanargmax(self.residual))]})."
         ]
         if self.repeated:
             groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
-            spread = f", repeatable to {1e3 * (self.repeatability or 0.0):.3g} mm" if self.repeatability else ""
+            spread = f", repeatable to {1e3 * self.repeatability:.3g} mm" if self.repeatability else ""
             lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
         if self.standing_out:
-            error = dict(zip(data.label, mm, strict=True))
-            named = listed([f"{label} ({error[label]:.2f} mm)" for label in self.standing_out], 10)
+            named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
             lines.append(f"Nominal error stands out: {named}.")
         return "\n".join(lines)
 
     def _identifiable(self) -> str:
         o = self.observability
-        weak = int(np.count_nonzero(o.singular_values[: o.rank] < 1))
+        indices = ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
         lines = [
-            f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {weak} of them less precisely "
+            f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {o.weak} of them less precisely "
             "than by the prior.",
-            f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; "
-            + ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
-            + ".",
+            f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; {indices}.",
         ]
         if o.unidentifiable:
             lines.append(f"Unidentifiable: {', '.join(o.unidentifiable)}.")
         if o.redundant:
-            named = "; ".join(combination(terms) for terms in o.redundant)
+            named = "; ".join(map(combination, o.redundant))
             lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
         return "\n".join(lines)
 
@@ -478,17 +484,14 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Say whether joint values are rounded so that this explains the RMS error [m] of a fit."""
-    points = points_of(problem)
     turning = np.array(problem.robot.joint_dimensions) == "angle"
-    if points is None or not turning.any():
-        return
-    arms = lever_arms(problem.robot, points.q, points.tools[0])[:, turning]
+    slopes = problem.joint_slopes()[Equations.of(problem.data).length]
+    arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        decimals = _decimals(points.q[:, turning] / size)
+        decimals = _decimals(_all_q(problem.data)[:, turning] / size)
         if decimals is None:
             continue
-        step = size * 10.0**-decimals
-        made = step / np.sqrt(12) * float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
+        made = size * 10.0**-decimals / np.sqrt(12) * arm
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
                 f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone contributes "
@@ -502,7 +505,7 @@ def _decimals(values: Array) -> int | None:
     """Return how many decimals all values have at most, up to 4; None where they have more."""
     for decimals in range(5):
         scaled = values * 10.0**decimals
-        if np.abs(scaled - scaled.round()).max() < 1e-6 * max(np.abs(scaled).max(), 1.0) ** 0.5:
+        if np.abs(scaled - scaled.round()).max(initial=0.0) < 1e-6 * np.abs(scaled).max(initial=1.0) ** 0.5:
             return decimals
     return None
 
@@ -521,18 +524,15 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     place = min(left, key=left.__getitem__)
     if left[place] < FITS * whole:
         first, second = (placed(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
+        # the second part's points by the other base
+        motion = first.base @ np.linalg.inv(second.base)
+        there = second.modelled @ motion[:3, :3].T + motion[:3, 3]
+        far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
         yield (
             f"from row {problem.data.label[points.row[place]]} on the points fit another base, "
-            f"{three_digits(1e3 * _apart(first, second))} mm away: the instrument or the robot's foot moved; calibrate "
+            f"{three_digits(1e3 * far)} mm away: the instrument or the robot's foot moved; calibrate "
             "the two parts apart, or register the second one anew."
         )
-
-
-def _apart(first: Fit, second: Fit) -> float:
-    """Return how far apart two bases put the points of the second one's rows [m], in the mean."""
-    body = (second.modelled - second.base[:3, 3]) @ second.base[:3, :3]
-    seen = body @ first.base[:3, :3].T + first.base[:3, 3]
-    return float(np.linalg.norm(second.modelled - seen, axis=1).mean())
 
 
 def _places(count: int) -> list[int]:
@@ -630,12 +630,10 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         if gain > best:
             best, place, step = gain, k, found
     if best > (1 - MOVED) * left.squares and left.chance(best, 6, left.squares, len(places)) < RARE:
-        block = data.blocks[0]
-        components = list(block.measurement.components)
-        lengths = [i for i, name in enumerate(components) if name in ("x", "y", "z", "distance")]
-        alone = problem.on(replace(data, blocks=data.blocks[:1]))
-        change = (alone.jacobian(x)[:, base] @ (free.scale[base] * step)).reshape(-1, len(components))
-        far = 1e3 * float(np.linalg.norm(change[block.row >= place][:, lengths], axis=1).mean())
+        equations = Equations.of(data)
+        after = equations.length & (equations.row >= place)
+        change = problem.jacobian(x)[np.ix_(after, base)] @ (free.scale[base] * step)
+        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
         share = 100 * np.sqrt(max(left.squares - best, 1e-300) / left.squares)
         yield (
             f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
@@ -694,9 +692,9 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
 def _scale(problem: CalibrationProblem, A: Array) -> float | None:
     """Return the relative standard deviation of distances between touched places; None for a single one."""
     free = problem.parameters.free
-    residual, jacobian = problem.slopes(np.zeros(len(free)), centred=False)
-    rows = [] if problem.touches is None else problem.touches.rows
-    places = [-residual[index].mean(axis=0) for index in rows]
+    jacobian = problem.slopes(np.zeros(len(free)), centred=False)[1]
+    places = [thing.centre for thing in problem.touched]
+    rows = problem.touches.rows if problem.touches else ()
     slopes = [jacobian[index].mean(axis=0) * free.scale for index in rows]
     C = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
     squares = []

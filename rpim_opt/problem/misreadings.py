@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -23,15 +24,13 @@ from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 
-STEPS = 16
-"""Steps of a fit of base and reflectors."""
-ZERO_STEPS = 20
-"""Steps of a fit of joint zeros, too."""
+STEPS = 20
+"""Steps of a fit of base and reflectors, joint zeros too if they are free."""
 
 
-def placed(robot: Robot, points: Points, steps: int = STEPS, zeros: bool = False) -> Fit:
+def placed(robot: Robot, points: Points, zeros: bool = False) -> Fit:
     """Return where base and reflectors fit best, joint zeros too if asked; of poses their positions."""
-    fit = fit_arms(robot, Candidates.of(robot, [points]), steps, zeros=zeros, robust=True)
+    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, zeros=zeros, robust=True)
     every = 1 if points.turns is None else 4
     return Fit(
         fit.modelled[0, ::every], fit.error[0, ::every], fit.cost[0], fit.base[0], fit.tools[0, ::every], fit.zero[0]
@@ -40,18 +39,17 @@ def placed(robot: Robot, points: Points, steps: int = STEPS, zeros: bool = False
 
 def misfit(robot: Robot, points: Points) -> float:
     """Return the error over the extent of the points, the RMS of the best three quarters; robot nominal."""
-    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
-    return float(rms(fit)[0]) / points.extent
+    return float(misfits(robot, [points], zeros=False)[0])
 
 
-def misfits(robot: Robot, tries: Sequence[Points]) -> Array:
-    """Return the same (B,) of many readings of a table, joint zeros fitted."""
+def misfits(robot: Robot, tries: Sequence[Points], zeros: bool = True) -> Array:
+    """Return the same (B,) of many readings of a table, joint zeros fitted by default."""
     found = np.full(len(tries), np.inf)
     sizes = np.array([len(points.row) for points in tries])
     for size in np.unique(sizes):
         some = np.flatnonzero(sizes == size)
         chosen = [tries[int(i)] for i in some]
-        fits = fit_arms(robot, Candidates.of(robot, chosen), ZERO_STEPS, zeros=True, robust=True)
+        fits = fit_arms(robot, Candidates.of(robot, chosen), STEPS, zeros=zeros, robust=True)
         found[some] = rms(fits) / [points.extent for points in chosen]
     return found
 
@@ -70,18 +68,6 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
         return float(np.pi)
     error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
     return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
-
-
-def lever_arms(robot: Robot, q: Array, tool: Array) -> Array:
-    """Return how far a point of the flange frame moves a radian (or metre) of every joint, (N, dof) [m]."""
-    step = 1e-6
-
-    def point(values: Array) -> Array:
-        T = forward_kinematics(robot, values)
-        return T[:, :3, :3] @ tool + T[:, :3, 3]
-
-    moved = [point(q + step * unit) - point(q - step * unit) for unit in np.eye(robot.dof)]
-    return np.stack([np.linalg.norm(each, axis=1) for each in moved], axis=1) / (2 * step)
 
 
 BETTER = 0.2
@@ -114,14 +100,24 @@ LENGTHS = {
     1e-2: ("in cm, not m", "name the columns X [cm], ... and use rpim-opt new"),
 }
 """Factors between units of lengths, what was read wrongly, and what to write."""
+ANGLES = {
+    np.pi / 180: ("as degrees, not radians", "name the columns q1_deg, ... (--units deg)"),
+    180 / np.pi: ("as radians, not degrees", "name the columns q1_rad, ... (--units rad)"),
+    0.9: ("as gon, not degrees", "multiply the joint values by 0.9"),
+}
+"""The same of joint angles."""
 
 
 class Reading(NamedTuple):
-    """Another reading: what was mistaken, what to write, the points as they are then, and readings that fit as well."""
+    """Another reading: what was mistaken, what to write, the points as they are then, and readings that fit as well.
+
+    ``robot`` is another nominal robot, on which joint zeros are not fitted.
+    """
 
     what: str
     remedy: str
-    change: Callable[[Points], Points]
+    change: Callable[[Points], Points] = lambda points: points
+    robot: Robot | None = None
     others: tuple[Reading, ...] = ()
 
 
@@ -134,13 +130,18 @@ class Better(NamedTuple):
     left: float
 
     @property
+    def factor(self) -> float:
+        """How many times better it fits."""
+        return self.stated / max(self.left, EXACT)
+
+    @property
     def sentence(self) -> str:
         """Say it with the figures."""
         alike = ""
         if ", or " in self.what:
             alike = " These explain the data equally well: apply the one that the set-up confirms."
         figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
-        times = three_digits(self.stated / max(self.left, EXACT))
+        times = three_digits(self.factor)
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
 
 
@@ -167,12 +168,8 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
 
     turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
-    for what, factor, remedy in (
-        ("as degrees, not radians", np.pi / 180, "name the columns q1_deg, ... (--units deg)"),
-        ("as radians, not degrees", 180 / np.pi, "name the columns q1_rad, ... (--units rad)"),
-        ("as gon, not degrees", 0.9, "multiply the joint values by 0.9"),
-    ):
-        yield of(f"joint values read {what}", remedy, np.diag(np.where(turning, factor, 1)))
+    for factor, (unit, remedy) in ANGLES.items():
+        yield of(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         yield of(f"joint {i + 1} reversed", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
@@ -201,41 +198,45 @@ def _of_positions() -> Iterator[Reading]:
 
     for factor, (unit, remedy) in LENGTHS.items():
         yield scaled(f"measured lengths {unit}", remedy, np.full(3, factor))
-        for k, axis in enumerate("xyz"):
-            factors = np.where(np.arange(3) == k, factor, 1.0)
-            yield scaled(f"column {axis} {unit}", f"multiply column {axis} by {factor:g} or name its unit", factors)
+        for axis, of_axis in zip("xyz", np.eye(3), strict=True):
+            remedy = f"multiply column {axis} by {factor:g} or name its unit"
+            yield scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
     remedy = "change the sign of one coordinate, or exchange two"
     yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
 def _of_poses() -> Iterator[Reading]:
     """Yield readings with other orientations."""
-    yield Reading(
+
+    def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Reading:
+        def changed(points: Points) -> Points:
+            return points if points.turns is None else replace(points, turns=change(points.turns))
+
+        return Reading(what, remedy, changed)
+
+    def euler(axes: str, factor: float = 1.0) -> Callable[[Array], Array]:
+        # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
+        columns = ["xyz".index(axis) for axis in axes.lower()]
+
+        def change(turns: Array) -> Array:
+            angles = factor * Rotation.from_matrix(turns).as_euler("xyz")
+            return np.asarray(Rotation.from_euler(axes, angles[:, columns]).as_matrix())
+
+        return change
+
+    yield turned(
         "orientations the other way round (of the instrument in the tool)",
         "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
-        lambda points: replace(points, turns=None if points.turns is None else np.swapaxes(points.turns, 1, 2)),
+        lambda turns: np.swapaxes(turns, 1, 2),
     )
     yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", _inverted)
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
             if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
                 what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
-                yield Reading(what, "convert them to roll, pitch, yaw, or to quaternions", _euler(axes))
+                yield turned(what, "convert them to roll, pitch, yaw, or to quaternions", euler(axes))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
-        yield Reading(f"Euler angles in {unit}", "convert them to degrees", _euler("xyz", factor))
-
-
-def _euler(axes: str, factor: float = 1.0) -> Callable[[Points], Points]:
-    """Return the reading of angles rx, ry, rz, taken for roll, pitch, yaw, about other axes or in another unit."""
-
-    def changed(points: Points) -> Points:
-        if points.turns is None:
-            return points
-        angles = factor * Rotation.from_matrix(points.turns).as_euler("xyz")
-        columns = ["xyz".index(axis) for axis in axes.lower()]
-        return replace(points, turns=Rotation.from_euler(axes, angles[:, columns]).as_matrix())
-
-    return changed
+        yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor))
 
 
 def _inverted(points: Points) -> Points:
@@ -252,20 +253,44 @@ def _of_rows(count: int) -> Iterator[Reading]:
         return Reading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
 
     rows = np.arange(count)
-    for k in (1, 2, 3):
-        if count - k >= 6:
-            said = f"{k} row{'s' * (k > 1)}"
-            for low, back, joints, values in (
-                ("low", "up", rows[:-k], rows[k:]),
-                ("high", "down", rows[k:], rows[:-k]),
-            ):
-                remedy = f"move the measured values {said} {back}, against the joint values"
-                yield of(f"measured values {said} too {low} in the table", remedy, joints, values)
+    for k in range(1, min(3, count - 6) + 1):
+        by = f"{k} row{'s' * (k > 1)}"
+        remedy = f"move the measured values {by} {{}}, against the joint values"
+        yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
+        yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
     yield of("the rows of joint values in the reverse order", "turn one of the two parts over", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     yield of("measured values sorted as texts (1, 10, 11, 2)", remedy, by_text, rows)
     yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
+
+
+def _orders(robot: Robot) -> Iterator[Reading]:
+    """Yield all orders of up to six turning joints."""
+    if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
+        return
+    for order in permutations(range(robot.dof)):
+        what = f"joints in the order {', '.join(f'q{i + 1}' for i in order)}"
+        yield Reading(
+            what, "name the columns in that order", lambda points, order=order: replace(points, q=points.q[:, order])
+        )
+
+
+def _other_robots(robot: Robot) -> Iterator[Reading]:
+    """Yield the table in the other Denavit-Hartenberg convention, and the ready robots with such joints."""
+    for which, shift, end, remedy in (
+        ("standard (distal)", 1, 0, "move alpha and a of every row to the next row (the first row's are 0)"),
+        ("modified (proximal)", -1, -1, "move alpha and a of every row to the row before"),
+    ):
+        mdh = robot.mdh.copy()
+        mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
+        mdh[end, :2] = 0.0
+        what = f"a table in the {which} Denavit-Hartenberg convention"
+        yield Reading(what, remedy, robot=replace(robot, mdh=mdh))
+    for name in robots():
+        ready = read_robot(READY / f"{name}.toml")
+        if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
+            yield Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', robot=ready)
 
 
 # Which of these fits
@@ -294,7 +319,7 @@ def lost_row(problem: CalibrationProblem) -> Better | None:
     start, by = tries[int(np.argmin(size))]
     if not size.min() < BETTER * stated:
         return None
-    error = placed(robot, moved(start, by), ZERO_STEPS, zeros=True).error
+    error = placed(robot, moved(start, by), zeros=True).error
     wrong = np.append(error > ROW_WRONG * np.median(error), False)
     first = start
     while wrong[start]:  # rows before the right start fit as they stand
@@ -304,12 +329,8 @@ def lost_row(problem: CalibrationProblem) -> Better | None:
         start = first
     label = problem.labels[points.row[min(start, len(rows) - 1)]]
     way, remedy = ("down", "a reading was lost there") if by > 0 else ("up", "there is a reading too many there")
-    return Better(
-        f"the measured values from row {label} on moved {way} by one row",
-        remedy,
-        stated * points.extent,
-        float(size.min()) * points.extent,
-    )
+    what = f"the measured values from row {label} on moved {way} by one row"
+    return Better(what, remedy, stated * points.extent, float(size.min()) * points.extent)
 
 
 def better_reading(problem: CalibrationProblem) -> Better | None:
@@ -336,23 +357,27 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     stated = misfit(robot, points)
     if not np.isfinite(stated):
         return None
-    found = _mistakes(robot, points, stated)
-    if found is None and stated > WRONG and not points.seen:
-        found = _reordered(robot, points, stated) or _other_robot(robot, points, stated)
-    return found
+    chain, left = _mistakes(robot, points, stated)
+    if stated > WRONG and not points.seen:
+        for readings in (_orders, _other_robots):
+            if not left < BETTER * stated:
+                chain, left = _best(robot, points, list(readings(robot)))
+    if not left < BETTER * stated:
+        return None
+    return _compared(robot, chain, points, stated, left)
 
 
-def _mistakes(robot: Robot, points: Points, stated: float) -> Better | None:
+def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
     chain: list[Reading] = []
     best = stated
     changed = points
     while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
         each, size = _best(robot, changed, _readings(robot, changed))
-        if each is None or not size < FURTHER * best:
+        if not size < FURTHER * best:
             break
-        chain.append(each)
-        changed = each.change(changed)
+        chain += each
+        changed = each[0].change(changed)
         best = size
     if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
         readings = _readings(robot, points)
@@ -360,14 +385,12 @@ def _mistakes(robot: Robot, points: Points, stated: float) -> Better | None:
             changed = readings[i].change(points)
             others = [each for each in _readings(robot, changed) if each.what != readings[i].what]
             second, left = _best(robot, changed, others)
-            if second is not None and left < min(best, BETTER * stated):
-                chain, best = [readings[i], second], left
+            if left < min(best, BETTER * stated):
+                chain, best = [readings[i], *second], left
     if len(chain) > 1 and best > WRONG:  # of many pairs one always fits somewhat better
         chain = chain[:1]
         best = float(_tried(robot, points, chain)[0])
-    if not best < BETTER * stated:
-        return None
-    return _compared(robot, chain, points, stated, best)
+    return chain, best
 
 
 def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float, left: float) -> Better:
@@ -380,7 +403,10 @@ def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float,
         for other in each.others:
             tried = other.change(changed)
             as_many = len(tried.row) == len(each.change(changed).row)  # the mistakes behind it are of so many rows
-            if not behind or (as_many and float(misfits(robot, [_changed(behind, tried)])[0]) <= SAME * left):
+            if behind and as_many:
+                whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
+                as_many = bool(misfits(robot, [whole])[0] <= SAME * left)
+            if as_many or not behind:
                 alike.append(other)
         same.append(alike)
         changed = each.change(changed)
@@ -389,65 +415,26 @@ def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float,
     return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
-def _changed(chain: Sequence[Reading], points: Points) -> Points:
-    for each in chain:
-        points = each.change(points)
-    return points
-
-
-def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[Reading | None, float]:
-    """Return the reading that fits best, and how badly it does; few rows choose whom more rows compare."""
-    size = _tried(robot, points, readings)
+def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[list[Reading], float]:
+    """Return the reading that fits best, if any does, and how badly; few rows choose whom more rows compare."""
+    size = _tried(robot, points, readings, FEW)
     least = float(size.min(initial=np.inf))
     if not np.isfinite(least):
-        return None, float("inf")
+        return [], float("inf")
     near = [readings[i] for i in np.argsort(size) if size[i] <= NEAR * least][:8]
-    whole = misfits(robot, [each.change(points) for each in near])
+    whole = _tried(robot, points, near, len(points.row))
     k = int(np.argmin(whole))
     same = [each for each, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
-    return near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3]), float(whole[k])
+    return [near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3])], float(whole[k])
 
 
-def _tried(robot: Robot, points: Points, readings: Sequence[Reading]) -> Array:
-    """Return how badly readings fit, from few rows."""
-    return misfits(robot, [each.change(points).evenly(FEW) for each in readings])
-
-
-def _reordered(robot: Robot, points: Points, stated: float) -> Better | None:
-    """Return the best order of up to six turning joints."""
-    if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
-        return None
-    readings = [
-        Reading(
-            f"joints in the order {', '.join(f'q{i + 1}' for i in order)}",
-            "name the columns in that order",
-            lambda points, order=order: replace(points, q=points.q[:, list(order)]),
-        )
-        for order in permutations(range(robot.dof))
-    ]
-    each, size = _best(robot, points, readings)
-    if each is None or not size < BETTER * stated:
-        return None
-    return _compared(robot, [each], points, stated, size)
-
-
-def _other_robot(robot: Robot, points: Points, stated: float) -> Better | None:
-    """Return the table in the other Denavit-Hartenberg convention, or a ready robot, that fits far better."""
-    tried: list[tuple[str, str, Robot]] = []
-    for which, shift, remedy in (
-        ("standard (distal)", 1, "move alpha and a of every row to the next row (the first row's are 0)"),
-        ("modified (proximal)", -1, "move alpha and a of every row to the row before"),
-    ):
-        mdh = robot.mdh.copy()
-        mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
-        mdh[0 if shift > 0 else -1, :2] = 0.0
-        tried.append((f"a table in the {which} Denavit-Hartenberg convention", remedy, replace(robot, mdh=mdh)))
-    for name in robots():
-        ready = read_robot(READY / f"{name}.toml")
-        if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
-            tried.append((f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready))
-    size = [misfit(other, points) for _, _, other in tried]
-    what, remedy, _ = tried[int(np.argmin(size))]
-    if not min(size) < BETTER * stated:
-        return None
-    return Better(what, remedy, stated * points.extent, min(size) * points.extent)
+def _tried(robot: Robot, points: Points, readings: Sequence[Reading], most: int = FEW) -> Array:
+    """Return how badly readings fit, from so many rows."""
+    tries = [each.change(points).evenly(most) for each in readings]
+    found = np.full(len(readings), np.inf)
+    own = [i for i, each in enumerate(readings) if each.robot is None]
+    found[own] = misfits(robot, [tries[i] for i in own])
+    for i, each in enumerate(readings):
+        if each.robot is not None:
+            found[i] = misfit(each.robot, tries[i])
+    return found

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import lever_arms, misfit, placed
+from rpim_opt.problem.misreadings import misfit, placed
 from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, points_of
 from tests.simulate import ARM
 
@@ -92,13 +92,6 @@ def test_a_few_rows_are_too_few_and_many_are_taken_evenly() -> None:
     assert some is not None
     assert some.row.tolist() == [3 * k for k in range(14)]
     assert some.y == pytest.approx(problem.data.blocks[0].y[::3])
-
-
-def test_arms_are_how_far_a_joint_moves_a_point() -> None:
-    """Of an arm in a plane: distances from the axes."""
-    flat = ro.robot.Robot("flat", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
-    found = lever_arms(flat, np.array([[0.3, 0.0], [0.0, np.pi / 2]]), np.array([0.3, 0.0, 0.1]))
-    assert found == pytest.approx(np.array([[0.7, 0.3], [0.5, 0.3]]), rel=1e-6)
 
 
 def test_directions_that_only_rounding_sees_have_no_rank() -> None:
