@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -166,3 +167,31 @@ def test_an_iterated_kalman_filter_is_tikhonov_with_weight_one() -> None:
     want = ro.calibrate(problem, ro.tikhonov, 1.0).x
     assert np.abs((baselines.extended_kalman_filter(problem, 8).x - want) / scale).max() < 1e-8
     assert np.abs((baselines.extended_kalman_filter(problem).x - want) / scale).max() < 0.5
+
+
+def test_a_constraint_that_does_not_bind_changes_nothing_at_weak_directions() -> None:
+    rng = np.random.default_rng(0)
+    U, V = (np.linalg.qr(rng.normal(size=(k, 8)))[0] for k in (40, 8))
+    s = np.array([1.0, 0.5, 1e-2, 1e-4, 5e-9, 7e-10, 0.0, 0.0])  # the data see six directions, two of them hardly
+    model = model_of(1e4 * (U * s) @ V.T, 1e-3 * rng.normal(size=40))
+    free = ro.Formulation("free")
+    slack = ro.Formulation("with room", constraints=(lambda z, _: z[0] <= 1e9,))
+    expected = ro.convex.pose(free, model).solve()
+    found = ro.convex.pose(slack, model).solve()
+    assert found.objective == pytest.approx(expected.objective, rel=1e-9)
+
+
+def test_row_generation_ends_where_the_other_rows_do_not_matter() -> None:
+    count = 1_500
+
+    def cvar(r):
+        threshold = cp.Variable()
+        return threshold + cp.sum(cp.pos(cp.abs(r) - threshold)) / (0.1 * r.size)
+
+    rng = np.random.default_rng(1)
+    model = model_of(rng.normal(size=(count, 4)), rng.standard_t(3, size=count))
+    program = ro.convex.pose(ro.Formulation("CVaR", loss=cvar, penalty=cp.sum_squares), model)
+    found = program.solve(1e-3)
+    assert found.objective == pytest.approx(program.problem(1e-3).solve(solver="CLARABEL"), rel=1e-7)
+    largest = np.sort(np.abs(model.A @ found.z - model.b))[-count // 10 :]
+    assert found.loss == pytest.approx(largest.mean(), rel=1e-7)

@@ -14,6 +14,7 @@ from scipy.linalg import qr, solve_triangular
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic
+from rpim_opt.problem.linear import RANK_TOLERANCE
 
 SOUGHT, ACCEPTED = 1e-10, 1e-8
 """Clarabel's tolerances: what it goes on to while it makes progress, and what is good enough."""
@@ -27,8 +28,6 @@ ATTEMPTS: tuple[dict[str, Any], ...] = (
 """Settings that are tried in turn: where one factorization stalls, another does not."""
 CURVED = 1e-14
 """Eigenvalues of P below this part of the largest are rounding."""
-RANK = 1e-9
-"""Singular values of a face below this part of the largest count as zero."""
 DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
@@ -552,7 +551,7 @@ def on_face(
         reduced = np.vstack([np.sqrt(2) * squares.R @ Z[at], np.sqrt(weight) * root @ Z])
         L: Any = np.linalg.qr(reduced, mode="r")
         pivots = np.abs(np.diag(L))
-        if len(L) == Z.shape[1] and pivots.min() > RANK * pivots.max():
+        if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
                 x = x - Z @ solve_triangular(L, _transposed(L, Z.T @ gradient(x)))
         else:
@@ -578,7 +577,7 @@ def _flat_minimum(
     """Return the minimum next to x (N,) along Z where some directions have no curvature; None where it is unbounded."""
     largest = np.abs(squares.R).max()
     _, values, V = np.linalg.svd(reduced, full_matrices=False)
-    V = V[values > RANK * max(values.max(initial=0.0), 1e-3 * largest)]
+    V = V[values > RANK_TOLERANCE * max(values.max(initial=0.0), 1e-3 * largest)]
     values = values[: len(V)]
     slope = np.zeros(Z.shape[1])
     for _ in range(3):  # refined

@@ -188,13 +188,17 @@ def _coupled(
             if "DualInfeasible" not in str(error) or len(warm.working) == count or warm.z is None:
                 raise
             v = entries(rows.A @ warm.z - rows.b)  # too few rows to bound the loss from below
-            warm.working = np.sort(np.argsort(-np.abs(v))[: min(2 * len(warm.working), count)])
+            warm.working = np.sort(np.argsort(-np.abs(v))[: 4 * len(warm.working)])
             continue
         warm.z = point.x[warm.penalty.at]
         v = entries(rows.A @ warm.z - rows.b)
         slope = np.zeros(len(rows.b))
         slope[rows.places(warm.working)] = point.slope
         more = _violated(canonical, owner, warm.working, v, point.rest)
+        if len(more) and point.rest is not None:  # unknowns of the loss that nothing holds count as violated, too
+            bound = part.value(point.rest)
+            if canonical.at_best(v) - bound <= VIOLATED * max(abs(bound), 1.0):
+                more = more[:0]
         if not len(more):  # the next minimum begins with what is active, and the largest beside it
             size = np.abs(entries(slope))
             active = np.flatnonzero(size > INACTIVE * size.max())
