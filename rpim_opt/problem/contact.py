@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -14,9 +14,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.problem.noise import Stack, equation_numbers
 
-UNKNOWNS = 3
-"""Of a point its coordinates; of a plane a distance and two tilts."""
-
 
 class Moved(NamedTuple):
     """How a centre (3, c) [m], a normal (3, c) and directions in a plane (2, 3, c), if any, move."""
@@ -27,74 +24,19 @@ class Moved(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
-    """A point at the mean of the positions p_i (K, 3) of its touches.
+class Thing:
+    """A point or a plane that fits the positions p_i (K, 3) of its touches best.
 
-    Without it K touches say 3 (K - 1) things of the robot alone, the differences of every touch to the mean of those
-    before it (Helmert's contrasts)::
-
-        h_j = sqrt(j / (j + 1)) (r_{j+1} - mean(r_1 ... r_j)),    j = 1 ... K - 1
-
-    They are orthonormal: independent touches of one accuracy have independent contrasts of that accuracy.
-
-    ``centre`` (3,) is the mean [m], ``count`` K; ``normal`` and ``across`` are zero: a point has none.
-    """
-
-    centre: Array
-    count: int
-    normal: Array
-    across: Array
-
-    @classmethod
-    def of(cls, positions: Array) -> Point:
-        """Return the point that touches at (K, 3) [m] put where they are in the mean."""
-        return cls(positions.mean(axis=0), len(positions), np.zeros(3), np.zeros((2, 3)))
-
-    @property
-    def level(self) -> Point:
-        """The point itself."""
-        return self
-
-    @property
-    def kept(self) -> np.ndarray:
-        """Which of the touches' coordinates (K, 3) give a contrast its place."""
-        found = np.ones((self.count, 3), dtype=bool)
-        found[0] = False
-        return found
-
-    def seen(self, values: Array) -> Array:
-        """Return what of values (K, 3, c) of the positions a touch shows, (K, 3, c)."""
-        return values
-
-    def slopes(self, values: Array) -> Array:
-        """Return how far touches are off the point (K, 3, c) changes, where positions move by values (K, 3, c)."""
-        return values - values.mean(axis=0)
-
-    def contrasts(self, values: Array) -> Array:
-        """Return the contrasts of values (K, 3, c), in the places that are kept."""
-        found = np.zeros_like(values)
-        j = np.arange(1, self.count)[:, None, None]
-        before = np.cumsum(values, axis=0)[:-1] / j
-        found[1:] = np.sqrt(j / (j + 1)) * (values[1:] - before)
-        return found
-
-    def moved(self, values: Array) -> Moved:
-        """Return how it moves where its touches move by values (K, 3, c)."""
-        return Moved(values.mean(axis=0), np.zeros(values.shape[1:]))
-
-
-@dataclass(frozen=True, eq=False)
-class Plane:
-    """A plane that fits the positions p_i (K, 3) of its touches best.
-
-    A touch shows how far it is along the normal n, s_i = n'(p_i - centre), its first coordinate here; two others are
-    zero. Without the plane K touches say K - 3 things of the robot alone: s in an orthonormal basis of what is
-    perpendicular to 1, u, v, the coordinates in the plane.
+    A touch of a point shows where it is, p_i; of a plane how far it is along the normal n, s_i = n'(p_i - centre), its
+    first coordinate here, while two others are zero. Without the thing K touches say of the robot alone what is left of
+    these in an orthonormal basis (K, k) of what is perpendicular to the ``places``: for a point to 1 (Helmert's
+    contrasts, of every touch to the mean of those before it), for a plane to 1, u, v, the coordinates in the plane.
+    Independent touches of one accuracy have independent contrasts of that accuracy.
 
     ``centre`` and ``normal`` are (3,) each, ``across`` (2, 3) two directions in the plane: the projection of the
     coordinate axis number ``axis`` (None for a plane that is parallel to those that should be), and what is
-    perpendicular to that. ``height`` (K,) is s of every touch [m], ``places`` (K, 3) 1 and its coordinates u, v [m] in
-    the plane, ``aside`` (K, K - 3) the orthonormal basis.
+    perpendicular to that; zero for a point. ``height`` (K,) is s of every touch [m], ``places`` (K, 1 or 3) 1, u, v
+    [m], ``shown`` (3 or 1, 3) the directions that a touch shows.
     """
 
     centre: Array
@@ -103,52 +45,57 @@ class Plane:
     across: Array
     height: Array
     places: Array
-    aside: Array
+    shown: Array
 
     @classmethod
-    def of(cls, positions: Array) -> Plane:
-        """Return the plane that is nearest to touches at (K, 3) [m]."""
+    def of(cls, positions: Array, planar: bool) -> Thing:
+        """Return what is nearest to touches at (K, 3) [m]."""
         centre = positions.mean(axis=0)
+        one = np.ones((len(positions), 1))
+        if not planar:
+            return cls(centre, np.zeros(3), None, np.zeros((2, 3)), np.zeros(len(positions)), one, np.eye(3))
         normal = np.linalg.svd(positions - centre)[2][2]
         normal = normal * np.copysign(1.0, normal[np.argmax(np.abs(normal))])
         axis = int(np.argmin(np.abs(normal)))
         first = np.eye(3)[axis] - normal * normal[axis]
         first = first / np.linalg.norm(first)
         across = np.array([first, np.cross(normal, first)])
-        places = np.column_stack([np.ones(len(positions)), (positions - centre) @ across.T])
-        aside = np.linalg.qr(places, mode="complete")[0][:, UNKNOWNS:]
-        return cls(centre, normal, axis, across, (positions - centre) @ normal, places, aside)
+        places = np.hstack([one, (positions - centre) @ across.T])
+        return cls(centre, normal, axis, across, (positions - centre) @ normal, places, normal[None])
 
     @property
-    def level(self) -> Plane:
-        """The plane with its touches in it, and parallel planes parallel: what the nominal robot is off is no noise."""
+    def planar(self) -> bool:
+        """Whether it is a plane."""
+        return len(self.shown) == 1
+
+    @property
+    def level(self) -> Thing:
+        """The thing with its touches on it, and parallel planes parallel: what the nominal robot is off is no noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
-    @property
-    def kept(self) -> np.ndarray:
-        """Which of the touches' coordinates (K, 3) give a contrast its place."""
-        found = np.zeros((len(self.places), 3), dtype=bool)
-        found[UNKNOWNS:, 0] = True
-        return found
+    @cached_property
+    def aside(self) -> Array:
+        """The orthonormal basis (K, k) of contrasts."""
+        if self.planar:
+            return np.linalg.qr(self.places, mode="complete")[0][:, 3:]
+        return -scipy.linalg.helmert(len(self.places)).T
+
+    def kept(self, equations: np.ndarray) -> np.ndarray:
+        """Return which of the touches' equations (K, 3) give a contrast its place, (k, 3 or 1)."""
+        return equations[self.places.shape[1] :, : len(self.shown)]
 
     def seen(self, values: Array) -> Array:
         """Return what of values (K, 3, c) of the positions a touch shows, (K, 3, c)."""
         found = np.zeros_like(values)
-        found[:, 0] = np.einsum("kic,i->kc", values, self.normal)
+        found[:, : len(self.shown)] = self.shown @ values
         return found
 
     def slopes(self, values: Array) -> Array:
-        """Return how s changes (K, 3, c), its first coordinate, where positions move by values (K, 3, c)."""
-        found = np.zeros_like(values)
+        """Return how what touches show, less the thing, changes (K, 3, c), where positions move by (K, 3, c)."""
         moved = self.moved(values)
-        q = self.places[:, 1:] @ self.across + np.outer(self.height, self.normal)
-        found[:, 0] = np.einsum("kic,i->kc", values - moved.centre, self.normal) + q @ moved.normal
-        return found
-
-    def contrasts(self, values: Array) -> Array:
-        """Return the contrasts of values (K, 3, c), in the places that are kept."""
-        found = np.zeros_like(values)
-        found[UNKNOWNS:, 0] = self.aside.T @ values[:, 0]
+        found = self.seen(values - moved.centre)
+        q = self.places[:, 1:] @ self.across[: self.places.shape[1] - 1] + np.outer(self.height, self.normal)
+        found[:, 0] += q @ moved.normal
         return found
 
     def moved(self, values: Array) -> Moved:
@@ -159,27 +106,29 @@ class Plane:
             dn = -E' (E M E' - s's)^-1 E dM n,    dM n = sum_i q_i n'dp_i + s_i dp_i,    E the directions in the plane
         """
         n = self.normal
+        centre = values.mean(axis=0)
+        if not self.planar:
+            return Moved(centre, np.zeros(values.shape[1:]))
         E = self.across
         uv = self.places[:, 1:]
         turn = uv.T @ np.einsum("kic,i->kc", values, n) + E @ np.einsum("k,kic->ic", self.height, values)
         normal = -E.T @ np.linalg.solve(uv.T @ uv - self.height @ self.height * np.eye(2), turn)
         if self.axis is None:
-            return Moved(values.mean(axis=0), normal, None)
+            return Moved(centre, normal)
         # E_1 = (a - n n'a) / |a - n n'a| with a coordinate axis a, E_2 = n x E_1
         a = np.eye(3)[self.axis]
         first = -(np.outer(n, a @ normal) + normal * (a @ n))
         across = np.empty((2, *normal.shape))
         across[0] = (first - np.outer(E[0], E[0] @ first)) / np.sqrt(1 - n[self.axis] ** 2)
         across[1] = np.cross(normal, E[0][:, None], axis=0) + np.cross(n[:, None], across[0], axis=0)
-        return Moved(values.mean(axis=0), normal, across)
+        return Moved(centre, normal, across)
 
 
-AXES = np.arange(3)
 CLOSE = 0.05
 """Touches that spread by less [m] do not show how large a robot is, whatever else is known."""
 ROUNDING = 1e-12
 """Relative size of a covariance that is none."""
-Things = Sequence[Point | Plane]
+Things = Sequence[Thing]
 
 
 class Tie(NamedTuple):
@@ -196,10 +145,10 @@ class Touches:
     """Which equations touch which point or plane, and how these are eliminated.
 
     Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
-    Their best values follow from the touches (`touched.Point`, `touched.Plane`), and what the equations say of the
-    robot alone are contrasts, which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two
-    of them is an equation of these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin
-    n_1'n_2 for square ones, n_2 along two directions in the first for parallel ones.
+    Their best values follow from the touches (`Thing`), and what the equations say of the robot alone are contrasts,
+    which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two of them is an equation of
+    these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
+    n_2 along two directions in the first for parallel ones.
 
     ``rows`` are the numbers (K, 3) of the equations of the touches of every thing, ``planar`` which of these are
     planes, ``ties`` what is known of two of them, ``equations`` how many there are before the elimination.
@@ -216,13 +165,14 @@ class Touches:
         at: dict[str, list[int]] = {}
         planar: dict[str, bool] = {}
         stated: list[tuple[np.ndarray, Block, int]] = []
-        for block, numbers in zip(data.blocks, equation_numbers(data), strict=True):
+        numbers = equation_numbers(data)
+        for block, equations in zip(data.blocks, numbers, strict=True):
             if block.touched is None:
                 continue
             if not block.measurement.touching:
-                stated += [(numbers[i], block, i) for i in range(len(numbers))]
+                stated += [(equations[i], block, i) for i in range(len(equations))]
                 continue
-            for equation, name in zip(numbers[:, 0], block.touched[:, 0], strict=True):
+            for equation, name in zip(equations[:, 0], block.touched[:, 0], strict=True):
                 at.setdefault(name, []).append(int(equation))
                 planar[name] = block.measurement.planar
         if not at:
@@ -230,17 +180,15 @@ class Touches:
         number = {name: i for i, name in enumerate(at)}
         ties = []
         for equations, block, i in stated:
-            ends = [number.get(name) for name in (() if block.touched is None else block.touched[i])]
-            one, other = ends
+            one, other = (number.get(name) for name in np.asarray(block.touched)[i])
             if one is not None and other is not None:
                 ties.append(Tie(equations, block.measurement.name, float(block.y[i, 0]), (one, other)))
-        rows = tuple(np.array(first)[:, None] + AXES for first in at.values())
-        return cls(rows, tuple(planar.values()), tuple(ties), sum(map(np.size, equation_numbers(data))))
+        rows = tuple(np.array(first)[:, None] + np.arange(3) for first in at.values())
+        return cls(rows, tuple(planar.values()), tuple(ties), sum(map(np.size, numbers)))
 
     def located(self, residual: Array) -> Things:
         """Return where points and planes are, of a residual (m,) that is -p_i for touches."""
-        kinds = {False: Point, True: Plane}
-        return [kinds[flat].of(-residual[index]) for index, flat in zip(self.rows, self.planar, strict=True)]
+        return [Thing.of(-residual[index], flat) for index, flat in zip(self.rows, self.planar, strict=True)]
 
     def size(self, residual: Array) -> float:
         """Return how far all touches spread (RMS distance from their mean) [m], of a residual as `located` has it."""
@@ -256,17 +204,11 @@ class Touches:
         """
         where = self.located(residual)
         spread = self.size(residual)
-        unit = 1.0
-        if size > CLOSE:
-            unit = size / spread
+        unit = size / spread if size > CLOSE else 1.0
         left = residual.copy()
-        for thing, index in zip(where, self.rows, strict=True):
-            centre = np.broadcast_to(thing.centre, index.shape)
-            left[index] = unit * thing.seen((residual[index] + centre)[:, :, None])[:, :, 0]
-        for tie in self.ties:
-            left[tie.equations] = _off(tie, where)
         slopes = jacobian.copy()
         for thing, index in zip(where, self.rows, strict=True):
+            left[index] = unit * thing.seen((residual[index] + thing.centre)[:, :, None])[:, :, 0]
             slopes[index] = unit * thing.slopes(jacobian[index])
         if size > CLOSE:
             every = np.concatenate(self.rows)
@@ -274,13 +216,20 @@ class Touches:
             growth = np.einsum("ki,kin->n", away, jacobian[every]) / len(every) / spread**2
             slopes[every] += left[every][:, :, None] * growth
         for tie in self.ties:
-            slopes[tie.equations] = self._through(tie, where, jacobian)
+            left[tie.equations] = _off(tie, where)
+            slopes[tie.equations] = sum(G @ jacobian[index.ravel()] for index, G in self.through(tie, where))
         return left, slopes
 
-    def _through(self, tie: Tie, where: Things, values: Array) -> Array:
-        """Return how what a tie compares changes (e, c) where positions move by values (m, c)."""
-        ends = [where[end].moved(values[self.rows[end]]) for end in tie.ends]
-        return _compared(tie, where, ends)
+    def through(self, tie: Tie, where: Things) -> list[tuple[np.ndarray, Array]]:
+        """Return equations (K, 3) of a tie's two things, and how what it compares follows their positions (e, 3K)."""
+        found = []
+        for k, end in enumerate(tie.ends):
+            index = self.rows[end]
+            still = np.zeros((3, index.size))
+            moved = [Moved(still, still), Moved(still, still)]
+            moved[k] = where[end].moved(np.eye(index.size).reshape(*index.shape, -1))
+            found.append((index, _compared(tie, where, moved)))
+        return found
 
     @cached_property
     def alone(self) -> np.ndarray:
@@ -292,37 +241,27 @@ class Touches:
         """Return which of the equations' places contrasts have (m,)."""
         found = np.ones(self.equations, dtype=bool)
         for thing, index in zip(where, self.rows, strict=True):
-            found[index] = thing.kept
+            found[index] = False
+            found[thing.kept(index)] = True
         return found
 
     def contrasts(self, values: Array, where: Things) -> Array:
         """Return what m equations' values (m, c), as of `centred`, say without points and planes, (k, c)."""
         found = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
-            found[index] = thing.contrasts(values[index])
+            shown = values[index[:, : len(thing.shown)]]
+            found[thing.kept(index)] = np.tensordot(thing.aside.T, shown, axes=1)
         return found[self.kept(where)]
 
-    def noise(self, where: Things) -> Array:
+    def noise(self, where: Things) -> scipy.sparse.csr_matrix:
         """Return by which noise of the m equations that of the contrasts is made, (k, m)."""
-        eye = np.eye(self.equations)
-        through = eye.copy()
+        found = scipy.sparse.identity(self.equations, format="lil")
         for thing, index in zip(where, self.rows, strict=True):
-            through[index] = thing.seen(eye[index])
+            found[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
         for tie in self.ties:
-            through[tie.equations] += self._through(tie, where, eye)
-        return self.contrasts(through, where)
-
-    def within(self, index: np.ndarray, things: Sequence[int], ties: Sequence[int]) -> Touches:
-        """Return the touches among some equations, counted from the first of these."""
-        place = np.full(self.equations, -1)
-        place[index] = np.arange(len(index))
-        number = {thing: i for i, thing in enumerate(things)}
-        inside = tuple(
-            tie._replace(equations=place[tie.equations], ends=(number[tie.ends[0]], number[tie.ends[1]]))
-            for tie in (self.ties[i] for i in ties)
-        )
-        rows = tuple(place[self.rows[i]] for i in things)
-        return Touches(rows, tuple(self.planar[i] for i in things), inside, len(index))
+            for index, G in self.through(tie, where):
+                found[tie.equations[:, None], index.ravel()] = G
+        return found.tocsr()[self.kept(where)]
 
 
 def _off(tie: Tie, where: Things) -> Array:
@@ -333,7 +272,7 @@ def _off(tie: Tie, where: Things) -> Array:
     if tie.kind == "known_parallel":
         return -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
     apart = second.centre - first.centre
-    distance = abs(first.normal @ apart) if isinstance(first, Plane) else np.linalg.norm(apart)
+    distance = abs(first.normal @ apart) if first.planar else np.linalg.norm(apart)
     return np.array([tie.value - float(distance)])
 
 
@@ -351,7 +290,7 @@ def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
             return first.across @ (same * other.normal - one.normal)
         return same * (first.across @ other.normal + np.einsum("aic,i->ac", one.across, second.normal))
     apart = second.centre - first.centre
-    if isinstance(first, Plane):
+    if first.planar:
         along = first.normal @ (other.centre - one.centre) + apart @ one.normal
         return along[None] * np.copysign(1.0, first.normal @ apart)
     u = apart / max(float(np.linalg.norm(apart)), 1e-300)
@@ -359,72 +298,43 @@ def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
-    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops."""
-    place = np.cumsum(touches.kept(where)) - 1
-    of_thing = {int(index[0, 0]): i for i, index in enumerate(touches.rows)}
-    of_tie = {int(tie.equations[0]): i for i, tie in enumerate(touches.ties)}
-    found: dict[tuple[int, int], list[Stack]] = {}
-    for stack in stacks:
-        for n, index in enumerate(stack.index):
-            things = sorted(of_thing[e] for e in index.tolist() if e in of_thing)
-            ties = sorted(of_tie[e] for e in index.tolist() if e in of_tie)
-            part = touches.within(index, things, ties)
-            there = [where[i] for i in things]
-            made = _stack(part, stack, n, there, stop[index])
-            made = replace(made, index=place[index[part.kept(there)]][None])
-            for each in _independent(made):
-                found.setdefault((each.index.shape[1], each.joint.shape[2]), []).append(each)
-    names = ("index", "instrument", "length", "angle", "joint", "unit")
-    return [
-        Stack(**{name: np.concatenate([getattr(each, name) for each in same]) for name in names})
-        for (size, _), same in found.items()
-        if size
-    ]
+    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops.
 
-
-def _stack(touches: Touches, stack: Stack, n: int, where: Things, stop: np.ndarray) -> Stack:
-    """Return the contrasts of a stack's configuration n with what divides their noise; ``index`` is that of all."""
-    m = touches.equations
-    W = touches.noise(where)
-    own = np.ones(m, dtype=bool)
+    Equations of a configuration whose noise is independent of each other's come in several.
+    """
+    kept = touches.kept(where)
+    place = np.cumsum(kept) - 1
+    noise = touches.noise(where)
+    own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
         own[tie.equations] = False  # its touches scatter, and not what is stated
-    stops = np.unique(stop, return_inverse=True)[1]
-    spread = np.zeros((m, stops.max(initial=0) + 1, stack.joint.shape[2]))
-    spread[np.arange(m), stops] = stack.joint[n] * own[:, None]
-    joint = W @ spread.reshape(m, -1)
-    if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
-        joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
-    kept = touches.kept(where)
-    return Stack(
-        index=stack.index[n : n + 1],
-        instrument=(W @ stack.instrument[n] @ W.T)[None],
-        length=(stack.length[n] & own)[None, kept],
-        angle=(stack.angle[n] & own)[None, kept],
-        joint=joint[None],
-        unit=((W * (stack.length[n] & own)) @ W.T)[None],
-    )
-
-
-def _independent(stack: Stack) -> Iterator[Stack]:
-    """Yield a configuration's equations in groups whose noise is independent of each other's."""
-    k = stack.index.shape[1]
-    if stack.joint.shape[2] or stack.unit is None:
-        yield stack
-        return
-    V = stack.instrument[0]
-    U = stack.unit[0]
-    related = (np.abs(V) > ROUNDING * np.abs(V).max(initial=0.0)) | (np.abs(U) > ROUNDING)
-    number = scipy.sparse.csgraph.connected_components(related | np.eye(k, dtype=bool))[1]
-    for part in (np.flatnonzero(number == i) for i in range(number.max(initial=-1) + 1)):
-        yield Stack(
-            index=stack.index[:, part],
-            instrument=V[np.ix_(part, part)][None],
-            length=stack.length[:, part],
-            angle=stack.angle[:, part],
-            joint=np.zeros((1, len(part), 0)),
-            unit=U[np.ix_(part, part)][None],
-        )
+    found: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
+    for stack in stacks:
+        for n, index in enumerate(stack.index):
+            rows = index[kept[index]]
+            W = noise[place[rows]][:, index].toarray()
+            instrument = W @ stack.instrument[n] @ W.T
+            unit = (W * (stack.length[n] & own[index])) @ W.T
+            stops = np.unique(stop[index], return_inverse=True)[1]
+            joint = np.zeros((len(index), stops.max() + 1, stack.joint.shape[2]))
+            joint[np.arange(len(index)), stops] = stack.joint[n] * own[index, None]
+            joint = W @ joint.reshape(len(index), -1)
+            if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
+                joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
+            groups = np.zeros(len(rows), dtype=int)
+            if not joint.shape[1]:
+                related = (np.abs(instrument) > ROUNDING * np.abs(instrument).max(initial=0.0)) | (
+                    np.abs(unit) > ROUNDING
+                )
+                groups = scipy.sparse.csgraph.connected_components(related | np.eye(len(rows), dtype=bool))[1]
+            for group in np.unique(groups):
+                some = np.flatnonzero(groups == group)
+                both = np.ix_(some, some)
+                e = rows[some]
+                dimensions = (each[n][np.isin(index, e)] & own[e] for each in (stack.length, stack.angle))
+                each = (place[e], instrument[both], *dimensions, joint[some], unit[both])
+                found.setdefault((len(some), joint.shape[1]), []).append(each)
+    return [Stack(*map(np.stack, zip(*same, strict=True))) for same in found.values()]
 
 
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
@@ -437,7 +347,10 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Thing
     left = touch.copy()
     for thing, index in zip(where, touches.rows, strict=True):
         left[index[:, 0]] = _left(thing, touch[index[:, 0]])
-    through = {tie.equations[0]: _of_tie(touches, tie, where, touch) for tie in touches.ties}
+    ties = {}
+    for tie in touches.ties:
+        parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)]
+        ties[tie.equations[0]] = sum(np.einsum("aki,kij,bkj->ab", G, V, G) for G, V in parts)
     found = []
     for block, V, first in zip(data.blocks, each, numbers, strict=True):
         if block.measurement.touching:
@@ -445,13 +358,13 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Thing
             continue
         rows = np.broadcast_to(V, (len(first), *V.shape[1:])).copy()
         for i, equation in enumerate(first):
-            if equation in through:
-                rows[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + through[equation]
+            if equation in ties:
+                rows[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + ties[equation]
         found.append(rows)
     return found
 
 
-def _left(thing: Point | Plane, V: Array) -> Array:
+def _left(thing: Thing, V: Array) -> Array:
     """Return the covariances (K, 3, 3) of what touches are off the thing that they put in its place, of their own."""
     K = len(V)
     if K == 1:
@@ -461,17 +374,4 @@ def _left(thing: Point | Plane, V: Array) -> Array:
     own = np.einsum("kii->ki", found)
     # directions that a touch does not show have no error: any positive variance serves
     own += np.where(own > 0, 0.0, V.max())
-    return found
-
-
-def _of_tie(touches: Touches, tie: Tie, where: Things, touch: Array) -> Array:
-    """Return what the touches' noise adds to the covariance (e, e) of what a drawing states."""
-    found = np.zeros((len(tie.equations), len(tie.equations)))
-    for end in tie.ends:
-        index = touches.rows[end]
-        K = len(index)
-        still = [Moved(np.zeros((3, 3 * K)), np.zeros((3, 3 * K)))] * 2
-        still[tie.ends.index(end)] = where[end].moved(np.eye(3 * K).reshape(K, 3, 3 * K))
-        each = _compared(tie, where, still).reshape(-1, K, 3)
-        found += np.einsum("aki,kij,bkj->ab", each, touch[index[:, 0]], each)
     return found

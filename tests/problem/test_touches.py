@@ -15,7 +15,7 @@ from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.outliers import clustered, error_ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
-from rpim_opt.problem.contact import Plane, Touches, contrasted
+from rpim_opt.problem.contact import Touches, contrasted
 from rpim_opt.problem.noise import Equations, Scatter
 
 SIGMA = 3e-5
@@ -93,7 +93,7 @@ def columns(found: Touches, where) -> np.ndarray:
     for k, (thing, index) in enumerate(zip(where, found.rows, strict=True)):
         F[index, 3 * k : 3 * k + 3] = -np.eye(3)
         moves.append((np.eye(3), np.zeros((3, 3))))
-        if isinstance(thing, Plane):
+        if thing.planar:
             F[index[:, 0], 3 * k : 3 * k + 3] = -thing.places
             F[index[:, 1:], 3 * k : 3 * k + 3] = 0.0
             height = np.column_stack([thing.normal, np.zeros((3, 2))])
@@ -111,7 +111,7 @@ def columns(found: Touches, where) -> np.ndarray:
             same = np.sign(first.normal @ second.normal)
             F[tie.equations, one] = -first.across @ n1
             F[tie.equations, other] = same * first.across @ n2
-        elif isinstance(first, Plane):
+        elif first.planar:
             sign = np.sign(first.normal @ apart)
             F[tie.equations, one] = sign * (apart @ n1 - first.normal @ c1)
             F[tie.equations, other] = sign * first.normal @ c2
