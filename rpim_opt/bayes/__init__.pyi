@@ -1,3 +1,2 @@
-from .population import PopulationPrior as PopulationPrior
 from .prior import Prior as Prior
 from .prior_terms import Stated as Stated

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, Trial, sampled, sides
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, sampled, sides
 from rpim_opt.bayes.outliers import clustered
 from rpim_opt.bayes.prior import Prior, family_of
 from rpim_opt.problem.blocks import Source
@@ -221,30 +221,6 @@ def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
 # --- at a result ------------------------------------------------------------------------------------------------
 
 
-class Outcome(Protocol):
-    """What is asked of a result: a `Calibration` has it."""
-
-    @property
-    def problem(self) -> Source:
-        """What was asked."""
-        ...
-
-    @property
-    def x(self) -> Array:
-        """Deviations (n,) [SI]."""
-        ...
-
-    @property
-    def learned(self) -> Learned | None:
-        """The hyperparameters, where they were estimated."""
-        ...
-
-    @cached_property
-    def flagged(self) -> Sequence[Any]:
-        """Outliers and downweighted rows, each with a ``label``."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A model that was compared: extensions beside what the result identifies, its parameters, and its optimum."""
@@ -267,7 +243,7 @@ class Comparison(Models):
     Of large data `hyperparameters.MOST` configurations are used.
     """
 
-    def __init__(self, result: Outcome) -> None:
+    def __init__(self, result: Any) -> None:
         self.result = result
         estimator = Estimator(Prior(), NOISE)
         if result.learned is not None:
@@ -339,7 +315,7 @@ class Comparison(Models):
         return Judged(families, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
 
 
-def _without_outliers(result: Outcome) -> CalibrationProblem:
+def _without_outliers(result: Any) -> CalibrationProblem:
     """Return the problem in memory without noise estimates, and without flagged rows unless their neighbours are."""
     problem = sampled(result.problem.scattered(None))
     labels = {label: i for i, label in enumerate(problem.labels)}

@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
-from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, Statement, default_widths
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
 from rpim_opt.robot.parameters import Parameters, overlay
@@ -55,7 +55,7 @@ class Prior:
     joint_offset, frames
         Factors on the scales of joint offsets, and of frames (base, reflectors, anchors).
     statements
-        Of linear combinations: `known`, `gaussian`, `from_result`.
+        Of linear combinations: `known`, `from_result`.
     doubted
         Whether centre and scale are left out where the marginal likelihood is against them: `from_population`.
 
@@ -114,36 +114,9 @@ class Prior:
         return cls(statements=(terms.known(text, value, sd),))
 
     @classmethod
-    def gaussian(
-        cls,
-        mean: Mapping[str, float],
-        covariance: Any = None,
-        *,
-        precision: Any = None,
-        sd: Any = None,
-    ) -> Prior:
-        """Return the prior that some deviations have a normal distribution, in the place of their own scales.
-
-        Parameters
-        ----------
-        mean
-            Of p deviations, by name with unit: ``{"a2_mm": 0.3, "theta3_mrad": 0.0}``.
-        covariance, precision
-            (p, p) in the units of the keys; a precision may leave directions open.
-        sd
-            (p,) in those units, or one number, for independent deviations.
-
-        Raises
-        ------
-        InputError
-            For a matrix that is no covariance or precision, and if not one of the three is given.
-        """
-        return cls(statements=(terms.gaussian(dict(mean), covariance, precision, sd),))
-
-    @classmethod
     def from_result(
         cls,
-        result: Result,
+        result: Any,
         inflate: float = 1.0,
         without: Sequence[str] = (),
         *,
@@ -185,25 +158,25 @@ class Prior:
         return cls(statements=(terms.posterior(result, inflate, without, noise),))
 
     @classmethod
-    def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
+    def from_population(cls, results: Sequence[Any] | Mapping[str, Any]) -> Prior:
         """Return the prior of another robot of the type of several that were calibrated: their centre and spread.
 
-        By empirical Bayes (`PopulationPrior`), shrunken towards the generic scales where robots or data are few. Where
+        By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
         the marginal likelihood of another robot's data is against it, this prior is left out (``doubted``).
 
         Parameters
         ----------
         results
-            Two or more, of the same nominal robot.
+            Two or more calibrations of the same nominal robot; with names where a mapping has them.
 
         Raises
         ------
         InputError
             For fewer than two, and for robots with other nominal parameters.
         """
-        from rpim_opt.bayes.population import PopulationPrior
+        from rpim_opt.bayes.population import population
 
-        centre, width = PopulationPrior.of(results).tables()
+        centre, width = population(results)
         return cls(centre=centre, scale=width, doubted=True)
 
     def __and__(self, other: Prior) -> Prior:

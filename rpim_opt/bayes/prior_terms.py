@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import UNITS, display, split_unit
+from rpim_opt.basics.units import display
 from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
-from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Quadratic
-from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
@@ -367,111 +364,15 @@ def known(text: str, value: float | None = None, sd: float | None = None) -> Sta
     return Statement(said.names, dimensions, (row,), (value / sd,), reference, text=text.strip())
 
 
-def gaussian(mean: dict[str, float], covariance: Any, precision: Any, sd: Any) -> Statement:
-    """Return the statement that deviations have a mean and a covariance; arguments as for `Prior.gaussian`."""
-    given = sum(each is not None for each in (covariance, precision, sd))
-    if given != 1:
-        raise InputError("Prior.gaussian", f"{given} of covariance, precision and sd", "one of them")
-    if not mean:
-        raise InputError("Prior.gaussian", "no parameter", "mean={'a2_mm': 0.0, ...}")
-    names, units = [], []
-    for key in mean:
-        name, unit = split_unit(key)
-        if unit is None:
-            raise InputError(f"Prior.gaussian, key {key}", "no unit", f"{key}_mm, {key}_mrad, ...")
-        names.append(name)
-        units.append(UNITS[key.removeprefix(name + "_")])
-    centre = np.array([float(value) for value in mean.values()])
-    if not np.isfinite(centre).all():
-        raise InputError("Prior.gaussian", "a mean that is not finite", "finite numbers")
-    if sd is not None:
-        covariance = np.diag(_vector(sd, len(mean)) ** 2)
-    rows = _root(precision, covariance, len(mean))
-    values = rows @ centre
-    rows = rows / np.array([unit.si for unit in units])
-    dimensions = tuple(unit.dimension for unit in units)
-    return Statement(tuple(names), dimensions, listed(rows), tuple(values.tolist()), None, True, "mean and covariance")
-
-
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
     """Return a matrix (k, p) as tuples, which are equal where their content is."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
-def _vector(sd: float | Sequence[float], count: int) -> Array:
-    values = np.asarray(sd, dtype=float)
-    if values.ndim > 1 or values.size not in (1, count):
-        raise InputError("Prior.gaussian", f"sd of shape {values.shape}", f"a number, or {count} numbers")
-    if not (np.isfinite(values).all() and (values > 0).all()):
-        raise InputError("Prior.gaussian", "an sd that is not above zero", "finite numbers above zero")
-    return np.broadcast_to(values.ravel(), (count,))
-
-
-def _root(precision: Any, covariance: Any, count: int) -> Array:
-    """Return W (k, p) with W'W the precision or inverse covariance; k < p where it leaves directions open."""
-    what = "covariance" if precision is None else "precision"
-    matrix = np.asarray(covariance if precision is None else precision, dtype=float)
-    if matrix.shape != (count, count):
-        raise InputError("Prior.gaussian", f"{what} of shape {matrix.shape}", f"({count}, {count})")
-    if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
-        raise InputError("Prior.gaussian", f"a {what} that is not finite and symmetric", "one that is")
-    size = np.sqrt(np.maximum(np.diag(matrix), 0))
-    unit = np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
-    if precision is None:
-        if np.min(values) <= 1e-15:
-            accepted = "one that is; [constraints] for what is known exactly, precision for what is not known at all"
-            raise InputError("Prior.gaussian", "a covariance that is not positive definite", accepted)
-        return (vectors / np.sqrt(values)).T / unit
-    if np.min(values) < -1e-10 * max(np.max(values), 1e-300):
-        raise InputError("Prior.gaussian", "a precision with negative eigenvalues", "one that is positive semidefinite")
-    kept = values > 1e-13 * np.max(values, initial=0.0)
-    return (vectors[:, kept] * np.sqrt(values[kept])).T * unit
-
-
 # --- an earlier result -----------------------------------------------------------------------------------------------
 
 
-class Result(Protocol):
-    """What a prior needs of an earlier result: a `Calibration` has it."""
-
-    @property
-    def problem(self) -> Source:
-        """What was asked."""
-        ...
-
-    @property
-    def x(self) -> Array:
-        """Deviations (n,) [SI]."""
-        ...
-
-    @property
-    def program(self) -> Program:
-        """The convex program at the solution."""
-        ...
-
-    @property
-    def penalty_weight(self) -> float:
-        """Zero without a penalty."""
-        ...
-
-    @cached_property
-    def linear(self) -> LinearModel:
-        """The equations of the fit."""
-        ...
-
-    @cached_property
-    def noise_variance(self) -> float:
-        """Of the equations, in units of the declared variance."""
-        ...
-
-    @cached_property
-    def spread(self) -> Any:
-        """``factor`` of a robust loss on squares, and ``drift`` (n, k) [SI], or InputError without covariance."""
-        ...
-
-
-def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
+def posterior(result: Any, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
     """Return what a result says of its parameters; arguments as for `Prior.from_result`."""
     for name, value in (("inflate", inflate), ("noise", noise)):
         if value is not None and not (np.isfinite(value) and value > 0):
@@ -506,7 +407,7 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     )
 
 
-def equation_variance(result: Result) -> float:
+def equation_variance(result: Any) -> float:
     """Return the variance of the equations' noise, in units of the declared one, as the loss weighs them."""
     return result.noise_variance * result.spread.factor
 

@@ -37,14 +37,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "a value that is none": (lambda: Prior.known("a2 - a3", value=np.nan, sd=1.0), "value nan, accepted: a finite"),
     "no deviation": (lambda: Prior.known("a2 - a3", value=0.0, sd=0.0), "sd 0.0, accepted: a standard deviation"),
-    "a mean of nothing": (lambda: Prior.gaussian({}, sd=1.0), "no parameter, accepted: mean="),
-    "a mean that is none": (lambda: Prior.gaussian({"a2_mm": np.inf}, sd=1.0), "a mean that is not finite"),
-    "a mean without a unit": (lambda: Prior.gaussian({"a2": 1.0}, sd=1.0), "key a2: found no unit, accepted: a2_mm"),
-    "too many deviations": (lambda: Prior.gaussian({"a2_mm": 1.0}, sd=[1.0, 2.0]), "sd of shape (2,)"),
-    "a deviation of zero": (lambda: Prior.gaussian({"a2_mm": 1.0}, sd=0.0), "an sd that is not above zero"),
-    "a covariance with nothing on its diagonal": (
-        lambda: Prior.gaussian({"a2_mm": 1.0, "a3_mm": 1.0}, [[1.0, 0.0], [0.0, 0.0]]), "not positive definite"
-    ),
     "groups of nothing": (lambda: Prior(groups=((),)), "names or patterns of parameters"),
     "two centres": (lambda: Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 2.0}), "'d5_mm' as 1 and 2"),
     "places in a list": (

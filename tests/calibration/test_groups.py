@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.group_weights import (
-    Grouped,
-    distance,
-    held_out,
-    k_fold_groups,
-    members,
-    minimum_distance,
-    reml_groups,
-    restricted_likelihood,
-    rule_of,
-)
+from rpim_opt.calibration.group_weights import Grouped, members, minimum, reml_groups, restricted_likelihood
 from rpim_opt.problem.linear import LinearModel
 
 PROBLEM = ro.load("position").problem
@@ -34,10 +23,17 @@ def simulated(seed: int, sizes: dict[str, float], noise: float = 1.0, rows: int 
     rng = np.random.default_rng(seed)
     size = np.ones(n)
     for key, value in sizes.items():
-        size[members(FREE, {key: None}).member == 0] = value
+        size[members(FREE, {key: ro.reml}).member == 0] = value
     A = 20 * rng.standard_normal((rows, n))
     b = A @ (size * rng.standard_normal(n)) + noise * rng.standard_normal(rows)
     return LinearModel(A, b, np.repeat(np.arange(rows // 3), 3), FREE)
+
+
+def groups_of(model: LinearModel, weights: dict[str, object]) -> Grouped:
+    """The penalty |z|^2 in groups."""
+    count = len(model.parameters)
+    own = members(model.parameters, weights)
+    return Grouped(model, own, np.ones(count), np.zeros(count), np.zeros((0, count)), np.zeros(0))
 
 
 def with_statements(grouped: Grouped) -> Grouped:
@@ -52,7 +48,7 @@ def with_statements(grouped: Grouped) -> Grouped:
 
 def dense_restricted_likelihood(grouped: Grouped, t: np.ndarray) -> float:
     """-2 ln of the density of what is left of the data without fixed effects, sigma profiled out, by covariances."""
-    weights = grouped.penalty(t)
+    weights = grouped.members.weights(t) * grouped.own
     A = np.vstack([grouped.model.A, grouped.rows])
     y = np.append(grouped.model.b, grouped.values) - A @ np.where(grouped.own > 0, grouped.centre, 0.0)
     fixed = FREE.of_frames | (grouped.own == 0)
@@ -67,7 +63,7 @@ def dense_restricted_likelihood(grouped: Grouped, t: np.ndarray) -> float:
 
 @pytest.mark.parametrize("statements", [False, True])
 def test_the_likelihood_is_the_textbook_s(statements: bool) -> None:
-    grouped = Grouped.of(simulated(1, {}, rows=60), KINDS)
+    grouped = groups_of(simulated(1, {}, rows=60), KINDS)
     if statements:
         grouped = with_statements(grouped)
     objective = restricted_likelihood(grouped)
@@ -80,17 +76,13 @@ def test_the_likelihood_is_the_textbook_s(statements: bool) -> None:
 
 
 @pytest.mark.parametrize("statements", [False, True])
-@pytest.mark.parametrize("score", ["likelihood", "folds", "distance"])
-def test_gradients_are_differences(score: str, statements: bool) -> None:
-    grouped = Grouped.of(simulated(4, {}, rows=60), {"alpha? theta?": None, "a? d?": None, "tool": None, "base": 2.0})
+def test_gradients_are_differences(statements: bool) -> None:
+    grouped = groups_of(
+        simulated(4, {}, rows=60), {"alpha? theta?": ro.reml, "a? d?": ro.reml, "tool": ro.reml, "base": 2.0}
+    )
     if statements:
         grouped = with_statements(grouped)
-    if score == "likelihood":
-        objective = restricted_likelihood(grouped)
-    elif score == "folds":
-        objective = held_out(grouped, [np.isin(grouped.model.group, part) for part in ([0, 3, 4], [1, 7])])
-    else:
-        objective = distance(grouped, 1.0, np.array([-1.0, 0.5, 2.0]))
+    objective = restricted_likelihood(grouped)
     t = np.array([1.0, 4.0, 2.0])
     slope = objective(t)[1]
     step = 1e-5
@@ -104,7 +96,7 @@ def test_a_single_group_is_the_single_weight(name: str) -> None:
     problem = ro.load(name).problem
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
     single = ro.reml(ro.convex.pose(ro.tikhonov, model))
-    found = reml_groups(Grouped.of(model, {"*": ro.reml}))
+    found = reml_groups(groups_of(model, {"*": ro.reml}))
     # a minimum of rounded numbers is as flat as their root
     assert np.log(found.groups["*"]) == pytest.approx(np.log(single.weight), abs=1e-5)
     z = [ro.convex.pose(ro.tikhonov, model).solve(weight).z for weight in (found.groups["*"], single.weight)]
@@ -113,10 +105,10 @@ def test_a_single_group_is_the_single_weight(name: str) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_most_likely_weights_are_those_of_a_grid(seed: int) -> None:
-    grouped = Grouped.of(simulated(seed, {"alpha? theta? beta?": 10.0, "a? d?": 0.1}), KINDS)
+    grouped = groups_of(simulated(seed, {"alpha? theta? beta?": 10.0, "a? d?": 0.1}), KINDS)
     objective = restricted_likelihood(grouped)
     found = reml_groups(grouped)
-    t = np.log([found.groups[name] for name in grouped.names])
+    t = np.log([found.groups[name] for name in grouped.members.names])
     axis = np.linspace(-12, 12, 49)
     values = np.array([[objective(np.array([u, v]))[0] for v in axis] for u in axis])
     i, j = np.unravel_index(np.argmin(values), values.shape)
@@ -129,82 +121,51 @@ def test_the_most_likely_weights_are_those_of_a_grid(seed: int) -> None:
 def test_the_sizes_of_groups_are_found() -> None:
     logs = []
     for seed in range(20):
-        grouped = Grouped.of(simulated(seed, {"alpha? theta? beta?": 10.0, "a? d?": 0.1}, rows=210), KINDS)
-        logs.append(np.log([reml_groups(grouped).groups[name] for name in grouped.names]))
+        grouped = groups_of(simulated(seed, {"alpha? theta? beta?": 10.0, "a? d?": 0.1}, rows=210), KINDS)
+        logs.append(np.log([reml_groups(grouped).groups[name] for name in grouped.members.names]))
     # weight is sigma^2 over the squared size, of some 12 deviations each: sd of its logarithm 0.4 a run
     assert np.mean(logs, axis=0) == pytest.approx([-2 * np.log(10.0), 2 * np.log(10.0)], abs=0.4)
 
 
 def test_frames_are_fixed_effects_unless_a_group_is_theirs_alone() -> None:
     model = simulated(1, {})
-    robot = Grouped.of(model, {"alpha? a? theta? d? beta?": None})
-    everything = Grouped.of(model, {"*": None})
+    robot = groups_of(model, {"alpha? a? theta? d? beta?": ro.reml})
+    everything = groups_of(model, {"*": ro.reml})
     t = np.array([0.7])
     assert restricted_likelihood(robot)(t)[0] == pytest.approx(restricted_likelihood(everything)(t)[0], rel=1e-12)
-    own = Grouped.of(model, {"alpha? a? theta? d? beta?": None, "base": None})
+    own = groups_of(model, {"alpha? a? theta? d? beta?": ro.reml, "base": ro.reml})
     slope = restricted_likelihood(own)(np.array([0.7, 0.2]))[1]
     assert slope[1] != 0.0
 
 
-def test_folds_are_what_solving_without_them_predicts() -> None:
-    grouped = Grouped.of(simulated(5, {}, rows=60), KINDS)
-    model = grouped.model
-    t = np.array([0.5, -1.0])
-    parts = [np.isin(model.group, part) for part in (range(10), range(10, 20))]
-    W = np.diag(grouped.penalty(t))
-    wanted = 0.0
-    for out in parts:
-        A, b = model.A[~out], model.b[~out]
-        z = np.linalg.solve(A.T @ A + W, A.T @ b)
-        wanted += np.sum((model.A[out] @ z - model.b[out]) ** 2)
-    assert held_out(grouped, parts)(t)[0] == pytest.approx(wanted, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_folds_choose_the_least_of_a_grid() -> None:
-    grouped = Grouped.of(simulated(6, {"alpha? theta? beta?": 3.0, "a? d?": 0.05}, noise=30.0), KINDS)
-    found = k_fold_groups(grouped)
-    parts = np.array_split(np.random.default_rng(0).permutation(np.unique(grouped.model.group)), 10)
-    objective = held_out(grouped, [np.isin(grouped.model.group, part) for part in parts])
-    t = np.log([found.groups[name] for name in grouped.names])
-    axis = np.linspace(*np.log([1e-2, 1e8]), 15)
-    assert objective(t)[0] <= min(objective(np.array([u, v]))[0] for u in axis for v in axis) * (1 + 1e-9)
-
-
-def test_the_nearest_point_of_the_surface_is_a_stationary_one() -> None:
-    grouped = Grouped.of(simulated(7, {"a? d?": 0.2}), KINDS)
-    found = minimum_distance(grouped)
-    assert found.interior
-    score = found.score
-    assert abs(int(np.argmin(score)) - len(score) // 2) <= 1  # of all weights times a factor, the factor 1
-
-
 def test_points_on_a_surface_and_pure_noise_leave_the_weights_at_one() -> None:
-    assert set(reml_groups(Grouped.of(replace(simulated(1, {}), constrained=True), KINDS)).groups.values()) == {1.0}
+    assert set(reml_groups(groups_of(replace(simulated(1, {}), constrained=True), KINDS)).groups.values()) == {1.0}
     rng = np.random.default_rng(8)
     noise = replace(simulated(1, {}), b=1e3 * rng.standard_normal(150))
-    found = reml_groups(Grouped.of(noise, {"*": ro.reml}))
+    found = reml_groups(groups_of(noise, {"*": ro.reml}))
     if found.groups["*"] == 1.0:
         assert "the data do not determine" in found.note
 
 
 def test_statements_hold_what_has_no_penalty() -> None:
-    grouped = with_statements(Grouped.of(simulated(1, {}, rows=60), KINDS))
+    grouped = with_statements(groups_of(simulated(1, {}, rows=60), KINDS))
     t = np.array([0.5, -1.0])
-    found = grouped.at(t)
+    T = grouped.model.triangle
+    R, r = np.vstack([T[:, :-1], grouped.rows]), np.append(T[:, -1], grouped.values)
+    z, inverse = minimum(R, r, grouped.members.weights(t) * grouped.own, grouped.centre)
     A = np.vstack([grouped.model.A, grouped.rows])
     y = np.append(grouped.model.b, grouped.values)
-    W = np.diag(grouped.penalty(t))
+    W = np.diag(grouped.members.weights(t) * grouped.own)
     wanted = np.linalg.solve(A.T @ A + W, A.T @ y + W @ grouped.centre)
-    assert found.z == pytest.approx(wanted, rel=1e-9, abs=1e-12)
-    assert found.inverse == pytest.approx(np.linalg.inv(A.T @ A + W), rel=1e-9, abs=1e-15)
+    assert z == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+    assert inverse == pytest.approx(np.linalg.inv(A.T @ A + W), rel=1e-9, abs=1e-15)
 
 
 # --- which parameters a group has -----------------------------------------------------------------------------------
 
 
 def test_keys_are_patterns_names_kinds_and_links() -> None:
-    found = members(FREE, {"alpha theta": None, "a2 a3 d?": 3.0, "tool": None})
+    found = members(FREE, {"alpha theta": ro.reml, "a2 a3 d?": 3.0, "tool": ro.reml})
     by_name = dict(zip(FREE.names, zip(found.member, found.given, strict=True), strict=True))
     assert found.names == ("alpha theta", "tool")
     assert by_name["theta4"] == (0, 1.0)
@@ -212,10 +173,10 @@ def test_keys_are_patterns_names_kinds_and_links() -> None:
     assert by_name["a4"] == (-1, 1.0)
     assert by_name["tool_x"] == (1, 1.0)
     assert found.told == {"a2 a3 d?": 3.0, "others": 1.0}
-    links = members(FREE, {"by_link": ro.reml})
-    assert links.names == ("link1", "link2", "link3", "link4", "link5", "link6", "base", "tool")
-    assert len(members(FREE, {"by_kind": ro.reml}).names) == 7
-    assert (members(FREE, {"length": None}).member == 0).sum() == 12
+    assert [FREE.names[i] for i in np.flatnonzero(members(FREE, {"link3": ro.reml}).member == 0)] == [
+        name for name in FREE.names if name.endswith("3")
+    ]
+    assert (members(FREE, {"length": ro.reml}).member == 0).sum() == 12
 
 
 @pytest.mark.parametrize(
@@ -228,6 +189,10 @@ def test_keys_are_patterns_names_kinds_and_links() -> None:
         ({"a?": 1.0, "a2": 2.0}, "'a2' in 'a?' and in 'a2'"),
         ({"a?": 0.0}, "0.0 for 'a?'"),
         ({"a?": np.inf}, "inf for 'a?'"),
+        ({"a?": ro.gcv}, "'gcv' for groups"),
+        ({"a?": "best"}, "'best'"),
+        ({"a?": True}, "'True'"),
+        ({"a?": None}, "'None'"),
     ],
 )
 def test_keys_that_name_nothing_or_twice_are_refused(weights: dict[str, float], says: str) -> None:
@@ -236,26 +201,12 @@ def test_keys_that_name_nothing_or_twice_are_refused(weights: dict[str, float], 
     assert says in str(error.value)
 
 
-def test_a_mapping_asks_for_one_selector() -> None:
-    assert rule_of({"a?": 1.0}) is None
-    for asked in (ro.reml, "reml", partial(ro.k_fold, folds=5), "minimum_distance", ro.l_curve):
-        assert rule_of({"a?": asked, "d?": asked, "alpha?": 2}) is not None
-    for asked, says in ((ro.gcv, "'gcv' for groups"), ("best", "'best'"), (True, "'True'"), (None, "'None'")):
-        with pytest.raises(ro.InputError) as error:
-            rule_of({"a?": asked})
-        assert says in str(error.value)
-    with pytest.raises(ro.InputError, match="different selectors"):
-        rule_of({"a?": ro.reml, "d?": ro.k_fold})
-    with pytest.raises(ro.InputError, match="50 configurations"):
-        rule_of({"a?": partial(ro.k_fold, folds=60)})(Grouped.of(simulated(1, {}), KINDS))
-
-
 def test_a_frame_that_no_row_sees_takes_nothing_away() -> None:
     model = simulated(1, {}, rows=60)
     frames = np.flatnonzero(model.parameters.of_frames)
     A = model.A.copy()
     A[:, frames[0]] = 0.0
-    _, R, _, equations = Grouped.of(replace(model, A=A), {"alpha? theta?": None, "a? d?": None}).robot()
+    _, R, _, equations = groups_of(replace(model, A=A), {"alpha? theta?": ro.reml, "a? d?": ro.reml}).robot()
     assert np.isfinite(R).all()
     assert equations == len(model.b) - np.linalg.matrix_rank(A[:, frames])
     assert np.abs(A[:, frames].T @ model.b).max() > 0

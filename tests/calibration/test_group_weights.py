@@ -11,7 +11,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
-from rpim_opt.bayes.group_weights import Grouped, members, reml_groups
+from rpim_opt.calibration.group_weights import Grouped, members, reml_groups
 
 POSITION = ro.load("position")
 PROBLEM = POSITION.problem
@@ -24,7 +24,7 @@ def weights_of(result: ro.calibration.Calibration, asked: dict[str, object]) -> 
     found = np.ones(len(FREE))
     assert result.selection is not None
     for key in asked:
-        found[members(FREE, {key: None}).member == 0] = result.selection.groups[key]
+        found[members(FREE, {key: ro.reml}).member == 0] = result.selection.groups[key]
     return found
 
 
@@ -59,7 +59,9 @@ def test_the_weights_are_their_own_answer() -> None:
     assert result.converged
     values = weights_of(result, ASKED)
     model = PROBLEM.linearize(result.x)
-    answer = reml_groups(Grouped.of(model, ASKED)).groups
+    n = len(FREE)
+    squares = Grouped(model, members(FREE, ASKED), np.ones(n), np.zeros(n), np.zeros((0, n)), np.zeros(0))
+    answer = reml_groups(squares).groups
     for key in ASKED:
         assert np.log(answer[key] / result.selection.groups[key]) == pytest.approx(0, abs=2e-3)
     assert result.problem.parameters.free.scale == pytest.approx(FREE.scale / np.sqrt(values), rel=1e-12)
