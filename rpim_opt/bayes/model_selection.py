@@ -15,6 +15,7 @@ from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, sampled, sides
 from rpim_opt.bayes.outliers import clustered
 from rpim_opt.bayes.prior import Prior, family_of
+from rpim_opt.bayes.prior_terms import Result
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.extensions import families, family_scales
@@ -243,7 +244,7 @@ class Comparison(Models):
     Of large data `hyperparameters.MOST` configurations are used.
     """
 
-    def __init__(self, result: Any) -> None:
+    def __init__(self, result: Result) -> None:
         self.result = result
         estimator = Estimator(Prior(), NOISE)
         if result.learned is not None:
@@ -315,7 +316,7 @@ class Comparison(Models):
         return Judged(families, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
 
 
-def _without_outliers(result: Any) -> CalibrationProblem:
+def _without_outliers(result: Result) -> CalibrationProblem:
     """Return the problem in memory without noise estimates, and without flagged rows unless their neighbours are."""
     problem = sampled(result.problem.scattered(None))
     labels = {label: i for i, label in enumerate(problem.labels)}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.bayes.prior_terms import FAR, default_widths, equation_variance, marginal, triangle_of
+from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, marginal, triangle_of
 
 PRIOR_ROBOTS = 3.0
 """Degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for."""
@@ -65,7 +64,7 @@ def expectation(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Arr
     return m, C_m, own**2 + variance
 
 
-def population(results: Sequence[Any] | Mapping[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
+def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[str, float], dict[str, float]]:
     """Return prior means and standard deviations of another robot's parameters, by their names with a unit.
 
     From the data of several robots of one type (`random_effects`), without the priors that they were calibrated with,
@@ -105,13 +104,14 @@ def population(results: Sequence[Any] | Mapping[str, Any]) -> tuple[dict[str, fl
     )
 
 
-def of_data(result: Any) -> tuple[tuple[str, ...], Array, Array]:
+def of_data(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     """Return names (p), rows (p, p) [1/SI] and values (p,) of what a result's data alone say of the robot.
 
     Frames have their default prior standard deviations and are integrated out.
     """
     free = result.problem.parameters.free
-    R = result.linear.triangle / np.sqrt(equation_variance(result))
+    spread = result.spread
+    R = spread.linear.triangle / np.sqrt(spread.noise_variance * spread.factor)
     n = len(free)
     own = np.eye(n)[free.of_frames] * (free.scale / default_widths(free))[free.of_frames, None]
     robot = np.flatnonzero(~free.of_frames)

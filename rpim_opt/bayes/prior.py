@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
-from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Stated, Statement, default_widths
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
 from rpim_opt.robot.parameters import Parameters, overlay
@@ -116,7 +116,7 @@ class Prior:
     @classmethod
     def from_result(
         cls,
-        result: Any,
+        result: Result,
         inflate: float = 1.0,
         without: Sequence[str] = (),
         *,
@@ -158,7 +158,7 @@ class Prior:
         return cls(statements=(terms.posterior(result, inflate, without, noise),))
 
     @classmethod
-    def from_population(cls, results: Sequence[Any] | Mapping[str, Any]) -> Prior:
+    def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
         """Return the prior of another robot of the type of several that were calibrated: their centre and spread.
 
         By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from rpim_opt.basics.units import display
 from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
+from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Quadratic
+from rpim_opt.problem.blocks import Source
 from rpim_opt.robot.parameter_names import is_joint_offset
 from rpim_opt.robot.parameters import Parameters
 
@@ -372,17 +374,52 @@ def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
 # --- an earlier result -----------------------------------------------------------------------------------------------
 
 
-def posterior(result: Any, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
+class Result(Protocol):
+    """What a prior or a comparison of models needs of a result: a `Calibration` has it."""
+
+    @property
+    def problem(self) -> Source:
+        """What was asked."""
+        ...
+
+    @property
+    def x(self) -> Array:
+        """Deviations (n,) [SI]."""
+        ...
+
+    @property
+    def program(self) -> Program:
+        """The convex program at the solution."""
+        ...
+
+    @property
+    def learned(self) -> Any:
+        """The hyperparameters (`Learned`), where they were estimated."""
+        ...
+
+    @cached_property
+    def flagged(self) -> Sequence[Any]:
+        """Outlying rows, each with a ``label``."""
+        ...
+
+    @cached_property
+    def spread(self) -> Any:
+        """The equations and the penalty of the fit (`Spread`), or InputError without covariance."""
+        ...
+
+
+def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
     """Return what a result says of its parameters; arguments as for `Prior.from_result`."""
     for name, value in (("inflate", inflate), ("noise", noise)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"Prior.from_result, {name}", f"{value}", "a number above zero")
     free = result.problem.parameters.free
+    spread = result.spread
     form = result.program.penalty_form
-    variance = equation_variance(result) if noise is None else noise**2 * result.spread.factor
-    parts = [result.linear.triangle[:, : len(free)] / np.sqrt(variance)]
-    if form is not None and result.penalty_weight > 0:
-        parts.append(np.sqrt(result.penalty_weight / variance) * form.matrix)
+    variance = spread.factor * (spread.noise_variance if noise is None else noise**2)
+    parts = [spread.linear.triangle[:, : len(free)] / np.sqrt(variance)]
+    if form is not None and spread.weight > 0:
+        parts.append(np.sqrt(spread.weight / variance) * form.matrix)
     if isinstance(without, str):
         without = without.split()
     kept = np.arange(len(free))
@@ -391,8 +428,8 @@ def posterior(result: Any, inflate: float, without: Sequence[str], noise: float 
     if not len(kept):
         raise InputError("Prior.from_result, without", "every parameter", "patterns that leave some")
     R = triangle_of(np.vstack(parts))
-    if result.spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
-        moved = R @ (result.spread.drift / free.scale[:, None])
+    if spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
+        moved = R @ (spread.drift / free.scale[:, None])
         R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
     rows, _ = marginal(R, np.zeros(len(free)), kept)
     rows = triangle_of(rows) / (free.scale[kept] * inflate)
@@ -405,11 +442,6 @@ def posterior(result: Any, inflate: float, without: Sequence[str], noise: float 
         whole=True,
         text="an earlier result",
     )
-
-
-def equation_variance(result: Any) -> float:
-    """Return the variance of the equations' noise, in units of the declared one, as the loss weighs them."""
-    return result.noise_variance * result.spread.factor
 
 
 def triangle_of(rows: Array) -> Array:

@@ -35,10 +35,8 @@ def result_of(formulation: ro.Formulation, linear: LinearModel, weight: float, n
     """What a prior needs of a calibration whose model is linear."""
     program = ro.convex.pose(formulation, linear)
     x = program.solve(weight).z * FREE.scale
-    return SimpleNamespace(
-        problem=PROBLEM, x=x, program=program, linear=linear, penalty_weight=weight, noise_variance=noise,
-        spread=SimpleNamespace(factor=1.0, drift=None),
-    )  # fmt: skip
+    spread = SimpleNamespace(linear=linear, weight=weight, noise_variance=noise, factor=1.0, drift=None)
+    return SimpleNamespace(problem=PROBLEM, x=x, program=program, spread=spread)
 
 
 def then(prior: Prior, linear: LinearModel) -> np.ndarray:
@@ -74,7 +72,7 @@ def test_what_neither_data_nor_penalty_saw_stays_open() -> None:
 
 def test_what_was_set_up_anew_is_left_out_whatever_it_was() -> None:
     result = result_of(ro.tikhonov, model(1), WEIGHT)
-    covariance = np.linalg.inv(result.linear.A.T @ result.linear.A + WEIGHT * np.eye(n))
+    covariance = np.linalg.inv(result.spread.linear.A.T @ result.spread.linear.A + WEIGHT * np.eye(n))
     stated = Prior.from_result(result, without=("base_*",)).stated(PROBLEM.parameters)
     kept = np.array([not name.startswith("base_") for name in FREE.names])
     precision = stated.rows.T @ stated.rows
