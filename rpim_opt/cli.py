@@ -194,11 +194,13 @@ def new(
     sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = "",
     columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = "",
     key: Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")] = "",
-    time_tolerance: Annotated[Number, Option(help="Join files by the nearest time, within so many s.")] = None,
+    time_tolerance: Annotated[
+        Number, Option(help="Join files by the nearest time, at most so many seconds apart.")
+    ] = None,
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, Option(help="What rx, ry, rz are: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
-    prefix: Annotated[str, Option(help="Of the robot's joints, if columns of several are there.")] = "",
-    encoding: Annotated[str, Option(help="Of text files, if not found: utf-8, cp1252, utf-16.")] = "",
+    prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
+    encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
     separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[
@@ -567,7 +569,7 @@ def compensate(
 @app.command()
 def simulate(
     problem: Annotated[str, Argument(help="A problem folder with a [simulation] table.")],
-    seed: Annotated[int | None, Option(min=0, help="Instead of the file's.")] = None,
+    seed: Annotated[int | None, Option(min=0, help="Seed in place of the file's.")] = None,
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
     allow_code: Code = False,
     as_json: Json = False,
@@ -588,8 +590,8 @@ def design(
     criterion: Annotated[str, Option(help="V (predicted positions), D, A or E.")] = "V",
     candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within limits.")] = 1000,
     table: Annotated[File, Option(help="A table of candidates instead: q1_deg, ...")] = None,
-    point: Annotated[Text, Option(help="Of a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of the random candidates.")] = 0,
+    point: Annotated[Text, Option(help="For a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,
+    seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
     augment: Annotated[bool, Option("--augment", help="Choose in addition to the measured configurations.")] = False,
     out: Table = None,
     allow_code: Code = False,

@@ -114,7 +114,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return a TOML file's content; errors say line and column."""
     text = read_text(path, endings=[".toml"])
     if _DEEP.search(text):
-        raise InputError("the TOML text", "a key of more than a hundred parts", "keys that a person would write", path)
+        raise InputError("the TOML text", "a key of more than a hundred parts", "shorter keys", path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep

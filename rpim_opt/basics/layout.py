@@ -202,9 +202,9 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     summing = [i for i in full if first[i].lower().rstrip(":") in SUMMARIES]
     columns, mark = _columns([grid.rows[i] for i in full if i not in summing], heads, options)
     notes = [*grid.notes, *_notes(grid, full, above, options)]
-    notes += [f"line {grid.lines[i]} sums others up: left out '{first[i]}'." for i in summing]
+    notes += [f"line {grid.lines[i]} is a total of others: left out '{first[i]}'." for i in summing]
     if mark == ",":
-        notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can part thousands'}.")
+        notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can separate thousands'}.")
     units: dict[str, str] = {}
     lines = [" ".join(filter(None, row)) for row in grid.rows[: above[0] if above else 0]]
     for stated in filter(None, map(UNITS_LINE.fullmatch, lines)):
@@ -238,7 +238,7 @@ def _notes(grid: Grid, full: Sequence[int], above: Sequence[int], options: Table
     again = [i for i in below if grid.rows[i] in header]
     others = [i for i in below if grid.rows[i] not in header]
     if again:
-        notes.append(f"the header stands there again in {lines(again)}: left out.")
+        notes.append(f"the header is repeated in {lines(again)}: left out.")
     for i in others[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
         notes.append(f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'.")
@@ -408,7 +408,9 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     if len(found) > 1:
         raise InputError("the numbers", f"'{found[',']}' and '{found['.']}'", "one decimal mark, or --decimal with it")
     if not found and doubtful:
-        raise InputError("the numbers", f"'{doubtful}', of thousands or of decimals", "--decimal , or --decimal .")
+        raise InputError(
+            "the numbers", f"'{doubtful}', whose mark may separate thousands or decimals", "--decimal , or --decimal ."
+        )
     return next(iter(found), ".")
 
 

@@ -185,7 +185,7 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     >>> _ = Path("points.txt").write_text("// Point X Y Z\nP1 1.5 2.5 3.5\nP2 4 5 6\n")
     >>> grid = read_grid(Path("points.txt"))
     >>> grid.rows[1], grid.notes
-    (['P1', '1.5', '2.5', '3.5'], ('cells are separated by space: it parts most numbers.',))
+    (['P1', '1.5', '2.5', '3.5'], ('cells are separated by space: it separates most numbers.',))
     """
     known = (*TEXTS, *EXCEL, ".parquet")
     require_file(path, LARGEST_DATA, known)
@@ -203,7 +203,7 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     notes = list(said)
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
-        notes.append(f"cells are separated by {spelled}: {'as stated' if separator else 'it parts most numbers'}.")
+        notes.append(f"cells are separated by {spelled}: {'as stated' if separator else 'it separates most numbers'}.")
     return Grid(*_split(text, mark), tuple(notes), mark == " ")
 
 

@@ -50,7 +50,7 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
         return _found(problem, estimator, model, start)
     except np.linalg.LinAlgError:
         found = "equations, scales and noise too far apart to estimate hyperparameters"
-        raise InputError("data", found, "their units looked at, or a weight") from None
+        raise InputError("data", found, "correct units, or a weight") from None
 
 
 def _found(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:

@@ -136,7 +136,7 @@ class Learned(Brief):
 
     def _short(self) -> str:
         sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.sizes.items())
-        return f"sizes: {sizes}; {len(self.left_out)} rows left out"
+        return f"hyperparameters: {sizes}; {len(self.left_out)} rows excluded"
 
     @property
     def families(self) -> tuple[str, ...]:

@@ -312,8 +312,10 @@ class Statement:
             some = parameters.take(place)
             turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
             if len(turned):  # angles of frames do not add up
-                found = f"'{some.names[turned[0]]}' that counts from another orientation"
-                raise InputError(self.where, found, "the same start of the frame; or leave out what was set up anew")
+                found = f"'{some.names[turned[0]]}' relative to another nominal orientation"
+                raise InputError(
+                    self.where, found, "the frame's earlier nominal values; or no prior on a frame that was set up anew"
+                )
             return offset
         rows = np.array(self.rows)[:, own]
         apart = np.abs(np.array(self.values) - rows @ offset)

@@ -60,7 +60,7 @@ def likely_causes(result: Outcome) -> list[str]:
     Parameters
     ----------
     result
-        A calibration; one of measurements in parts says nothing.
+        A calibration; one of data in blocks says nothing.
 
     Examples
     --------
@@ -113,7 +113,7 @@ def find_causes(result: Outcome) -> tuple[Cause, ...]:
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some.
 
     The table is read in other ways; rows without value, exchanged rows, rounded joints and a base that moved are looked
-    for. Asked only of a fit that is bad, for it takes seconds; empty for measurements in parts, and where nothing does.
+    for. Asked only of a fit that is bad, for it takes seconds; empty for data in blocks, and where nothing does.
     """
     if not result.problem.keeps_rows:
         return ()

@@ -332,7 +332,9 @@ def grouped(
         elsewhere = relocated(problem)
         if elsewhere is not None:
             problem = elsewhere
-            notes.append("Frames were stated far from where the data put them; their deviations count from there.")
+            notes.append(
+                "The stated frames are far from their registration; deviations count from the registered frames."
+            )
     stated = (prior or Prior()).stated(problem.parameters, widened=False)
     weighing = Weighing(formulation, found, stated, options)
     t = np.zeros(len(found.names))
@@ -352,7 +354,7 @@ def grouped(
         used = dict(zip(found.names, np.exp(t).tolist(), strict=True))
         selection = replace(selection, groups={**selection.groups, **used})
         if change > NEARLY:
-            notes.insert(0, f"The weights of groups did not settle in {MOST_ROUNDS} rounds: the last ones are used.")
+            notes.insert(0, f"The weights of groups did not converge in {MOST_ROUNDS} rounds: the last ones are used.")
     how = {"formulation": formulation, "weights": weights, "prior": prior, "options": replace(options, progress=None)}
     again = partial(_again, table=problem.parameters, **how)
     return replace(result, selection=selection, message=" ".join([result.message, *notes]), asked=again)

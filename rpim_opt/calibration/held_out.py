@@ -103,7 +103,7 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
         raise InputError("validation", "no held-out rows", "a calibration with validation data")
     stated = result.stated
     if not stated.keeps_rows:
-        raise InputError("refit_all", "measurements in parts", "measurements in memory")
+        raise InputError("refit_all", "data in blocks", "measurements in memory")
     used = len(stated.data)
     whole = Dataset.together([stated.data, apart], ["identification", "validation"])
     errors = result.nominal_errors(apart), result.errors(apart)

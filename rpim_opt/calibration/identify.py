@@ -34,7 +34,7 @@ NOISE = {
 }
 """Parts of the noise that are estimated, by the option's name."""
 MODELS = ("geometry", "auto")
-ELSEWHERE = "Frames were stated far from where the data put them; their deviations count from there."
+ELSEWHERE = "The stated frames are far from their registration; deviations count from the registered frames."
 
 
 @one_blas_thread

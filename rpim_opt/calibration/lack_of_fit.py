@@ -64,7 +64,7 @@ WHAT = {
     "gravity": "gravity",
     "first harmonic": "unevenly turning joints (eccentric encoders or gears)",
     "second harmonic": "second harmonics of joints",
-    "moments": "gravity on masses elsewhere than supposed",
+    "moments": "gravity on masses with other centres than assumed",
     "sessions": "a registration that differs from session to session",
     "temperature": "lengths that grow with temperature",
 }

@@ -541,7 +541,7 @@ class Outcome:
         """
         out = [flag for flag in self.flagged if flag.label not in self.kept_together]
         kept = self.stated.without({flag.label for flag in out})
-        reasons = {f.label: f"distrusted, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in out}
+        reasons = {f.label: f"outlier, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in out}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.asked(kept), record=record)
 

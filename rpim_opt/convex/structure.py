@@ -562,8 +562,8 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"
     if np.isfinite(formulation.largest):
-        raise InputError(where, "a largest norm, with measurements in parts", accepted)
+        raise InputError(where, "a largest norm, with data in blocks", accepted)
     if not separable(formulation.loss, formulation.loss_over):
-        raise InputError(where, "a loss that is no sum, with measurements in parts", accepted)
+        raise InputError(where, "a loss that is no sum, with data in blocks", accepted)
     squares = Squares(formulation.loss, formulation.name, formulation.loss_over)
     return replace(formulation, loss=SQUARES, loss_over="equation"), squares

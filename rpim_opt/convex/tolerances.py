@@ -258,7 +258,7 @@ class _Reader:
             raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
         (kind, sums), (other, large) = sides
         if relations[0] == "=" or not kind or other:
-            raise self._wrong("a demand that is not convex", "an absolute value or norm <= a number")
+            raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
         limit = self._constant(large[0])
         if not limit > 0:
             raise self._wrong(f"a limit of {limit:g}", "one above zero; '=' where nothing may differ")
@@ -276,7 +276,7 @@ class _Reader:
             found.append(self._sum())
         end = "|" if opening == "|" else ")"
         if not self._next(end):
-            raise self._wrong(f"no {end} at the end of a size")
+            raise self._wrong(f"no closing {end}")
         return opening, tuple(found)
 
     # --- sums ------------------------------------------------------------------------------------------------

@@ -121,7 +121,7 @@ class PartitionedProblem(RobotModel):
     @property
     def data(self) -> NoReturn:
         """Raises InputError: the measurements do not stand together anywhere."""
-        raise InputError("problem.data", "measurements in parts", "problem.rows(), one problem a part")
+        raise InputError("problem.data", "data in blocks", "problem.rows(), one problem a part")
 
     @property
     def keeps_rows(self) -> bool:

@@ -258,7 +258,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     ' write sign and theta_deg of these joints in robot.toml.'
     """
     if not problem.keeps_rows:
-        raise InputError("inspect", "measurements in parts", "one of them: inspect(part) for part in problem.rows()")
+        raise InputError("inspect", "data in blocks", "one of them: inspect(part) for part in problem.rows()")
     data = problem.data
     fitted, x = fitted_frames(problem)
     residual = fitted.errors(x)
@@ -600,7 +600,7 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     gain, i, j, factor = max(found)
     whole = float(left.rest @ left.rest)
     if gain > (1 - MOVED) * whole and left.chance(gain, 1, whole, len(found)) < RARE:
-        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder says (gear ratio)"
+        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
         if i != j:
             what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
         share = 100 * np.sqrt(max(whole - gain, 0.0) / whole)

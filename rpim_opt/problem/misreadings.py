@@ -229,7 +229,7 @@ def _of_poses() -> Iterator[Reading]:
         "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
         lambda turns: np.swapaxes(turns, 1, 2),
     )
-    yield Reading("transforms the other way round (the instrument seen from the tool)", "invert the poses", _inverted)
+    yield Reading("transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted)
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
             if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
@@ -258,7 +258,7 @@ def _of_rows(count: int) -> Iterator[Reading]:
         remedy = f"move the measured values {by} {{}}, against the joint values"
         yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
         yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
-    yield of("the rows of joint values in the reverse order", "turn one of the two parts over", rows[::-1], rows)
+    yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     yield of("measured values sorted as texts (1, 10, 11, 2)", remedy, by_text, rows)

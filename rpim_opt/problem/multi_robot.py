@@ -51,7 +51,7 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     ------
     InputError
         For fewer than two problems, a pattern that matches no parameter that all have, shared parameters that are
-        stated differently, scatter (it is stated of the whole, or learned), measurements in parts, and touches of a
+        stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a
         point that is elsewhere for another robot.
 
     Examples
@@ -101,7 +101,7 @@ def _require_parts(parts: Mapping[str, CalibrationProblem], count: int) -> None:
             raise InputError(where, "several robots", "one; give all problems in one call")
         if part.scatter is not None:
             accepted = "none: it is estimated, or stated for the whole problem by .scattered()"
-            raise InputError(where, "the robot's scatter", accepted)
+            raise InputError(where, "the robot's repeatability", accepted)
 
 
 def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> tuple[str, ...]:
@@ -127,7 +127,7 @@ def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> t
             apart = abs(one.nominal[i] - p.nominal[k])
             if apart > FAR * one.scale[i]:
                 found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
-                raise InputError(f"together, shared '{name}'", found, "one thing, stated alike")
+                raise InputError(f"together, shared '{name}'", found, "one nominal value in all")
     return common
 
 

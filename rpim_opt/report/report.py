@@ -438,7 +438,7 @@ def _provenance(content: Content) -> Iterator[Block]:
 
 
 def _changes(each: Earlier) -> str:
-    changes = ", ".join(each.let_go) or "nothing that readings show"
+    changes = ", ".join(each.let_go) or "nothing that the measurements identify"
     if each.inflate != 1:
         changes += f"; standard deviations times {each.inflate:g}"
     return changes

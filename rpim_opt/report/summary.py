@@ -186,7 +186,7 @@ def headline(result: Calibration) -> str:
         )
     if result.record.earlier:
         last = result.record.earlier[-1]
-        changed = joined(last.let_go) if last.let_go else "nothing that these measurements show"
+        changed = joined(last.let_go) if last.let_go else "nothing that these measurements identify"
         sentence += f" The prior is a calibration of {last.rows} rows; changed since: {changed}."
     return sentence
 

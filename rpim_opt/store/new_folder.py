@@ -245,7 +245,7 @@ def _kind(
         accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
         raise InputError("the target", "nothing", accepted, found.file)
     if measurement is not None:
-        return kind, "as you said"
+        return kind, "as stated"
     if kind.by_camera:
         return _camera(arm, target.under(found.columns))
     if not kind.touching:
@@ -261,7 +261,7 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
     best, other = sorted(misfit, key=lambda name: misfit[name])
     said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CAMERA_CLEARLY * misfit[best]:
-        raise InputError("the camera", f"no clear place ({best} leaves {said})", f"--measurement {best} or {other}")
+        raise InputError("the camera", f"no clear mounting ({best} leaves {said})", f"--measurement {best} or {other}")
     return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
 
 

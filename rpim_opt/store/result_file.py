@@ -101,7 +101,7 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
     "The paper's cooperative manipulator"
     """
     if not result.problem.keeps_rows:
-        raise InputError("save_result", "measurements in parts", "measurements in memory, which the file repeats")
+        raise InputError("save_result", "data in blocks", "data in memory, which the file repeats")
     if record is not None:
         result = replace(result, record=record)
     write_json(_result_path(path), content(result))

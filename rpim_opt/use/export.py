@@ -290,7 +290,7 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     notes = []
     if b"joint_checksum" in read_bytes(Path(source)):
         notes.append(
-            "joint_checksum stands as in the source: nothing public says how it is formed, so that a controller may "
+            "joint_checksum stands as in the source: its algorithm is not published, so that a controller may "
             "refuse the file. Keep the original."
         )
     if not np.array_equal(mdh, robot.mdh):

@@ -221,7 +221,7 @@ def update(
     Raises
     ------
     InputError
-        For a result without covariance (lasso), measurements in parts, and readings that cannot be this robot's.
+        For a result without covariance (lasso), data in blocks, and readings that cannot be this robot's.
 
     Examples
     --------
@@ -327,7 +327,7 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
     """Return a result's problem with other measurements; sessions that it does not know stand behind."""
     problem = result.problem
     if not isinstance(problem, CalibrationProblem):
-        raise InputError("the result", "a calibration of measurements in parts", "one of measurements in memory")
+        raise InputError("the result", "a calibration of data in blocks", "one of measurements in memory")
     return knowing_sessions(problem.on(data))
 
 

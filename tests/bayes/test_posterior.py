@@ -122,7 +122,7 @@ def test_a_turned_frame_is_not_added_up() -> None:
     result = result_of(ro.tikhonov, model(1), WEIGHT)
     turned = PROBLEM.parameters.nominal.copy()
     turned[PROBLEM.parameters.names.index("base_rx")] += 0.1
-    with pytest.raises(ro.InputError, match="'base_rx' that counts from another orientation"):
+    with pytest.raises(ro.InputError, match="'base_rx' relative to another nominal orientation"):
         Prior.from_result(result).stated(replace(PROBLEM.parameters, nominal=turned))
     Prior.from_result(result, without=["base_*"]).stated(replace(PROBLEM.parameters, nominal=turned))
 

@@ -1,4 +1,4 @@
-"""Calibrations of several robots, of measurements in parts and of losses by equation, asked for what they know."""
+"""Calibrations of several robots, of data in blocks and of losses by equation, asked for what they know."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_what_needs_all_rows_says_so_of_measurements_in_parts() -> None:
     assert parts.x == pytest.approx(result().x, abs=1e-9)
     assert likely_causes(parts) == []
     held_out = one().data.take(np.arange(3))
-    with pytest.raises(ro.InputError, match="measurements in parts, accepted: measurements in memory"):
+    with pytest.raises(ro.InputError, match="data in blocks, accepted: measurements in memory"):
         refit_all(parts, held_out)
     with pytest.raises(ro.InputError, match="no held-out rows"):
         refit_all(result())

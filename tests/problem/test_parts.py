@@ -40,7 +40,7 @@ def x_of(problem) -> np.ndarray:
 def test_it_is_no_problem_in_memory_and_says_so(whole: ro.CalibrationProblem) -> None:
     problem = apart(whole)
     assert not isinstance(problem, ro.CalibrationProblem)
-    with pytest.raises(ro.InputError, match="measurements in parts"):
+    with pytest.raises(ro.InputError, match="data in blocks"):
         problem.data  # noqa: B018
     with pytest.raises(ro.InputError, match="parts: found none"):
         PartitionedProblem(whole.robot, whole.parameters, whole.data, ())
@@ -192,7 +192,7 @@ def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationPro
     ids=lambda f: f.name,
 )  # fmt: skip
 def test_losses_that_are_no_sums_are_refused(whole: ro.CalibrationProblem, formulation: ro.Formulation) -> None:
-    with pytest.raises(ro.InputError, match="measurements in parts"):
+    with pytest.raises(ro.InputError, match="data in blocks"):
         ro.calibrate(apart(whole), formulation, 1.0)
 
 

@@ -166,11 +166,11 @@ def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Datas
     for rule in (ro.leave_one_out, ro.k_fold, ro.two_step, ro.ncp):
         with pytest.raises(ro.InputError, match="QR factor"):
             ro.calibrate(problem, ro.tikhonov, rule)
-    with pytest.raises(ro.InputError, match="measurements in parts"):
+    with pytest.raises(ro.InputError, match="data in blocks"):
         ro.problem.inspect(problem)
-    with pytest.raises(ro.InputError, match="measurements in parts"):
+    with pytest.raises(ro.InputError, match="data in blocks"):
         ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), "nowhere.json")
-    with pytest.raises(ro.InputError, match="measurements in parts"):
+    with pytest.raises(ro.InputError, match="data in blocks"):
         ro.calibrate(problem, ro.Formulation("worst", loss=ro.minimax.loss, penalty=ro.minimax.penalty), 1.0)
 
 

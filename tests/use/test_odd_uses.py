@@ -241,7 +241,7 @@ def test_everything_may_be_let_go() -> None:
     halves = [data.take(np.arange(k, k + 15)) for k in (0, 15)]
     p = calibrated().problem
     parts = PartitionedProblem(p.robot, p.parameters, halves[0], tuple(lambda each=each: each for each in halves))
-    with pytest.raises(ro.InputError, match="a calibration of measurements in parts, accepted: one of measurements in"):
+    with pytest.raises(ro.InputError, match="a calibration of data in blocks, accepted: one of measurements in"):
         ro.use.update(ro.calibrate(parts, ro.tikhonov, 1.0), checks())
 
 

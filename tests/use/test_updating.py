@@ -175,7 +175,7 @@ def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> N
     assert run(monkeypatch, "update", str(tmp_path), validation, "--out", out) == 0
     assert run(monkeypatch, "report", out) == 0
     page = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
-    assert "changed since: nothing that these measurements show" in page
+    assert "changed since: nothing that these measurements identify" in page
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:

@@ -204,7 +204,7 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
     """Return the weights between which an estimator in closed form changes, by its singular values."""
     s = form.s[form.seen]
     if not len(s):
-        raise InputError("data", "no sensitivity to any identified parameter", "data that see at least one")
+        raise InputError("data", "no sensitivity to any identified parameter", "data that depend on at least one")
     return np.geomspace(1e-4 * s[-1] ** 2, 10 * s[0] ** 2, count)
 
 

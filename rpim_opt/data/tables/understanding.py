@@ -40,7 +40,7 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
-    "point": "point that was touched or seen", "rx": "measured roll (extrinsic xyz)",
+    "point": "touched or imaged point", "rx": "measured roll (extrinsic xyz)",
     "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)",
 }  # fmt: skip
 NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
@@ -323,7 +323,7 @@ def _left_out(read: Readings, targets: bool) -> dict[str, str]:
         elif each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
             read[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
         else:
-            why[name] = "what was wanted is no measurement"
+            why[name] = "a commanded value is no measurement"
     return why
 
 

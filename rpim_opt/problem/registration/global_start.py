@@ -118,7 +118,7 @@ class JointMapping:
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
             said.append(
                 f"{described(self.joint_types, other.sign, other.zero).capitalize()} fits as well, and predicts "
-                f"{three_digits(1e3 * other.apart)} mm elsewhere: measure at ({values}) to tell."
+                f"{three_digits(1e3 * other.apart)} mm at other configurations: measure at ({values}) to tell."
             )
         return tuple(said)
 
