@@ -190,7 +190,9 @@ def choose(
         raise InputError("count", f"{count}", f"1 to {len(candidates) - 1}, fewer than the candidates")
     A = _rows(problem, candidates)
     if problem.data.blocks[0].measurement.touching:
-        A = _of_one_point(A, problem)
+        # touches of one point, a fixed effect: its place is unknown to `ANYWHERE`
+        place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(np.median(problem.data.blocks[0].covariance, axis=0)))
+        A = np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2)
     n = A.shape[2]
     C = np.eye(n)
     if criterion == "V":
@@ -207,20 +209,19 @@ def choose(
         C = np.eye(n)
     weights, bound = _relaxed(A, count, criterion, C, progress)
     progress("rounding")
-    rng, best, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
+    rng, value, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
     for trial in range(ROUNDINGS):
         start = np.argsort(-weights)[:count]
         if trial:
             share = np.maximum(weights, 1e-6)
             start = rng.choice(len(A), count, replace=False, p=share / share.sum())
         picked = np.sort(_exchanged(A, start, criterion, C, weights))
-        value, _ = _criterion(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
-        score = value if criterion in "DE" else -value
-        if score > best:
-            best, chosen = score, picked
-    value = best if criterion in "DE" else -best
-    gap = {"D": np.exp((bound - value) / n), "E": bound / value}.get(criterion, value / bound) - 1
-    return Design(chosen, weights, criterion, float(value), float(bound), float(max(gap, 0.0)))
+        score, _ = _criterion(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
+        if score > value:
+            value, chosen = score, picked
+    gap = np.exp((bound - value) / n) - 1 if criterion == "D" else max(bound / value, value / bound) - 1
+    sign = 1.0 if criterion in "DE" else -1.0
+    return Design(chosen, weights, criterion, sign * value, sign * bound, float(max(gap, 0.0)))
 
 
 def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array:
@@ -261,15 +262,8 @@ def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tu
     return np.asarray(B, dtype=float), np.asarray(W, dtype=float)
 
 
-def _of_one_point(A: Array, problem: CalibrationProblem) -> Array:
-    """Return rows (M, 3, n + 3) of touches of one point, a fixed effect: its place is unknown to `ANYWHERE`."""
-    covariance = np.median(problem.data.blocks[0].covariance, axis=0)
-    place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(covariance))
-    return np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)
-
-
 def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
-    """Return the value, and Z such that tr(A_i Z A_i') is by how much the relaxed criterion gains from candidate i."""
+    """Return the value, to be maximized, and Z: tr(A_i Z A_i') is what the relaxed criterion gains from candidate i."""
     if criterion == "E":
         values, vectors = np.linalg.eigh(M)
         power = (values[0] / values) ** (SMOOTH + 1)
@@ -277,7 +271,7 @@ def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
     inverse = np.asarray(np.linalg.inv(M), dtype=float)
     if criterion == "D":
         return float(np.linalg.slogdet(M)[1]), inverse
-    return float(np.sum(inverse * C.T)), inverse @ C @ inverse
+    return -float(np.sum(inverse * C.T)), inverse @ C @ inverse
 
 
 def _relaxed(
@@ -289,26 +283,20 @@ def _relaxed(
     most tr(Z M) for every Z of trace one, here that of a smooth least eigenvalue.
     """
     n, w = A.shape[2], np.full(len(A), count / len(A))
-    upper = criterion in "DE"
-    bound = np.inf if upper else -np.inf
+    bound = np.inf
     flat = A.reshape(-1, n)
     power = {"D": 1.0, "E": 1.0 / (SMOOTH + 1)}.get(criterion, 0.5)
     for k in range(most):
         M = np.eye(n) + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
         value, Z = _criterion(M, criterion, C)
         gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
-        most_gain = float(np.sort(gain)[-count:].sum())
-        if criterion == "E":
-            bound = min(bound, 1.0 + most_gain)
-        elif criterion == "D":
-            bound = min(bound, value + most_gain - float(gain @ w))
-        else:
-            bound = max(bound, value - most_gain + float(gain @ w))
-        off = bound - value if criterion == "D" else abs(bound - value) / abs(value)
-        if off <= ENOUGH * (n if criterion == "D" else 1):
+        top = np.sum(Z * M) if criterion == "E" else value
+        bound = min(bound, float(top + np.sort(gain)[-count:].sum() - gain @ w))
+        off = (bound - value) / (n if criterion == "D" else abs(value))
+        if off <= ENOUGH:
             break
         if k % 200 == 0:
-            progress(f"relaxing over {len(A)} candidates: within {100 * off / (n if criterion == 'D' else 1):.2f} %")
+            progress(f"relaxing over {len(A)} candidates: within {100 * off:.2f} %")
         w = _filled(w * np.maximum(gain, 1e-300) ** power, count)
     return w, bound
 

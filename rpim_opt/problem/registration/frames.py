@@ -25,10 +25,8 @@ from rpim_opt.problem.registration.closed_forms import (
     NOMINAL_ERROR,
     TOOL_ERROR,
     Place,
-    hand_eye,
     proper,
     register,
-    tool_from_distances,
     transforms,
 )
 from rpim_opt.problem.registration.points import Candidates, fit_arms
@@ -109,7 +107,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
 
     All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where that does
-    not determine the rotations, closed forms say what they can.
+    not determine the rotations, positions are fitted with reflectors near where they are stated.
     """
     rows = _Rows.of(robot, data, ENOUGH)
     if rows is None:
@@ -118,7 +116,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     try:
         start = _certified(rows, places)
     except InputError as error:
-        return _closed_forms(rows, places, error.found)
+        base, found, _ = _fitted(robot, rows, places)
+        return Located(base, found, f"by registration of positions: {error.found}")
     base = start.bases[""]
     for marker, place in places.items():
         if marker in start.tools:
@@ -136,30 +135,32 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
 
 
 def _certified(rows: _Rows, places: Mapping[str, Array]) -> CertifiedStart:
-    """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free."""
-    posed_rows = Counter(rows.marker[rows.turned].tolist())
-    turning = [marker for marker, _ in posed_rows.most_common(MOST_TURNING)]
+    """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free.
+
+    From some markers, of some with their orientations; from all where every configuration shows other markers.
+    """
+    turning = [marker for marker, _ in Counter(rows.marker[rows.turned].tolist()).most_common(MOST_TURNING)]
     some = [marker for marker, _ in Counter(rows.marker.tolist()).most_common(MOST_PLACING)]
-    try:
-        return _started(rows, places, turning + some, turning)
-    except InputError:  # where every configuration shows other markers, it takes all of them
-        if len(places) <= MOST_PLACING:
-            raise
-        return _started(rows, places, list(places), turning)
-
-
-def _started(rows: _Rows, places: Mapping[str, Array], placing: list[str], turning: list[str]) -> CertifiedStart:
-    """Return the certified start from some markers, of some with their orientations; refuse it where it is free."""
-    chosen = rows.take(np.isin(rows.marker, placing))
-    chosen.measured[~np.isin(chosen.marker, turning), :3, :3] = np.nan
-    sigma = chosen.sigma[:, 0], chosen.sigma[:, 1]
-    names = chosen.marker.tolist()
-    start = certified_hand_eye(
-        chosen.flange, chosen.measured, marker=names, sigma=sigma, expected=places, spread=TOOL_ERROR
-    )
-    if start.uncertainty > FREE:
-        raise InputError("the data", start.reason, "turns about two axes")
-    return start
+    tries = [turning + some]
+    if len(places) > MOST_PLACING:
+        tries.append(list(places))
+    reason = ""
+    for placing in tries:
+        chosen = rows.take(np.isin(rows.marker, placing))
+        chosen.measured[~np.isin(chosen.marker, turning), :3, :3] = np.nan
+        sigma = chosen.sigma[:, 0], chosen.sigma[:, 1]
+        names = chosen.marker.tolist()
+        try:
+            start = certified_hand_eye(
+                chosen.flange, chosen.measured, marker=names, sigma=sigma, expected=places, spread=TOOL_ERROR
+            )
+        except InputError as error:
+            reason = error.found
+            continue
+        if start.uncertainty <= FREE:
+            return start
+        reason = start.reason
+    raise InputError("the data", reason, "turns about two axes")
 
 
 def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
@@ -174,47 +175,24 @@ def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
         tools[marker] = frame_numbers(tool)
 
 
-def _registered(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located | None:
-    """Return base and reflectors in closed form, from positions alone; None where they do not fit the nominal robot."""
-    rows = _Rows.of(robot, data, FEW // max(len(data.blocks), 1) + 3)
-    if rows is None:
-        return None
+def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array], Array]:
+    """Return base (6,) and reflectors (6,) that fit positions of the nominal robot, and the errors (N,) that are left.
+
+    Reflectors are where they are stated up to `TOOL_ERROR`, and turned as poses show.
+    """
     markers = list(tools)
     marker = np.array([markers.index(name) for name in rows.marker.tolist()])
     places = np.array([tools[name][:3] for name in markers])
     y = rows.measured[:, :3, 3]
+    # refuses points on a line
     register(np.einsum("nij,nj->ni", rows.flange[:, :3, :3], places[marker]) + rows.flange[:, :3, 3], y)
-    q = rows.q @ robot.joint_map.T  # and points on a line were refused
+    q = rows.q @ robot.joint_map.T
     spread = np.full(len(places), TOOL_ERROR)
     given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
     fit = fit_arms(robot, given, QUICK_STEPS)
-    if not np.sqrt(np.mean(fit.error**2)) <= MISFIT * NOMINAL_ERROR:
-        return None
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
     _turn(found, fit.base[0], rows)
-    return Located(frame_numbers(fit.base[0]), found, "in closed form")
-
-
-def _closed_forms(rows: _Rows, places: dict[str, Array], reason: str) -> Located:
-    """Return the base and the reflectors: of the first poses that tell, or positions by distances and registration."""
-    how = f"by closed forms: {reason}"
-    source, target, weight = [], [], []
-    for marker in dict.fromkeys(rows.marker.tolist()):
-        own = rows.take(rows.marker == marker)
-        place = places[marker]
-        turned = own.take(own.turned)
-        with suppress(InputError):  # too few turns: positions and the stated tool have to do
-            base, tool = hand_eye(turned.flange, turned.measured, place[:3])
-            return Located(frame_numbers(base), {**places, marker: frame_numbers(tool)}, how)
-        y = own.measured[:, :3, 3]
-        if len(y) > 3:
-            place[:3] = tool_from_distances(own.flange, y, place[:3], TOOL_ERROR)
-        source.append(own.flange[:, :3, :3] @ place[:3] + own.flange[:, :3, 3])
-        target.append(y)
-        weight.append(1 / own.variance[:, 0])
-    q = np.concatenate(weight)
-    base = register(np.concatenate(source), np.concatenate(target), q / q.max())
-    return Located(frame_numbers(base), places, how)
+    return frame_numbers(fit.base[0]), found, fit.error[0]
 
 
 APART = 0.1
@@ -361,7 +339,11 @@ def starting_parameters(
     array([ 1.8 , -0.7 ,  0.35])
     """
     tools = tools or {"": (0.0,) * 6}
-    _require_reflectors(data, tools)
+    for block in data.blocks:
+        for marker in set(block.markers) - set(tools):
+            where = f"row {data.label[block.row[0]]}, column marker"
+            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
     own = {**(own or {}), **starting_cameras(data, own or {})}
     places = tools
     if base is None:
@@ -397,15 +379,6 @@ def own_frames(data: Dataset) -> tuple[str, ...]:
     return tuple(dict.fromkeys(of_fixture(name + "_", fixture) for kind, fixture in blocks for name in kind.frames))
 
 
-def _require_reflectors(data: Dataset, tools: Mapping[str, Place]) -> None:
-    """Refuse rows of a reflector that is not stated."""
-    for block in data.blocks:
-        for marker in set(block.markers) - set(tools):
-            where = f"row {data.label[block.row[0]]}, column marker"
-            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
-            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
-
-
 def _own_values(
     robot: Robot, block: Block, base: Place, tool: Place, stated: Mapping[str, float]
 ) -> Mapping[str, float]:
@@ -437,9 +410,12 @@ def relocated(problem: Source) -> Source | None:
             frames = [(base, found.base), *((k, found.tools[marker]) for marker, k in at.items())]
             return [(k, place) for k, place in frames if _misplaced(p, k, place, limit)]
 
-        quick = _registered(problem.robot, data, tools)
-        if quick is not None and not far(quick, MISPLACED / 2):
-            return None
+        few = _Rows.of(problem.robot, data, FEW // max(len(data.blocks), 1) + 3)
+        if few is not None:
+            place, reflectors, error = _fitted(problem.robot, few, tools)
+            agrees = np.sqrt(np.mean(error**2)) <= MISFIT * NOMINAL_ERROR
+            if agrees and not far(Located(place, reflectors, ""), MISPLACED / 2):
+                return None
         for k, place in far(locate(problem.robot, data, tools), MISPLACED):
             free = p.identified[k]
             nominal[k[free]] = place[free]
@@ -452,8 +428,7 @@ def relocated(problem: Source) -> Source | None:
 
 def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
     """Return the places (6,) of a frame in a table."""
-    index = {name: i for i, name in enumerate(p.names)}
-    return np.array([index[prefix + component] for component in FRAME])
+    return np.array([p.names.index(prefix + component) for component in FRAME])
 
 
 def _misplaced(p: Parameters, k: np.ndarray, place: Array, limit: float = MISPLACED) -> bool:
@@ -461,7 +436,10 @@ def _misplaced(p: Parameters, k: np.ndarray, place: Array, limit: float = MISPLA
     position, orientation = np.split(p.identified[k], 2)
     if not position.all() or orientation.any() != orientation.all():
         return False
-    far = np.abs(_deviation(place, p.nominal[k])) > limit * (p.scale[k] + NOMINAL_ERROR)
+    T, T0 = numeric_frame(place), numeric_frame(p.nominal[k])
+    # the deviation that takes the nominal frame there (`kinematics.frame`)
+    deviation = np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])
+    far = np.abs(deviation) > limit * (p.scale[k] + NOMINAL_ERROR)
     return bool((far & p.identified[k]).any())
 
 
@@ -543,9 +521,3 @@ def settled(alone: Source) -> Array:
 
 def _objective(model: LinearModel, z: Array) -> float:
     return float(np.sum((model.A @ z - model.b) ** 2) + np.sum(z**2))
-
-
-def _deviation(place: Place, nominal: Array) -> Array:
-    """Return the deviation (6,) that takes a nominal frame to a place (`kinematics.frame`)."""
-    T, T0 = numeric_frame(place), numeric_frame(nominal)
-    return np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])
