@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -543,102 +543,95 @@ def _places(count: int) -> list[int]:
 # What residuals say
 
 
-class _Residual(NamedTuple):
-    """A linearization A (m, n), and its residual without what parameters with their prior explain (m + n,)."""
+class _Added(NamedTuple):
+    """Which of several additions to a linearization explains its residual, by which coefficients (c,), and the rest."""
 
-    A: Array
-    rest: Array
-    squares: float
-    own: Array
-
-    def without(self, columns: Array) -> Array:
-        """Return columns (m, c) without what parameters with their prior explain, (m + n, c)."""
-        G = np.vstack([columns, np.zeros((self.A.shape[1], columns.shape[1]))])
-        return G - self.own @ (self.own.T @ G)
-
-    def chance(self, gain: float, columns: int, whole: float, tried: int) -> float:
-        """Return with which probability one of the tried explains so much of a sum of squares by chance (F test)."""
-        freedom = max(len(self.A) - self.A.shape[1] - columns, 1)
-        left = max(whole - gain, 1e-300)
-        return float(fdtrc(columns, freedom, gain / columns / (left / freedom))) * tried
+    number: int
+    coefficients: Array
+    left: float  # part of the residual's norm
 
 
-def _residual_of(problem: CalibrationProblem, x: Array) -> _Residual | None:
-    """Return the residual of a linearization at x (n,); None of too many equations."""
+def _added(problem: CalibrationProblem, x: Array, additions: Callable[[Array], Sequence[Array]]) -> _Added | None:
+    """Return the columns (m, c) that explain the residual at x (n,) best, of those that follow from A (m, n) there.
+
+    Beside the parameters with their prior they must explain half of the sum of squares, more than chance does once in a
+    million (F test, all additions counted). None where none does, and of more than `MOST_EQUATIONS` equations.
+    """
     model = problem.linearize(x)
     if len(model.b) > MOST_EQUATIONS:
         return None
     r = model.b - model.A @ (x / problem.parameters.free.scale)
+    whole = float(r @ r)
     own = np.linalg.qr(np.vstack([model.A, np.eye(len(x))]))[0]
-    found = _Residual(model.A, r, float(r @ r), own)
-    return found._replace(rest=found.without(r[:, None])[:, 0])
+
+    def without(columns: Array) -> Array:
+        G = np.vstack([columns, np.zeros((len(x), columns.shape[1]))])
+        return G - own @ (own.T @ G)
+
+    rest = without(r[:, None])[:, 0]
+    columns = additions(model.A)
+    gains, steps = [], []
+    for each in columns:
+        G = without(each)
+        steps.append(np.linalg.lstsq(G, rest, rcond=1e-9)[0])
+        gains.append(float(rest @ rest - np.sum((rest - G @ steps[-1]) ** 2)))
+    best = int(np.argmax(gains)) if gains else 0
+    if not gains or gains[best] <= (1 - MOVED) * whole:
+        return None
+    c = len(steps[best])
+    freedom = max(len(model.A) - len(x) - c, 1)
+    left = max(whole - gains[best], 1e-300)
+    if float(fdtrc(c, freedom, gains[best] / c / (left / freedom))) * len(gains) >= RARE:
+        return None
+    return _Added(best, steps[best], float(np.sqrt(left / whole)))
 
 
 def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Say whether the residuals at x (n,) are those of a joint's gear ratio, or of a coupling to another joint.
 
-    One column, the slope of a joint's zero times the value of a joint, is added to the last linearization. It must
-    explain half of the sum of squares, more than chance does once in a million (F test, all columns counted).
+    One column is added to the linearization (`_added`), the slope of a joint's zero times the value of a joint.
     """
     free = problem.parameters.free
-    left = _residual_of(problem, x)
-    if left is None:
-        return
     q = problem.joint_values[problem.owners]
-    found: list[tuple[float, int, int, float]] = []
-    for i, kind in enumerate(problem.robot.joint_types):
-        name = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
-        if name not in free.names:
-            continue
-        k = free.names.index(name)
-        G = left.without(left.A[:, k, None] * q / free.scale[k])
-        size = np.sum(G**2, axis=0)
-        along = left.rest @ G
-        found += [(along[j] ** 2 / size[j], i, int(j), along[j] / size[j]) for j in np.flatnonzero(size > 0)]
-    if not found:
-        return
-    gain, i, j, factor = max(found)
-    whole = float(left.rest @ left.rest)
-    if gain > (1 - MOVED) * whole and left.chance(gain, 1, whole, len(found)) < RARE:
+    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(problem.robot.joint_types, 1)]
+    pairs = [(i, j) for i, name in enumerate(zeros) for j in range(q.shape[1]) if name in free.names and q[:, j].any()]
+
+    def columns(A: Array) -> list[Array]:
+        places = [free.names.index(zeros[i]) for i, _ in pairs]
+        return [A[:, [k]] * q[:, [j]] / free.scale[k] for k, (_, j) in zip(places, pairs, strict=True)]
+
+    found = _added(problem, x, columns)
+    if found is not None:
+        i, j = pairs[found.number]
+        factor = found.coefficients[0]
         what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
         if i != j:
             what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
-        share = 100 * np.sqrt(max(whole - gain, 0.0) / whole)
-        yield f"{what}: that leaves {share:.0f} % of the residuals; write it into coupling in robot.toml."
+        yield f"{what}: that leaves {100 * found.left:.0f} % of the residuals; write it into coupling in robot.toml."
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Say from which row on the residuals at x (n,) show a base that has moved: a change point.
 
-    Six columns, the base's motion for the rows from there on, are added to the last linearization. They must explain
-    half of the sum of squares, more than chance does once in a million (F test, all places counted).
+    Six columns are added to the linearization (`_added`), the base's motion for the rows from there on.
     """
     free = problem.parameters.free
     base = [free.names.index(f"base_{c}") for c in FRAME if f"base_{c}" in free.names]
     data = problem.data
-    left = None
-    if len(base) == len(FRAME) and len(data) >= 2 * FEWEST:
-        left = _residual_of(problem, x)
-    if left is None:
+    if len(base) < len(FRAME) or len(data) < 2 * FEWEST:
         return
     places = _places(len(data))
-    best, place, step = 0.0, 0, np.zeros(6)
-    for k in places:
-        G = left.without(left.A[:, base] * (problem.owners >= k)[:, None])
-        found = np.asarray(np.linalg.lstsq(G, left.rest, rcond=1e-9)[0], dtype=float)
-        gain = float(left.rest @ left.rest - np.sum((left.rest - G @ found) ** 2))
-        if gain > best:
-            best, place, step = gain, k, found
-    if best > (1 - MOVED) * left.squares and left.chance(best, 6, left.squares, len(places)) < RARE:
+    found = _added(problem, x, lambda A: [A[:, base] * (problem.owners >= k)[:, None] for k in places])
+    if found is not None:
+        place = places[found.number]
         equations = Equations.of(data)
         after = equations.length & (equations.row >= place)
-        change = problem.jacobian(x)[np.ix_(after, base)] @ (free.scale[base] * step)
+        change = problem.jacobian(x)[np.ix_(after, base)] @ (free.scale[base] * found.coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
-        share = 100 * np.sqrt(max(left.squares - best, 1e-300) / left.squares)
         yield (
             f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
-            f"them, and fit a base that moved (that leaves {share:.0f} % of the residuals): did the instrument or the "
-            "robot's foot move? Calibrate the two parts apart."
+            f"them, and fit a base that moved (that leaves {100 * found.left:.0f} % of the residuals): did the "
+            "instrument or the robot's foot move? Calibrate the two parts apart."
         )
 
 

@@ -39,23 +39,20 @@ class Predicted(NamedTuple):
 
 def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
     """Return where a reflector is at q (N, dof) [rad or m] to first order; ``torque`` (N, dof) [Nm]."""
-    return _linear(machine, _there(machine, q, marker, torque), np.ones(len(machine.parameters.free)))
+    here = _there(machine, q, marker, torque)
+    x = np.zeros(len(machine.parameters.free)) if machine.at is None else machine.at
+    position = here.modelled(x)[0]
+    slope = here.jacobian(x).reshape(len(position), 3, -1)
+    return Predicted(position - slope @ x, slope)
 
 
 def moved(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
     """Return by how much the robot's own parameters move a reflector, frames where they are; arguments as before."""
-    here = _there(machine, q, marker, torque)
     own = ~machine.parameters.free.of_frames
-    found = _linear(machine, here, own)
-    return Predicted(found.position - here.modelled(np.zeros(len(own)))[0], found.slope * own)
-
-
-def _linear(machine: Machine, here: CalibrationProblem, own: Array) -> Predicted:
-    """Return positions about where the machine is looked at, of its ``own`` deviations (n,) alone."""
-    x = own * (0.0 if machine.at is None else machine.at)
-    position = here.modelled(x)[0]
-    slope = here.jacobian(x).reshape(len(position), 3, -1)
-    return Predicted(position - slope @ x, slope)
+    at = None if machine.at is None else machine.at * own
+    found = predicted(replace(machine, at=at), q, marker, torque)
+    nominal = _there(machine, q, marker, torque).modelled(np.zeros(len(own)))[0]
+    return Predicted(found.position - nominal, found.slope * own)
 
 
 def _there(machine: Machine, q: Array, marker: str | None, torque: Array | None) -> CalibrationProblem:

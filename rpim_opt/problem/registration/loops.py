@@ -306,21 +306,17 @@ class Solver:
 
     def repeated(self, solved: Solved) -> Solved:
         """Return the fixed point of weights and solution, the last of which is the relaxation's."""
-        settled = False
         for _ in range(MOST_ITERATIONS):
             weights = (solved.squares <= self.beyond).astype(float)
-            if weights.sum() < FEWEST:
+            same = np.array_equal(weights, solved.weights)
+            bounded = bool(np.isfinite(solved.smallest.bound))
+            if weights.sum() < FEWEST or (same and bounded):
                 break
-            if not np.array_equal(weights, solved.weights):
-                solved = self.weighted(weights, near=solved.smallest.rotations)
-                continue
-            settled = bool(np.isfinite(solved.smallest.bound))
-            if settled:
-                break
-            solved = self.weighted(weights, [solved.smallest.rotations])
+            near = None if same else solved.smallest.rotations
+            solved = self.weighted(weights, [solved.smallest.rotations], near)
         if not np.isfinite(solved.smallest.bound):
             solved = self.weighted(solved.weights, [solved.smallest.rotations])
-        return replace(solved, settled=settled)
+        return replace(solved, settled=np.array_equal(solved.squares <= self.beyond, solved.weights))
 
     def graduated(self, among: np.ndarray) -> Solved:
         """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
