@@ -231,25 +231,22 @@ class CalibrationProblem(RobotModel):
             if block.robot not in self.arms:
                 found = f"rows of robot '{block.robot}'" if block.robot else "rows that name no robot"
                 raise InputError("data", found, f"Dataset.of_robots of {choices(block.robot, self.arms)}")
-            self._require_fit(block)
+            dof = self.arms[block.robot].dof
+            if block.q.shape[2] != dof:
+                raise InputError("q", f"{block.q.shape[2]} columns", f"{dof}, one a joint")
+            names = self.parameters.of_robot(block.robot).names
+            for marker in block.markers:
+                if tool_prefix(marker) + "x" not in names:
+                    known = sorted({n.split("_")[1] for n in names if n.startswith("tool_") and n.count("_") == 2})
+                    raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
+            for name in block.measurement.parameters:
+                if of_fixture(name, block.fixture) not in names:
+                    where = f"measurement {block.measurement.name}"
+                    raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
         for name, robot in self.arms.items():
-            if name in self._present:
-                require_loads(robot, self.parameters.of_robot(name), self._rows_of(name))
-
-    def _require_fit(self, block: Block) -> None:
-        """Refuse rows whose joints, reflectors or fixtures their robot does not have."""
-        dof = self.arms[block.robot].dof
-        if block.q.shape[2] != dof:
-            raise InputError("q", f"{block.q.shape[2]} columns", f"{dof}, one a joint")
-        names = self.parameters.of_robot(block.robot).names
-        for marker in block.markers:
-            if tool_prefix(marker) + "x" not in names:
-                known = sorted({n.split("_")[1] for n in names if n.startswith("tool_") and n.count("_") == 2})
-                raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
-        for name in block.measurement.parameters:
-            if of_fixture(name, block.fixture) not in names:
-                where = f"measurement {block.measurement.name}"
-                raise InputError(where, f"no parameter '{of_fixture(name, block.fixture)}'", "a model with it")
+            own = [block for block in self.data.blocks if block.robot == name]
+            if own:
+                require_loads(robot, self.parameters.of_robot(name), own)
 
     def alone(self, robot: str) -> CalibrationProblem:
         """Return the problem of one of several robots: its parameters, as itself calls them, and its rows."""
@@ -272,15 +269,6 @@ class CalibrationProblem(RobotModel):
             found[block.row, : len(M)] = block.q[:, 0] @ M.T
         return found
 
-    @cached_property
-    def _present(self) -> frozenset[str]:
-        return frozenset(block.robot for block in self.data.blocks)
-
-    def _rows_of(self, robot: str) -> Dataset:
-        if self._present == {robot}:
-            return self.data
-        return replace(self.data, blocks=tuple(block for block in self.data.blocks if block.robot == robot))
-
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
 
@@ -289,9 +277,10 @@ class CalibrationProblem(RobotModel):
         InputError
             When data and parameters do not fit, or compliances have measured torques here and not there.
         """
-        for name in {block.robot for block in data.blocks} & self._present:
-            p = self.parameters.of_robot(name)
-            require_same_torques(self.arms[name], p, self._rows_of(name), measured_torques(data, name))
+        here, there = ({block.robot for block in each.blocks} for each in (self.data, data))
+        for name in here & there:
+            measured = measured_torques(self.data, name), measured_torques(data, name)
+            require_same_torques(self.arms[name], self.parameters.of_robot(name), *measured)
         return replace(self, data=data)
 
     def without(self, labels: Collection[str]) -> CalibrationProblem:

@@ -187,7 +187,7 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     metres = ca.SX(1)
     if measurement.metres is not None:
         metres = measurement.metres(*transforms, **own)
-    return [p.x, p.nominal, ca.vertcat(*stated, session, y)], [residual, modelled, ca.densify(metres)]
+    return [p.x, p.nominal, ca.vertcat(*stated.values(), session, y)], [residual, modelled, ca.densify(metres)]
 
 
 def _reflector(
@@ -216,15 +216,21 @@ def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: S
         if not name.startswith(in_frames):
             own[name] = p.value(of_fixture(name, of.fixture))
     points = len(of.markers)
-    known = of.loads.named(stated) | {"q": ca.reshape(stated.q, -1, points)}
-    if stated.torque.numel():
-        known["torque"] = ca.reshape(stated.torque, -1, points)
+    known = of.loads.named(stated) | {"q": ca.reshape(stated["q"], -1, points)}
+    if "torque" in stated:
+        known["torque"] = ca.reshape(stated["torque"], -1, points)
     for name in measurement.sees:
         if name not in known:
             where = f"measurement {measurement.name}"
             raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
         own[name] = known[name]
     return own
+
+
+Stated = Mapping[str, ca.SX]
+"""The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
+COLUMN = "column {}"
+"""Name of the symbol of a further column among these."""
 
 
 class Loads(NamedTuple):
@@ -238,15 +244,13 @@ class Loads(NamedTuple):
     columns: tuple[str, ...] = ()
 
     def symbols(self, dof: int, points: int) -> Stated:
-        """Return the symbols of a row of some points: empty for what it does not state."""
+        """Return the symbols of a row of some points."""
         joints = dof * points
-        return Stated(
-            q=ca.SX.sym("q", joints),
-            torque=ca.SX.sym("tau", joints * self.torques),
-            payload=ca.SX.sym("payload", int(self.payload)),
-            approach=ca.SX.sym("approach", joints * self.approach),
-            columns=ca.SX.sym("columns", len(self.columns)),
-        )
+        sizes = {
+            "q": joints, "torque": joints * self.torques, "payload": int(self.payload),
+            "approach": joints * self.approach, **dict.fromkeys(map(COLUMN.format, self.columns), 1),
+        }  # fmt: skip
+        return {name: ca.SX.sym(name, size) for name, size in sizes.items() if size}
 
     def posture(
         self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: Stated, point: int = 0
@@ -254,31 +258,18 @@ class Loads(NamedTuple):
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
         dof = len(joint_types)
         at = slice(point * dof, (point + 1) * dof)
-        q = ca.vertsplit(stated.q[at])
-        torque = None
-        if self.torques:
-            torque = ca.vertsplit(stated.torque[at])
-        elif not self.weighs:
+        parts = {name: ca.vertsplit(stated[name][at]) for name in ("q", "torque", "approach") if name in stated}
+        torque = parts.get("torque")
+        if torque is None and not self.weighs:
             torque = [0.0] * dof
         weight = None
         if self.gravity is not None:
-            weight = Statics(joint_types, q, nominal, self.gravity, stated.payload if self.payload else None)
-        directions = ca.vertsplit(stated.approach[at]) if self.approach else None
-        return Posture(q, torque, directions, weight, self.named(stated))
+            weight = Statics(joint_types, parts["q"], nominal, self.gravity, stated.get("payload"))
+        return Posture(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
 
     def named(self, stated: Stated) -> dict[str, Symbol]:
         """Return the symbols of columns by name."""
-        return {name: stated.columns[i] for i, name in enumerate(self.columns)}
-
-
-class Stated(NamedTuple):
-    """The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
-
-    q: ca.SX
-    torque: ca.SX
-    payload: ca.SX
-    approach: ca.SX
-    columns: ca.SX
+        return {name: stated[COLUMN.format(name)] for name in self.columns}
 
 
 class Needs(NamedTuple):
@@ -334,41 +325,40 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
 
 
 def loads_in(robot: Robot, block: Block) -> list[Array]:
-    """Return what rows state of the joints of the model, (N, c) each, in the order of `Stated`."""
-    N = len(block.y)
-    found = [(block.q @ robot.joint_map.T).reshape(N, -1)]
+    """Return what rows state of the joints of the model, (N, c) each, in the order of `Loads.symbols`."""
+    found = [block.q @ robot.joint_map.T]
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
         if robot.dof < len(robot.mdh):
             raise InputError("joint torques", "those of a robot with mimic joints", "a table without them")
-        found.append((block.torque @ np.linalg.inv(robot.joint_map)).reshape(N, -1))
+        found.append(block.torque @ np.linalg.inv(robot.joint_map))
     if block.payload is not None:
-        found.append(block.payload.reshape(N, 1))
+        found.append(block.payload)
     if block.approach is not None:
-        found.append(np.sign(block.approach @ robot.joint_map.T).reshape(N, -1))
-    return [*found, *(values.reshape(N, 1) for values in block.columns.values())]
+        found.append(np.sign(block.approach @ robot.joint_map.T))
+    return [values.reshape(len(block.y), -1) for values in (*found, *block.columns.values())]
 
 
-def require_loads(robot: Robot, parameters: Parameters, data: Dataset) -> None:
-    """Refuse to identify from data of a robot what needs columns that they do not have."""
+def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block]) -> None:
+    """Refuse to identify from rows of a robot what needs columns that they do not have."""
     for name in parameters.free.names:
         sided = name.startswith("backlash") and of_term(name)
         if not sided and any(not isinstance(term, Transmission) for term in robot.model.terms):
             sided = dependencies(robot.model, robot.joint_types, lambda other, name=name: other == name).approach
-        if sided and all(block.approach is None for block in data.blocks):
+        if sided and all(block.approach is None for block in blocks):
             found = f"'{name}' without directions of approach"
             raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
     needed = Needs.of(robot, parameters).columns
-    for block in data.blocks:
+    for block in blocks:
         for name in sorted({*needed, *block.measurement.extra} - {*block.columns}):
             accepted = f"a column '{name}' of the table, or Dataset.of(..., columns={{'{name}': ...}})"
             raise InputError("data", f"no column '{name}', on which a term or a measurement depends", accepted)
 
 
-def require_same_torques(robot: Robot, parameters: Parameters, data: Dataset, measured: bool) -> None:
-    """Refuse other torques than a problem's data have where compliances need them: gravity's are on guessed masses."""
-    if not Needs.of(robot, parameters).torques or measured_torques(data) == measured:
+def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now: bool) -> None:
+    """Refuse other torques than a problem has where compliances need them: gravity's are on guessed masses."""
+    if before == now or not Needs.of(robot, parameters).torques:
         return
-    if measured:
+    if now:
         accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"
         raise InputError("compliances", "joint torques", accepted)
     raise InputError("compliances", "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")

@@ -29,7 +29,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import Loads, bearing, loads_on, require_same_torques
+from rpim_opt.problem.row_functions import Loads, bearing, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
@@ -424,7 +424,7 @@ class _Cell(NamedTuple):
         if tool is not None and scatter is not None:
             scatter = replace(scatter, at=values)
         problem = CalibrationProblem(robot, parameters, measured.data, scatter=scatter)
-        require_same_torques(robot, parameters, problem.data, torques)
+        require_same_torques(robot, parameters, measured_torques(problem.data), torques)
         loads = loads_on(robot, parameters, problem.data, torques)
         prefix = tool_prefix(marker)
         return cls(

@@ -60,10 +60,10 @@ class Arm(NamedTuple):
         twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
         moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, _ in joints))
         # gravity bends a joint by the values of all of them
-        J = (ca.horzcat(*twists) @ ca.jacobian(moved, command.q))[: len(kind.components), :]
+        J = (ca.horzcat(*twists) @ ca.jacobian(moved, command["q"]))[: len(kind.components), :]
         modelled = kind.model(T)
         outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
-        return cls(ca.Function("arm", [ca.vertcat(*command, y)], outputs), robot.joint_map)
+        return cls(ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs), robot.joint_map)
 
     def at(self, q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
