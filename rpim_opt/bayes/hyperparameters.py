@@ -254,7 +254,7 @@ class Estimator:
             own = replace(hierarchy, group=np.where(known, stated.group, FIXED), spectrum=spectrum)
             hierarchy = own.of(np.ones(len(unit), dtype=bool))
         have = {"instrument"}
-        if any(stack.positional for stack in stacks):
+        if any(stack.unit is not None or stack.length.any() for stack in stacks):
             have |= {"position", "joint"}
         if any(stack.angle.any() for stack in stacks):
             have.add("orientation")

@@ -20,6 +20,7 @@ from rpim_opt.problem.design import Observability, combination, observe
 from rpim_opt.problem.misreadings import better_reading, misfit, placed
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
+from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.points import points_of
 from rpim_opt.problem.row_functions import repeatable
@@ -470,8 +471,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     if len(points.tools) < 2 or not len(far):
         return
     flange = forward_kinematics(problem.robot, points.q[far])
-    body = found.tools @ flange[:, :3, :3].transpose(0, 2, 1) + flange[:, None, :3, 3]
-    model = body @ found.base[:3, :3].T + found.base[:3, 3]
+    model = transformed((found.base @ flange)[:, None], found.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
     markers = [label[i] for i in far[error.min(axis=1) < FITS * found.error[far]]]
@@ -525,8 +525,7 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     if left[place] < FITS * whole:
         first, second = (placed(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
         # the second part's points by the other base
-        motion = first.base @ np.linalg.inv(second.base)
-        there = second.modelled @ motion[:3, :3].T + motion[:3, 3]
+        there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
         far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
         yield (
             f"from row {problem.data.label[points.row[place]]} on the points fit another base, "
@@ -663,23 +662,18 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
         "offset of the first joint."
     )
-    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
-    known = {problem.labels[i] for block in drawn for i in block.row}
-    alone = _scale(problem, problem.without(known).linearize(x).A)
-    if alone is None:
+    scale = _scale(problem, model.A)
+    if scale is None:
         yield "All touched points are in one place: the size of the robot rests on its nominal lengths."
         return
-    by_touches = f"{1e3 * alone:.2g} mm in a metre"
-    if not known:
+    known = f"Distances between touched places: known to {1e3 * scale:.2g} mm in a metre"
+    if any(tie.kind == "known_distance" for tie in touches.ties):
+        yield f"{known}."
+    else:
         yield (
-            f"Distances between touched places: known to {by_touches} by touches and the scales of the file; a known "
-            "distance between two of them ([[known_distance]]) would determine the size of the robot."
+            f"{known} by touches and the scales of the file; a known distance between two of them ([[known_distance]]) "
+            "would determine the size of the robot."
         )
-        return
-    yield (
-        f"Distances between touched places: known to {1e3 * (_scale(problem, model.A) or alone):.2g} mm in a metre, "
-        f"and to {by_touches} without the stated distances."
-    )
 
 
 def _scale(problem: CalibrationProblem, A: Array) -> float | None:

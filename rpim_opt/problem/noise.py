@@ -71,11 +71,6 @@ class Stack:
     joint: Array
     unit: Array | None = None
 
-    @property
-    def positional(self) -> bool:
-        """Whether any equation shows a scatter of positions."""
-        return self.unit is not None or bool(self.length.any())
-
     def of(self, dimension: str) -> np.ndarray:
         """Return which equations (N, k) are of a dimension: ``length``, ``angle``, or any other."""
         if dimension == "length":

@@ -310,22 +310,18 @@ class CalibrationProblem(RobotModel):
     def functions(self, block: Block) -> Functions:
         """Return the functions of a block's rows."""
         if block not in self._structures:
-            self._structures[block] = self._structure(block)
+            p = self.parameters
+            absent = (p.nominal == 0) & ~p.identified
+            robot = self.arms[block.robot]
+            names = p.names
+            if block.robot:  # those of other robots keep their long names, which no formulation asks for
+                names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
+            loads = loads_of(robot, Needs.of(robot, p.of_robot(block.robot)), self.data, block)
+            self._structures[block] = Structure(
+                robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
+                tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
+            )  # fmt: skip
         return (self.asked or asked)(self._structures[block], block.measurement)
-
-    def _structure(self, block: Block) -> Structure:
-        """Return what the functions of a block's rows depend on, besides its measurement."""
-        p = self.parameters
-        absent = (p.nominal == 0) & ~p.identified
-        robot = self.arms[block.robot]
-        names = p.names
-        if block.robot:  # those of other robots keep their long names, which no formulation asks for
-            names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-        loads = loads_of(robot, Needs.of(robot, p.of_robot(block.robot)), self.data, block)
-        return Structure(
-            robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
-            tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
-        )  # fmt: skip
 
     @cached_property
     def _sessions(self) -> dict[str, tuple[str, ...]]:

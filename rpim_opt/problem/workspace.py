@@ -19,6 +19,7 @@ from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.linear import Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
+from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.row_functions import bearing
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.mdh import Robot
@@ -364,7 +365,7 @@ def postures_in_sight(
 
 def _in_sight(T: Array, points: Array, camera: dict[str, float], image: Array) -> np.ndarray:
     """Return which poses (N, 4, 4) of the board in the camera's frame show all of it."""
-    there = points @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+    there = transformed(T[:, None], points)
     before = (there[:, :, 2] > 0).all(axis=1)
     sight = there.mean(axis=1)
     normal = np.linalg.svd(points - points.mean(axis=0))[2][2]

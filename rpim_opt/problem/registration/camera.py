@@ -15,7 +15,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, TARGET, eye_in_hand
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.pose import pose
-from rpim_opt.problem.registration.closed_forms import proper
+from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 
 FEWEST = {True: 4, False: 6}
 """Points that a view of a plane, and of points in space, has to show."""
@@ -77,20 +77,16 @@ def view_pose(points: Array, xy: Array) -> Array:
     middle, axes, planar = _plane(points)
     local = (points - middle) @ axes.T
     if planar:
-        first = _of_homography(_linear(local[:, :2], xy))
+        H = _linear(local[:, :2], xy)  # its columns are two axes of the board and its origin, before the camera
+        H = H / np.copysign(np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1])), H[2, 2])
+        first = rigid(proper(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])), H[:, 2])
         starts = [first, _mirrored(first)]
     else:
         P = _linear(local, xy)
         P *= np.sign(np.linalg.det(P[:, :3]))
-        start = np.eye(4)
-        start[:3, :3] = proper(P[:, :3])
-        start[:3, 3] = P[:, 3] / np.linalg.svd(P[:, :3])[1].mean()
-        starts = [start]
+        starts = [rigid(proper(P[:, :3]), P[:, 3] / np.linalg.svd(P[:, :3])[1].mean())]
     T = min((_refined(start, local, xy) for start in starts), key=lambda found: found[1])[0]
-    board = np.eye(4)
-    board[:3, :3] = axes
-    board[:3, 3] = -axes @ middle
-    return T @ board
+    return T @ rigid(axes, -axes @ middle)
 
 
 def _plane(points: Array) -> tuple[Array, Array, bool]:
@@ -130,39 +126,24 @@ def _linear(points: Array, xy: Array) -> Array:
     return np.asarray(np.linalg.solve(V, P @ U), dtype=float)
 
 
-def _of_homography(H: Array) -> Array:
-    """Return the pose (4, 4) whose first two axes and origin a homography shows, before the camera."""
-    scale = np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
-    H = H / np.copysign(scale, H[2, 2])
-    T = np.eye(4)
-    T[:3, :3] = proper(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
-    T[:3, 3] = H[:, 2]
-    return T
-
-
 def _mirrored(T: Array) -> Array:
     """Return the pose whose normal leans to the other side of the line of sight: it looks much alike from far away."""
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
     turn = np.diag([-1.0, -1.0, 1.0])
     to = scipy.spatial.transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
     half = to.T @ turn @ to  # half a turn about the line of sight
-    found = T.copy()
-    found[:3, :3] = half @ T[:3, :3] @ turn  # and half a turn about the board's normal
-    return found
+    return rigid(half @ T[:3, :3] @ turn, T[:3, 3])  # and half a turn about the board's normal
 
 
 def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
     """Return the pose that fits best near a first one, and its sum of squares."""
 
     def pose_at(step: Array) -> Array:
-        found = np.eye(4)
-        found[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3]
-        found[:3, 3] = T[:3, 3] + step[3:]
-        return found
+        turn = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
+        return rigid(turn @ T[:3, :3], T[:3, 3] + step[3:])
 
     def residual(step: Array) -> Array:
-        M = pose_at(step)
-        there = points @ M[:3, :3].T + M[:3, 3]
+        there = transformed(pose_at(step), points)
         return (there[:, :2] / np.maximum(there[:, 2:], BEFORE) - xy).ravel()
 
     found = scipy.optimize.least_squares(

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye, rigid
 from rpim_opt.problem.registration.loops import LOSSES, Loops, Solved, of_motions, of_poses, solve
 
 GAP = 1e-3
@@ -183,8 +183,8 @@ def certified_hand_eye(
     scale = 1 / solved.v[loops.linear - 1] if scaled else 1.0
     t = solved.v[: loops.linear - scaled].reshape(-1, 3) * scale
     turns = dict(zip(np.unique(which[turned]).tolist(), R[count:].swapaxes(1, 2), strict=True))
-    bases = {name: _transform(R[i], R[i] @ t[len(markers) + i]) for i, name in enumerate(instruments)}
-    tools = {name: _transform(turns.get(k, np.eye(3)), t[k]) for k, name in enumerate(markers)}
+    bases = {name: rigid(R[i], R[i] @ t[len(markers) + i]) for i, name in enumerate(instruments)}
+    tools = {name: rigid(turns.get(k, np.eye(3)), t[k]) for k, name in enumerate(markers)}
     return _judged(solved, loops, bases, tools, scale)
 
 
@@ -248,7 +248,7 @@ def certified_motions(
     loops = of_motions(A, B, _deviations(sigma, len(A)), place, spread, scaled)
     solved = solve(loops, loss)
     scale = 1 / solved.v[3] if scaled else 1.0
-    tool = _transform(solved.smallest.rotations[0], solved.v[:3] * scale)
+    tool = rigid(solved.smallest.rotations[0], solved.v[:3] * scale)
     return _judged(solved, loops, {}, {"": tool}, scale)
 
 
@@ -266,8 +266,7 @@ def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tupl
     if fewest > N:
         raise InputError("poses", f"{N}", f"{fewest} or more")
     points = measured if measured.ndim == 2 else measured[:, :3, 3]
-    poses = np.tile(np.eye(4), (N, 1, 1))
-    poses[:, :3, 3] = points
+    poses = rigid(np.eye(3), points)
     turned = np.zeros(N, dtype=bool)
     if measured.ndim == 3:
         turned = np.asarray(~np.isnan(measured[:, :3, :3]).any(axis=(1, 2)))
@@ -298,10 +297,3 @@ def _deviations(sigma: tuple[float | Array, float | Array], N: int) -> Array:
     if not (np.isfinite(both).all() and (both > 0).all()):
         raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
     return both
-
-
-def _transform(R: Array, t: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = t
-    return T

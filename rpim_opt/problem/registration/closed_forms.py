@@ -48,10 +48,8 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
         if spread[1] <= 1e-6 * spread[0]:
             raise InputError(f"{what} points", "points on a line, or all in one place", "points that span a plane")
     p, r = q @ source / q.sum(), q @ target / q.sum()
-    T = np.eye(4)
-    T[:3, :3] = proper((target - r).T @ (q[:, None] * (source - p)))
-    T[:3, 3] = r - T[:3, :3] @ p
-    return T
+    R = proper((target - r).T @ (q[:, None] * (source - p)))
+    return rigid(R, r - R @ p)
 
 
 def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), spread: float = np.inf) -> Array:
@@ -85,7 +83,7 @@ def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), 
     ridge = NOMINAL_ERROR / spread * np.sqrt(len(i) / N)  # a configuration counts once, in however many pairs
 
     def residual(o: Array) -> Array:
-        p = flange[:, :3, :3] @ o + flange[:, :3, 3]
+        p = transformed(flange, o)
         return np.append(np.linalg.norm(p[j] - p[i], axis=1) - measured, ridge * (o - first))
 
     return scipy.optimize.least_squares(residual, first, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
@@ -124,14 +122,12 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
         raise InputError("poses", "rotations about one axis only", "poses turned about two axes")
     V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
     sign = np.sign(np.linalg.det(V))
-    Z, X = np.eye(4), np.eye(4)
-    Z[:3, :3], X[:3, :3] = proper(sign * V), proper(sign * W).T
-    A = np.concatenate([np.hstack([Z[:3, :3] @ R, np.eye(3)]) for R in RA])
+    Z, X = proper(sign * V), proper(sign * W).T
+    A = np.concatenate([np.hstack([Z @ R, np.eye(3)]) for R in RA])
     o = np.asarray(start, dtype=float)
-    b = measured[:, :3, 3] - (flange[:, :3, 3] + RA @ o) @ Z[:3, :3].T
+    b = measured[:, :3, 3] - transformed(flange, o) @ Z.T
     t = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
-    X[:3, 3], Z[:3, 3] = o + t[:3], t[3:]
-    return Z, X
+    return rigid(Z, t[3:]), rigid(X, o + t[:3])
 
 
 def proper(M: Array) -> Array:
@@ -145,7 +141,18 @@ def proper(M: Array) -> Array:
 
 def transforms(y: Array) -> Array:
     """Return the transforms (N, 4, 4) of measured poses (N, 7): x, y, z [m] and unit quaternion, w first."""
-    T = np.tile(np.eye(4), (len(y), 1, 1))
-    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix()
-    T[:, :3, 3] = y[:, :3]
+    return rigid(scipy.spatial.transform.Rotation.from_quat(y[:, [4, 5, 6, 3]]).as_matrix(), y[:, :3])
+
+
+def rigid(R: Array, t: Array) -> Array:
+    """Return the transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
     return T
+
+
+def transformed(T: Array, points: Array) -> Array:
+    """Return points (..., 3) where transforms (..., 4, 4) put them."""
+    return np.asarray((T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3])

@@ -27,6 +27,8 @@ from rpim_opt.problem.registration.closed_forms import (
     Place,
     proper,
     register,
+    rigid,
+    transformed,
     transforms,
 )
 from rpim_opt.problem.registration.points import Candidates, fit_arms
@@ -90,9 +92,7 @@ class _Rows(NamedTuple):
             count = len(block.row)
             rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
             some = block.take(rows, rows)
-            T = np.tile(np.eye(4), (len(rows), 1, 1))
-            T[:, :3, :3] = np.nan
-            T[:, :3, 3] = some.y[:, :3]
+            T = rigid(np.full((3, 3), np.nan), some.y[:, :3])
             variance = np.zeros((len(rows), 2))
             variance[:, 0] = np.trace(some.covariance[:, :3, :3], axis1=1, axis2=2) / 3
             if block.measurement.name == "pose":
@@ -124,8 +124,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
             place[:3] = start.tools[marker][:3, 3]
         else:  # where its positions are least off, seen from the base
             own = rows.take(rows.marker == marker)
-            T = base @ own.flange
-            there = np.einsum("nji,nj->ni", T[:, :3, :3], own.measured[:, :3, 3] - T[:, :3, 3])
+            there = transformed(np.linalg.inv(base @ own.flange), own.measured[:, :3, 3])
             precision = own.sigma[:, 0] ** -2
             total = place[:3] * TOOL_ERROR**-2 + precision @ there
             place[:3] = total / (TOOL_ERROR**-2 + precision.sum())
@@ -168,11 +167,8 @@ def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
     posed_rows = rows.take(rows.turned)
     for marker in np.unique(posed_rows.marker).tolist():
         own = posed_rows.take(posed_rows.marker == marker)
-        tool = np.eye(4)
         turned = (base @ own.flange)[:, :3, :3].transpose(0, 2, 1) @ own.measured[:, :3, :3]
-        tool[:3, :3] = proper(turned.sum(axis=0))
-        tool[:3, 3] = tools[marker][:3]
-        tools[marker] = frame_numbers(tool)
+        tools[marker] = frame_numbers(rigid(proper(turned.sum(axis=0)), np.asarray(tools[marker][:3])))
 
 
 def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array], Array]:
@@ -185,7 +181,7 @@ def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Arra
     places = np.array([tools[name][:3] for name in markers])
     y = rows.measured[:, :3, 3]
     # refuses points on a line
-    register(np.einsum("nij,nj->ni", rows.flange[:, :3, :3], places[marker]) + rows.flange[:, :3, 3], y)
+    register(transformed(rows.flange, places[marker]), y)
     q = rows.q @ robot.joint_map.T
     spread = np.full(len(places), TOOL_ERROR)
     given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
@@ -218,7 +214,7 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
                 base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
                 found[robot] = frame_numbers(base)
         for name, place in places.items():
-            there = base[:3, :3] @ place + base[:3, 3]
+            there = transformed(base, place)
             distance = float(np.linalg.norm(there - known.setdefault(name, there)))
             # of a base that touches do not place, too few of them say nothing
             placed = robot in found or seen or not p.identified[k].all()

@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import proper
+from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers
 from rpim_opt.robot.mdh import Robot
@@ -198,11 +198,8 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     places = {"base_": fit.base[0]}
     several = len(fit.tools[0]) // len(points.names)
     for name, tool in zip(points.names, fit.tools[0].reshape(len(points.names), several, 3), strict=True):
-        T = np.eye(4)
-        T[:3, 3] = tool[0]
-        if several > 1:
-            T[:3, :3] = proper((tool[1:] - tool[0]).T)
-        places[tool_prefix(name)] = T
+        turn = proper((tool[1:] - tool[0]).T) if several > 1 else np.eye(3)
+        places[tool_prefix(name)] = rigid(turn, tool[0])
     free = set(p.free.names)
     for prefix, T in places.items():
         of_frame = {prefix + c: value for c, value in zip(FRAME, frame_numbers(T), strict=True)}
@@ -307,7 +304,8 @@ def _judged(
     classes: list[list[int]] = []
     said: list[Array] = []
     for i in near:
-        there = _predicted(robot, sign[i], fits.take(np.array([i])), elsewhere)
+        T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
+        there = transformed(T[:, None], fits.tools[i])
         gaps = [_apart(there, other) for other in said]
         if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
             classes[int(np.argmin(gaps))].append(i)
@@ -356,9 +354,3 @@ def _plain(sign: Array, zero: Array) -> tuple[int, int, float]:
     """How far a mapping is from the stated one: joints that change, reversed ones, then the size of the zeros."""
     changed = (sign < 0) | (np.abs(zero) > NEAR_ZERO)
     return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2)
-
-
-def _predicted(robot: Robot, sign: Array, fit: Fit, q: Array) -> Array:
-    """Return where reflectors are at joint values (K, dof) of the controller, (K, M, 3) [m]."""
-    T = fit.base[0] @ forward_kinematics(mapped(robot, sign, fit.zero[0]), q)
-    return np.einsum("kij,mj->kmi", T[:, :3, :3], fit.tools[0]) + T[:, None, :3, 3]

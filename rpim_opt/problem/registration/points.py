@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import posed
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, transforms
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, rigid, transforms
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
@@ -246,11 +246,10 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
         quiet = 0 if (before - state.cost > SHORT * before).any() else quiet + 1
         if quiet == QUIET:
             break
-    base = np.tile(np.eye(4), (B, 1, 1))
-    base[:, :3, :3] = np.swapaxes(state.base, 1, 2)
-    seen = np.einsum("bij,jbn->bni", base[:, :3, :3], state.points)
+    turn = np.swapaxes(state.base, 1, 2)
+    seen = np.einsum("bij,jbn->bni", turn, state.points)
     weight = weights / weights.sum(axis=1, keepdims=True)
-    base[:, :3, 3] = np.einsum("bn,bni->bi", weight, candidates.y - seen)
+    base = rigid(turn, np.einsum("bn,bni->bi", weight, candidates.y - seen))
     modelled = seen + base[:, None, :3, 3]
     return Fit(modelled, np.linalg.norm(candidates.y - modelled, axis=2), state.cost, base, state.tools, state.zero)
 
