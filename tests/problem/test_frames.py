@@ -186,7 +186,7 @@ def test_where_some_markers_do_not_tell_the_base_all_are_asked(monkeypatch: pyte
     """Two of one configuration leave a turn about the line between them."""
     data, tools = once_each(24, 3)
     whole = locate(ARM, data, tools)
-    assert "closed forms" not in whole.how
+    assert "registration" not in whole.how
     monkeypatch.setattr(located, "MOST_PLACING", 2)
     some = locate(ARM, data, tools)
     assert np.array_equal(some.base, whole.base)
