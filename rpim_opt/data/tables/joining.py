@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import split_unit
+from rpim_opt.basics.units import numeral, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.understanding import Understood, row_stems
 from rpim_opt.robot.mdh import Robot
@@ -27,6 +27,9 @@ SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 
 """What a unit is in lower case (`str.casefold`)."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
+
+
+Rows = Sequence[int]
 
 
 class Whole(NamedTuple):
@@ -61,7 +64,21 @@ def together(
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
         found = f"{lost or 'some tables'} with only part of joint and measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
-    return _by_key(moving, seen, key) if within is None else _by_time(moving, seen, key, within)
+    joints = _stacked(moving)
+    values = _stacked(seen)
+    if within is None:
+        left, right, names, notes = _by_key(moving, seen, joints.columns, values.columns, key)
+    else:
+        left, right, names, notes = _by_time(moving, seen, values.columns, key, within)
+    own = {name: cells for name, cells in joints.columns.items() if name not in values.columns}
+    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
+    whole |= {name: [cells[i] for i in right] for name, cells in values.columns.items()}
+    whole.pop("label", None)
+    if len(set(names)) == len(names):
+        whole = {"label": names, **whole}
+    else:  # several measured values of a configuration
+        whole.setdefault("configuration", names)
+    return Whole(whole, (*joints.notes, *values.notes, *notes))
 
 
 # --- below each other ----------------------------------------------------------------------------------------------
@@ -111,28 +128,14 @@ def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
     return columns
 
 
-def _beside(joints: Whole, left: Sequence[int], values: Whole, right: Sequence[int], names: list[str]) -> Columns:
-    """Return rows of joints beside rows of measured values, whose columns go before.
-
-    Their names are labels where each is another, otherwise configurations.
-    """
-    own = {name: cells for name, cells in joints.columns.items() if name not in values.columns}
-    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
-    whole |= {name: [cells[i] for i in right] for name, cells in values.columns.items()}
-    whole.pop("label", None)
-    if len(set(names)) == len(names):
-        return {"label": names, **whole}
-    return {**whole, "configuration": whole.get("configuration", names)}
-
-
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
-def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) -> Whole:
-    """Return rows of joints with the measured values of the same key."""
-    joints = _stacked(moving)
-    values = _stacked(seen)
-    how, left, right = _keys(moving, seen, joints.columns, values.columns, key)
+def _by_key(
+    moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
+) -> tuple[Rows, Rows, list[str], list[str]]:
+    """Return the rows of joints and of measured values that have the same key, their keys, and notes."""
+    how, left, right = _keys(moving, seen, joints, values, key)
     place: dict[str, int] = {}
     for i, name in enumerate(left):
         if place.setdefault(name, i) != i:
@@ -143,25 +146,24 @@ def _by_key(moving: Sequence[Understood], seen: Sequence[Understood], key: str) 
         accepted = "--key with a column that both have, --key row, or --time-tolerance for the nearest time"
         raise InputError(f"the key {how}", found, accepted)
     names = [right[i] for i in rows]
-    notes = [*joints.notes, *values.notes]
-    notes.append(f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured.")
+    notes = [f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured."]
     known = set(names)
     lonely = [name for name in left if name not in known] + [name for name in right if name not in place]
     if lonely:
         notes.append(f"without a partner, left out: {listed(lonely)}.")
-    return Whole(_beside(joints, [place[name] for name in names], values, rows, names), tuple(notes))
+    return [place[name] for name in names], rows, names, notes
 
 
 def _keys(
     moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
 ) -> tuple[str, list[str], list[str]]:
     """Return what the key is, and those of the rows with joints and of the measured ones."""
-    counts = _count(joints), _count(values)
     if key == "row":
-        if counts[0] != counts[1]:
-            found = f"{counts[0]} rows of joints and {counts[1]} measured"
+        count = _count(joints)
+        if _count(values) != count:
+            found = f"{count} rows of joints and {_count(values)} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
-        numbers = [str(i) for i in range(1, counts[0] + 1)]
+        numbers = [str(i) for i in range(1, count + 1)]
         return "the number of the row", numbers, numbers
     if "label" in joints and key in ("", "label"):
         labels = _normal(joints["label"])
@@ -197,31 +199,28 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 # --- by the nearest time -------------------------------------------------------------------------------------------
 
 
-def _by_time(moving: Sequence[Understood], seen: Sequence[Understood], key: str, within: float) -> Whole:
-    """Return rows of joints beside the measured values of the nearest time."""
+def _by_time(
+    moving: Sequence[Understood], seen: Sequence[Understood], values: Columns, key: str, within: float
+) -> tuple[Rows, Rows, list[str], list[str]]:
+    """Return the rows of joints and of measured values of the nearest times, the labels of these, and notes."""
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-    joints = _stacked(moving)
-    values = _stacked(seen)
     there = _times(moving, key)
     then = _times(seen, key)
-    pairs = partners(there, then, within)
-    if not len(pairs.left):
-        apart = float(np.abs(there[:, None] - then[:1]).min())
-        found = f"no two within {within:g} s; the first measured row is {apart:.4g} s from the nearest with joints"
+    left, right, apart = partners(there, then, within)
+    if not len(left):
+        nearest = float(np.abs(there - then[0]).min())
+        found = f"no two within {within:g} s; the first measured row is {nearest:.4g} s from the nearest with joints"
         raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
-    labels = _labels(values.columns)
-    right = pairs.right.tolist()
-    whole = _beside(joints, pairs.left.tolist(), values, right, [labels[i] for i in right])
-    note = (
+    notes = [
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
-        f"times differ by {np.abs(pairs.apart).max():.3g} s at most, {pairs.apart.mean():+.3g} s on average."
-    )
-    notes = [*joints.notes, *values.notes, note]
-    lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right))]
+        f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
+    ]
+    labels = _labels(values)
+    lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
         notes.append(f"{len(lonely)} measured rows without a partner within {within:g} s, left out: {listed(lonely)}.")
-    return Whole(whole, tuple(notes))
+    return left.tolist(), right.tolist(), [labels[i] for i in right], notes
 
 
 def partners(left: Array, right: Array, within: float) -> Pairs:
@@ -282,16 +281,20 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     >>> seconds("time_ms", ["0", "250"]).tolist(), seconds("date", ["1970-01-01T00:01", "1970-01-02"]).tolist()
     ([0.0, 0.25], [60.0, 86400.0])
     """
-    read = [_time(cell) for cell in cells]
-    for i, (cell, time) in enumerate(zip(cells, read, strict=True), start=1):
-        if time is None or type(time) is not type(read[0]):
-            raise InputError(f"column '{name}', row {i}", f"'{cell}'", "numbers, or dates as 2026-05-31T12:00:00")
-    if read and isinstance(read[0], datetime):
-        return np.array([date.replace(tzinfo=date.tzinfo or UTC).timestamp() for date in read])  # type: ignore[union-attr]
-    found = np.array(read, dtype=float)
-    size = np.abs(found).max(initial=0.0)
+    texts = [str(cell).strip() for cell in cells]
+    times = np.array([numeral(text) for text in texts])
+    dates = bool(np.isnan(times[:1]).any())
+    if dates:
+        times = np.array([_date(text) for text in texts])
+    if np.isnan(times).any():
+        i = int(np.isnan(times).argmax())
+        accepted = "numbers, or dates as 2026-05-31T12:00:00"
+        raise InputError(f"column '{name}', row {i + 1}", f"'{texts[i]}'", accepted)
+    if dates:
+        return times
+    size = np.abs(times).max(initial=0.0)
     guessed = next((unit for least, unit in SINCE_1970 if size >= least), "s")
-    return SECONDS[_split_time(name)[1].casefold() or guessed] * found
+    return SECONDS[_split_time(name)[1].casefold() or guessed] * times
 
 
 def _split_time(name: str) -> tuple[str, str]:
@@ -299,15 +302,10 @@ def _split_time(name: str) -> tuple[str, str]:
     return (match[1].strip(), match[2]) if match else (name.strip(), "")
 
 
-def _time(cell: Any) -> float | datetime | None:
-    """Return a cell's finite number or date; None where it is neither."""
-    if isinstance(cell, datetime):
-        return cell
+def _date(text: str) -> float:
+    """Return the time [s] since 1970 of a date; NaN for another text."""
     try:
-        value = float(cell)
-    except (TypeError, ValueError):
-        try:
-            return datetime.fromisoformat(str(cell).strip())
-        except ValueError:
-            return None
-    return value if np.isfinite(value) else None
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        return np.nan
+    return date.replace(tzinfo=date.tzinfo or UTC).timestamp()

@@ -1,0 +1,136 @@
+"""Programs and data lists of controllers, a pattern each: their joint targets if there are some, else their poses.
+
+FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXIS XP1={A1 10.0,A2 -90.0,...}``; ABB
+``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
+in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Staubli
+``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+import scipy
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.data.tables.formats.registry import Rows, TableFormat
+
+NUMBER = r"[+-]?[\d.]+(?:e[+-]?\d+)?"
+FANUC = re.compile(r'P\[(\d+)(?::"([^"]*)")?\]\s*\{(.*?)\};', re.DOTALL)
+KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
+ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\]", re.IGNORECASE)
+ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
+UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
+YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
+STAUBLI = re.compile(r"<Value\s([^<>]{0,2000})>")
+PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
+KUKA_NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **dict(zip("XYZ", PLACE, strict=True)),
+              **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
+STAUBLI_NAMES = {**{f"j{i}": f"J{i} [deg]" for i in range(1, 7)}, **dict(zip("xyz", PLACE, strict=True))}
+
+
+def _rows(joints: Sequence[tuple[str, Mapping[str, str]]], poses: Sequence[tuple[str, Mapping[str, str]]] = ()) -> Rows:
+    """Return a row a joint target, or a pose where there are none; what has no name is numbered."""
+    return [{"label": name or str(i), **values} for i, (name, values) in enumerate(joints or poses, start=1)]
+
+
+def _joints(cells: str, name: str = "J") -> dict[str, str]:
+    """Return joint values [deg] that are separated by commas."""
+    return {f"{name}{i} [deg]": cell.strip() for i, cell in enumerate(cells.split(","), start=1)}
+
+
+def read_fanuc(text: str) -> Rows:
+    """Return the points; a position register without values (``********``) has none."""
+    points = FANUC.findall(text)
+    comments = [comment for _, comment, _ in points]
+    named = all(comments) and len(set(comments)) == len(comments)
+    rows = []
+    for number, comment, fields in points:
+        found = re.findall(r"\b(J\d|[XYZWPR])\s*=\s*([+-]?[\d.]+)\s*(deg|mm)", fields)
+        values = {f"{'' if name[0] == 'J' else 'commanded '}{name} [{unit}]": value for name, value, unit in found}
+        rows.append((comment if named else f"P{number}", values))
+    return _rows(rows)
+
+
+def read_kuka(text: str) -> Rows:
+    """Return the targets; where all names begin with X, as inline forms name P1's data, they are without it."""
+    found = KUKA.findall(text)
+    found = [each for each in found if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or found
+    inline = all(name.upper().startswith("X") for name, _ in found)
+    rows = []
+    for name, fields in found:
+        pairs = re.findall(rf"\b([A-Z]\d?)\s+({NUMBER})", fields, re.IGNORECASE)
+        values = {KUKA_NAMES[key.upper()]: value for key, value in pairs if key.upper() in KUKA_NAMES}
+        rows.append((name[1:] if inline else name, values))
+    return _rows(rows)
+
+
+def read_abb(text: str) -> Rows:
+    """Return the targets; a quaternion has w first."""
+    text = re.sub(r"!.*", "", text)
+    names = [*PLACE, *(f"commanded q{part}" for part in "wxyz")]
+    poses = [(name, [*place.split(","), *turn.split(",")]) for name, place, turn in ABB_POSES.findall(text)]
+    return _rows(
+        [(name, _joints(cells, "rax_")) for name, cells in ABB_JOINTS.findall(text)],
+        [(name, dict(zip(names, map(str.strip, values), strict=False))) for name, values in poses],
+    )
+
+
+def _plain_urscript(text: str) -> str:
+    """Return a program without comments, its angles in rad."""
+    radians = re.sub(r"d2r\(\s*([+-]?[\d.]+)\s*\)", lambda degrees: repr(math.radians(float(degrees[1]))), text)
+    return re.sub(r"#.*", "", radians)
+
+
+def read_urscript(text: str) -> Rows:
+    """Return the targets that are commanded or named."""
+    joints = []
+    poses = []
+    for name, pose, cells in UR.findall(_plain_urscript(text)):
+        values = [float(cell) for cell in cells.split(",")]
+        if not pose:
+            row = {f"joint_{i} [rad]": repr(value) for i, value in enumerate(values, start=1)}
+            joints.append((name.removesuffix("_q"), row))
+        elif name.lower() != "set_tcp":
+            turn = scipy.spatial.transform.Rotation.from_rotvec(values[3:]).as_quat().tolist()
+            row = {f"commanded {axis} [m]": repr(value) for axis, value in zip("xyz", values, strict=False)}
+            row |= {f"commanded q{part}": repr(value) for part, value in zip("xyzw", turn, strict=True)}
+            poses.append((name.removesuffix("_p"), row))
+    return _rows(joints, poses)
+
+
+def read_yaskawa(text: str) -> Rows:
+    """Return the points; pulses of encoders say no angles without the robot's gear ratios."""
+    kind = re.search(r"///POSTYPE\s+(\w+)", text)
+    if kind is None or kind[1] == "PULSE":
+        raise InputError("the positions", "pulses of encoders", "///POSTYPE ANGLE or BASE: export the job so")
+    points = YASKAWA.findall(text)
+    if kind[1] == "ANGLE":
+        return _rows([(name, _joints(cells)) for name, cells in points])
+    return _rows([(name, dict(zip(PLACE, map(str.strip, cells.split(",")), strict=False))) for name, cells in points])
+
+
+def read_staubli(text: str) -> Rows:
+    """Return the points by their keys."""
+    found = [dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields)) for fields in STAUBLI.findall(text)]
+    found = [each for each in found if "j1" in each] or found
+    rows = [{new: each[name] for name, new in STAUBLI_NAMES.items() if name in each} for each in found]
+    return _rows([(each.get("key", ""), row) for each, row in zip(found, rows, strict=True)])
+
+
+def _has_abb(text: str) -> bool:
+    return any(pattern.search(text) for pattern in (ABB_JOINTS, ABB_POSES))
+
+
+FORMATS = (
+    TableFormat("FANUC program", (".ls",), lambda text: FANUC.search(text) is not None, read_fanuc),
+    TableFormat("KUKA data list", (".dat", ".src"), lambda text: KUKA.search(text) is not None, read_kuka),
+    TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), _has_abb, read_abb),
+    TableFormat(
+        "URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)) is not None, read_urscript
+    ),
+    TableFormat("Yaskawa job", (".jbi",), lambda text: YASKAWA.search(text) is not None, read_yaskawa),
+    TableFormat("VAL3 data", (".dtx",), lambda text: STAUBLI.search(text) is not None, read_staubli),
+)
