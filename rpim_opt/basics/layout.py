@@ -278,8 +278,10 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
     units = [""] * width
-    if len(lines) > 1 and _is_units(lines[-1]):
-        signs = ["" if cell in ("-", "1") else cell for cell in (each.strip("[]()") for each in lines.pop())]
+    bare = [cell.strip("[]()") for cell in lines[-1]]
+    if len(lines) > 1 and any(bare) and all(cell.lower() in UNIT_SIGNS for cell in filter(None, bare)):
+        lines.pop()
+        signs = ["" if cell in ("-", "1") else cell for cell in bare]
         lacking = [""] * (width - len(signs))
         units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
@@ -322,11 +324,6 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
             if not cells[0] and len(cells) > width:
                 return cells[1:]
     return cells
-
-
-def _is_units(row: Sequence[str]) -> bool:
-    cells = [cell.strip("[]()").lower() for cell in row if cell]
-    return bool(cells) and all(cell in UNIT_SIGNS for cell in cells)
 
 
 def _unmerged(line: Sequence[str]) -> list[str]:
@@ -392,26 +389,21 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     """
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "a comma or a point")
-    found: dict[str, str] = {}
-    doubtful = ""
-    for cell in cells:
-        mark = _mark(cell)
-        if mark == "?":
-            doubtful = doubtful or cell
-        elif mark and GROUPED.fullmatch(found.get(mark, "1.000")):
-            found[mark] = cell
+    marks = [(_mark(cell), cell) for cell in cells]
     if stated:
-        cell = found.get("." if stated == "," else ",", "")
-        if cell and not GROUPED.fullmatch(cell):
-            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
+        for mark, cell in marks:
+            if mark not in ("", "?", stated) and not GROUPED.fullmatch(cell):
+                raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
         return stated
-    if len(found) > 1:
-        raise InputError("the numbers", f"'{found[',']}' and '{found['.']}'", "one decimal mark, or --decimal with it")
-    if not found and doubtful:
+    shown = {mark: cell for mark, cell in reversed(marks) if mark}
+    doubtful = shown.pop("?", "")
+    if len(shown) > 1:
+        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or --decimal with it")
+    if not shown and doubtful:
         raise InputError(
             "the numbers", f"'{doubtful}', whose mark may separate thousands or decimals", "--decimal , or --decimal ."
         )
-    return next(iter(found), ".")
+    return next(iter(shown), ".")
 
 
 def _mark(cell: str) -> str:
@@ -481,31 +473,31 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
         return columns, []
     letters = [str(cell).lower() for cell in axis.cells]
     others = [each for each in columns if each is not axis]
-    key = next((each for each in others if _names_points(each.cells, letters)), None)
-    if key is None:
+    points: dict[str, dict[str, int]] = {}  # the row of every coordinate, by the names of points
+    for key in others:
+        names = [str(cell).strip() for cell in key.cells]
+        if all(names) and len(set(zip(names, letters, strict=True))) == len(names) > 2 * len(set(names)):
+            for i, (name, letter) in enumerate(zip(names, letters, strict=True)):
+                points.setdefault(name, {})[letter] = i
+            break
+    if not points:
         accepted = "a column that names its point, all three once"
         raise InputError("the header", f"a row a coordinate ('{axis.name}')", accepted)
-    points: dict[Any, dict[str, int]] = {}
-    for i, (name, letter) in enumerate(zip(key.cells, letters, strict=True)):
-        points.setdefault(name, {})[letter] = i
-    rows = list(points.values())
-    same = [each for each in others if all(len({each.cells[i] for i in row.values()}) == 1 for row in rows)]
-    names = {each.name for each in same}
-    values = [each for each in others if each.name not in names and _is_numeric(list(map(str, each.cells)))]
+    whole = []
+    values = []
+    for each in others:
+        cells = [{each.cells[i] for i in rows.values()} for rows in points.values()]
+        if all(len(own) == 1 for own in cells):
+            whole.append(each._replace(cells=[own.pop() for own in cells]))
+        elif _is_numeric(list(map(str, each.cells))):
+            values.append(each)
     measured = [each for each in values if VALUE.search(each.name)] or values
     if len(measured) != 1:
         found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     (value,) = measured
-    whole = [each._replace(cells=[each.cells[min(row.values())] for row in rows]) for each in same]
     for letter in "xyz":
         head = Head(letter, "", value.head.unit or split(value.name)[1])
-        cells = [str(value.cells[row[letter]]) if letter in row else "" for row in rows]
+        cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points.values()]
         whole.append(Column(str(head), head, cells))
     return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
-
-
-def _names_points(keys: Sequence[Any], letters: Sequence[str]) -> bool:
-    """Return whether no key has a letter twice, and all but the last have all three."""
-    pairs = set(zip(map(str, keys), letters, strict=True))
-    return all(map(str.strip, map(str, keys))) and len(pairs) == len(letters) > 2 * len(set(keys))
