@@ -204,9 +204,16 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 stream.flush()
                 os.fsync(stream.fileno())
         for place, file in made.items():
-            if len(contents) > 1:
-                _keep_old(place, file, renames)
+            old = file.with_name("old")
+            known = place.exists()
+            if known and len(contents) > 1:  # a later one may fail
+                try:
+                    os.link(place, old)
+                except OSError:  # a file system without links
+                    shutil.copy2(place, old)
             file.replace(place)
+            if len(contents) > 1:
+                renames.callback(old.replace, place) if known else renames.callback(place.unlink)
         for path, data in streams.items():
             path.write_bytes(data)
         for folder in {place.parent for place in made}:
@@ -233,25 +240,6 @@ def make_folder(folder: Path, steps: ExitStack) -> None:
 def _remove_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
-
-
-def _keep_old(place: Path, file: Path, steps: ExitStack) -> None:
-    """Keep what is at a place beside the file that replaces it, for the case that a later one cannot be replaced."""
-    old = file.with_name("old")
-    try:
-        os.link(place, old)
-    except FileNotFoundError:
-        steps.callback(_take_away, place, file)
-        return
-    except OSError:  # a file system without links
-        shutil.copy2(place, old)
-    steps.callback(old.replace, place)
-
-
-def _take_away(place: Path, file: Path) -> None:
-    """Remove a file that was put where none was; another's, if ours was never put there, stays."""
-    if not file.exists():
-        place.unlink(missing_ok=True)
 
 
 def _is_stream(path: Path) -> bool:

@@ -19,14 +19,14 @@ def least(function: Callable[[float], float], low: float, high: float, accuracy:
     divides the larger side by the golden section. A minimum at an end is found next to it, within ``accuracy``.
     """
     start = low + GOLDEN * (high - low)
-    points = [(start, float(function(start)))] * 3  # the best three, best first
+    points = [(start, float(function(start)))]  # the best three, best first
     last = before = high - low
     for _ in range(MOST):
         best = points[0][0]
         middle = (low + high) / 2
         if abs(best - middle) + (high - low) / 2 <= accuracy:
             break
-        step = _to_vertex(points)
+        step = _to_vertex(points) if len(points) == 3 else None
         if step is None or abs(step) >= abs(before) / 2 or not low < best + step < high:
             last = low - best if best > middle else high - best
             step = GOLDEN * last
@@ -37,7 +37,7 @@ def least(function: Callable[[float], float], low: float, high: float, accuracy:
         tried = (best + step, float(function(best + step)))
         inner, outer = sorted([points[0], tried], key=lambda point: point[1])
         low, high = (outer[0], high) if outer[0] < inner[0] else (low, outer[0])
-        points = _three_best(points, tried)
+        points = sorted([tried, *points], key=lambda point: point[1])[:3]
     return points[0]
 
 
@@ -48,13 +48,3 @@ def _to_vertex(points: list[Point]) -> float | None:
     other = (x - w) * (y - f)
     below = 2 * (one - other)
     return ((x - w) * other - (x - v) * one) / below if below else None
-
-
-def _three_best(points: list[Point], tried: Point) -> list[Point]:
-    if tried[1] <= points[0][1]:
-        return [tried, *points[:2]]
-    if tried[1] <= points[1][1] or points[1] == points[0]:
-        return [points[0], tried, points[1]]
-    if tried[1] <= points[2][1] or points[2] in points[:2]:
-        return [*points[:2], tried]
-    return points

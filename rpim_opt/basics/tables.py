@@ -30,7 +30,7 @@ WIDEST = 1000
 """Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
 MOST_CELLS = 2**27
 MOST_TEXT = 2**27
-"""Cells, and bytes of texts, of a Parquet file: a dictionary of one value repeats it in every row."""
+"""Cells of a Parquet file, and bytes of a column's texts: a dictionary of one value repeats it in every row."""
 LARGEST_WORKBOOK = 2**27
 """Bytes that a workbook may unpack to: some three hundred thousand rows."""
 EXCEL_ROWS = 2**20
@@ -106,7 +106,9 @@ def _csv(path: Path) -> Columns:
     rows, _ = _split(text, ",")
     if rows and len(rows[0]) == 1 and any(mark in rows[0][0] for mark in ";\t"):
         raise InputError("the header", "one column with semicolons or tabs", "columns separated by commas")
-    return _rectangle([[_without_apostrophe(cell) for cell in row] for row in rows])
+    return _rectangle(
+        [[cell[1:].strip() if cell.startswith("'") and FORMULA.match(cell) else cell for cell in row] for row in rows]
+    )
 
 
 def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
@@ -148,28 +150,23 @@ def _parquet(path: Path) -> Columns:
         texts = [field.name for field in schema if str(field.type).startswith(kinds)]
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that is there again once
             table = file.read()
-        repeated = sum(_repeated(table.column(name)) for name in texts)
-        if repeated > MOST_TEXT:
-            raise InputError("the table", f"{repeated} bytes of texts", f"at most {MOST_TEXT}")
         return {name: _parquet_cells(table.column(name)) for name in table.column_names}
     except (OSError, ValueError, KeyError, NotImplementedError, MemoryError) as error:  # pyarrow's derive from these
         raise InputError("the file", _first_line(error), "a readable Parquet file") from None
 
 
-def _repeated(column: Any) -> int:
-    """Return the bytes of a column's texts where each stands in every row that has it."""
-    compute = import_module("pyarrow.compute")
-    if str(getattr(column.type, "value_type", "")) not in ("string", "large_string", "binary"):
-        return 0
-    sizes = [compute.binary_length(chunk.dictionary).take(chunk.indices) for chunk in column.chunks]
-    return sum(compute.sum(each).as_py() or 0 for each in sizes)
-
-
 def _parquet_cells(column: Any) -> Sequence[Any]:
-    if str(column.type).startswith("dictionary"):
-        return column.cast(column.type.value_type).to_pylist()
-    numeric = str(column.type).startswith(("float", "double", "int", "uint"))
-    return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
+    if not str(column.type).startswith("dictionary"):
+        numeric = str(column.type).startswith(("float", "double", "int", "uint"))
+        return column.to_numpy() if numeric and not column.null_count else column.to_pylist()
+    cells = []
+    for chunk in column.chunks:
+        values = chunk.dictionary.to_pylist()
+        cells += [None if i is None else values[i] for i in chunk.indices.to_pylist()]
+    size = sum(len(cell) for cell in cells if isinstance(cell, str | bytes))
+    if size > MOST_TEXT:
+        raise InputError("the table", f"{size} bytes of texts", f"at most {MOST_TEXT}")
+    return cells
 
 
 # --- files as people have them -------------------------------------------------------------------------------------
@@ -450,10 +447,6 @@ def _with_apostrophe(cell: Any) -> Any:
         float(cell)
         return cell
     return f"'{cell}"
-
-
-def _without_apostrophe(cell: str) -> str:
-    return cell[1:].strip() if cell.startswith("'") and FORMULA.match(cell) else cell
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:

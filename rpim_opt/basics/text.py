@@ -150,19 +150,14 @@ class Tabled(Brief):
         return frame_of(self._frame_rows())
 
     def _repr_html_(self) -> str:
-        """Return the table for a notebook."""
-        return as_html(self._shown_rows(), self._notes(), f"{type(self).__name__} {self._short()}")
-
-
-def as_html(rows: Sequence[dict[str, Any]], notes: Sequence[str], title: str = "") -> str:
-    """Return rows as a table of HTML with a line above and sentences below; columns without any value are left out."""
-    head: list[str] = []
-    if rows:
-        head = [key for key in rows[0] if any(row[key] is not None for row in rows)]
-    cells = [[_cell(row[key]) for key in head] for row in rows[:MOST]]
-    if len(rows) > MOST:
-        notes = [f"... and {len(rows) - MOST} rows more.", *notes]
-    return html_table(head, cells, notes=notes, title=title)
+        """Return the table for a notebook; columns without any value are left out."""
+        rows = self._shown_rows()
+        notes = list(self._notes())
+        if len(rows) > MOST:
+            notes.insert(0, f"... and {len(rows) - MOST} rows more.")
+        head = [key for key in next(iter(rows), {}) if any(row[key] is not None for row in rows)]
+        cells = [[_cell(row[key]) for key in head] for row in rows[:MOST]]
+        return html_table(head, cells, notes, f"{type(self).__name__} {self._short()}")
 
 
 def _cell(value: Any) -> str:

@@ -117,8 +117,8 @@ def understand(
     require_rotation(options.rotation)
     known = number_columns(robot, kind)
     try:
-        read, why, rotation = _readings(raw, robot, kind, options, joints, targets)
-        columns, meant = _under_our_names(raw.columns, read, why, kind, known, options.units)
+        read, rotation = _readings(raw, robot, kind, options, joints, targets)
+        columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
         if "rx" in known and (options.rotation or rotation) not in ("", "extrinsic xyz"):
             columns, meant = _as_quaternions(columns, meant, options.rotation or rotation)
         kept, notes = range(len(next(iter(columns.values()), ()))), []
@@ -151,8 +151,8 @@ def _doubt(read: Readings, options: TableOptions, rotation: str, dof: int) -> st
 
 def _readings(
     raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions, joints: Sequence[str], targets: bool
-) -> tuple[Readings, dict[str, str], str]:
-    """Return what every column holds, why some are left out, and the rotation that names tell."""
+) -> tuple[Readings, str]:
+    """Return what every column holds, nothing where it is left out, and the rotation that names tell."""
     table, dof = raw.columns, robot.dof
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
@@ -175,7 +175,8 @@ def _readings(
         wanted = {*options.units, *robot.model.columns}
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature whose unit is not there")
-    return read, _left_out(read, targets), rotation
+    _leave_out(read, targets)
+    return read, rotation
 
 
 def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
@@ -300,31 +301,28 @@ def _counted(read: Readings, robot: Robot) -> Readings:
     return whole[0] if len(whole) == 1 else {}
 
 
-def _left_out(read: Readings, targets: bool) -> dict[str, str]:
-    """Return why columns are left out: what was computed, and what was wanted where it was measured.
-
-    Of targets, what was measured is left out where it was wanted, too.
-    """
-    why: dict[str, str] = {}
+def _leave_out(read: Readings, targets: bool) -> None:
+    """Leave out what was computed, and what was wanted where it was measured; of targets what was measured."""
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
     by_instrument = {"x", "y", "z"} if named >= {"x", "y", "z"} else set()  # one alone is of another frame
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
     for name, each in list(read.items()):
+        why = ""
         if each.kind == "derived":
-            why[name] = "computed from others"
+            why = "computed from others"
         elif not each.kind and each.stem in by_instrument and not INSTRUMENT.search(name):
-            why[name] = "another column names the instrument"
+            why = "another column names the instrument"
         elif targets:
             if each.kind != "wanted" and each.stem in wanted:
-                why[name] = "it is not where the robot is to go"
-        elif each.kind != "wanted" or (each.stem == "label" and "label" not in measured):
-            continue
-        elif each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
-            read[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
-        else:
-            why[name] = "a commanded value is no measurement"
-    return why
+                why = "it is not where the robot is to go"
+        elif each.kind == "wanted" and (each.stem != "label" or "label" in measured):
+            if each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
+                read[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
+            else:
+                why = "a commanded value is no measurement"
+        if why:
+            read[name] = Reading("", "", why)
 
 
 # --- our names and units -------------------------------------------------------------------------------------------
@@ -333,7 +331,6 @@ def _left_out(read: Readings, targets: bool) -> dict[str, str]:
 def _under_our_names(
     table: Columns,
     read: Readings,
-    left_why: Mapping[str, str],
     kind: Measurement,
     known: Mapping[str, Sequence[str]],
     units: Mapping[str, str],
@@ -344,9 +341,8 @@ def _under_our_names(
     unitless: dict[str, list[str]] = {}
     for name, cells in table.items():
         found = read[name]
-        if name in left_why or (found.stem not in known and found.stem not in text_columns(kind)):
-            reason = left_why.get(name) or found.why or "no column of these measurements"
-            meant.append(Meant(name, "left out", "", "", reason))
+        if found.stem not in known and found.stem not in text_columns(kind):
+            meant.append(Meant(name, "left out", "", "", found.why or "no column of these measurements"))
             continue
         dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
         unit, why = _unit(name, found, dimensions, units)
