@@ -1,7 +1,6 @@
 from .chain import Described as Described
 from .chain import without_beta as without_beta
 from .extensions import bend_names as bend_names
-from .extensions import bending_joints as bending_joints
 from .extensions import families as families
 from .extensions import family_scales as family_scales
 from .extensions import gravity_torques as gravity_torques

@@ -63,19 +63,20 @@ def _mapped(function: ca.Function, shared: int, N: int) -> ca.Function:
 
 def evaluate_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
     """Return what `call_rows` returns, the same bits, in the quickest way that pays for so many rows."""
-    vectorized = _quickest(function, len(shared), len(rows))
+    evaluated = _evaluated(function)
+    evaluated[0] += len(rows)
+    vectorized = None
+    if evaluated[0] >= PAYS:
+        width = WIDTH
+        while len(rows) <= width // 2 and width > NARROW:  # few of them are evaluated for nothing
+            width //= 2
+        vectorized = _vectorize(function, len(shared), width)
     if vectorized is None:
         return call_rows(function, shared, rows)
-    results = [np.empty((c, r, len(rows))) for r, c in vectorized.shapes]
-    _evaluate(vectorized, shared, rows, results)
-    return [values.transpose(2, 0, 1) for values in results]
-
-
-def _split(numbers: Array, results: Sequence[Array]) -> list[Array]:
-    """Return numbers (n, m) of all outputs by output, each (c, r, m)."""
-    ends = np.cumsum([into.shape[0] * into.shape[1] for into in results])
-    parts = np.split(numbers, ends[:-1])
-    return [part.reshape(*into.shape[:2], -1) for part, into in zip(parts, results, strict=True)]
+    numbers = _evaluate(vectorized, shared, rows)
+    ends = np.cumsum([r * c for r, c in vectorized.shapes])
+    parts = zip(np.split(numbers, ends[:-1]), vectorized.shapes, strict=True)
+    return [part.reshape(c, r, len(rows)).transpose(2, 0, 1) for part, (r, c) in parts]
 
 
 class _Vectorized(NamedTuple):
@@ -91,18 +92,6 @@ class _Vectorized(NamedTuple):
 def _evaluated(_: ca.Function) -> list[int]:
     """Return a list with the number of rows at which a function was evaluated, to be counted up."""
     return [0]
-
-
-def _quickest(function: ca.Function, shared: int, rows: int) -> _Vectorized | None:
-    """Return how a function is evaluated at some rows more; None for one row after the other."""
-    evaluated = _evaluated(function)
-    evaluated[0] += rows
-    if evaluated[0] < PAYS:
-        return None
-    width = WIDTH
-    while rows <= width // 2 and width > NARROW:  # few of them are evaluated for nothing
-        width //= 2
-    return _vectorize(function, shared, width)
 
 
 @lru_cache(maxsize=256)
@@ -182,8 +171,9 @@ def _memory(vectorized: _Vectorized, _thread: int) -> _Memory:
     return _Memory(vectorized)
 
 
-def _evaluate(vectorized: _Vectorized, shared: Sequence[Array], rows: Array, results: Sequence[Array]) -> None:
-    """Write the numbers of a table (N, k) into arrays (c, r, N)."""
+def _evaluate(vectorized: _Vectorized, shared: Sequence[Array], rows: Array) -> Array:
+    """Return the numbers (n, N) of a table (N, k)."""
+    numbers = np.empty((vectorized.rows.size2_out(0), len(rows)))
 
     def evaluate(begin: int) -> None:
         memory = _memory(vectorized, threading.get_ident())
@@ -197,8 +187,7 @@ def _evaluate(vectorized: _Vectorized, shared: Sequence[Array], rows: Array, res
             memory.table[:, :count] = rows[part].T
             memory.table[:, count:] = rows[part.stop - 1][:, None]  # stands for those missing
             memory.rows[0]()
-            numbers = memory.numbers[:, :count]
-            for into, values in zip(results, _split(numbers, results), strict=True):
-                into[:, :, part] = values
+            numbers[:, part] = memory.numbers[:, :count]
 
     on_all_cores(evaluate, range(0, len(rows), SHARE))
+    return numbers

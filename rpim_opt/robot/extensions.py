@@ -192,16 +192,10 @@ def _bend_names(mdh: bytes, joint_types: tuple[str, ...], joint_map: bytes, grav
     return tuple(names)
 
 
-def bending_joints(robot: Robot) -> list[int]:
-    """Return the joints (from 1) whose torque of gravity changes with the configuration."""
-    spread = np.ptp(gravity_torques(robot, _draws(robot)), axis=0)
-    return [i for i, each in enumerate(spread, start=1) if each > SAME * spread.max()]
-
-
 def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return the parameters of every family that may be added to a robot's geometry, by what they describe.
 
-    Compliances are those of the joints that gravity bends.
+    Compliances are those of the joints whose torque of gravity changes with the configuration.
 
     Examples
     --------
@@ -212,9 +206,11 @@ def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     >>> {name: len(names) for name, names in found.items()}
     {'gravity': 4, 'first harmonic': 12, 'second harmonic': 12, 'moments': 30}
     """
+    spread = np.ptp(gravity_torques(robot, _draws(robot)), axis=0)
+    bending = [i for i, each in enumerate(spread, start=1) if each > SAME * spread.max()]
     revolute = [i for i, kind in enumerate(robot.joint_types, start=1) if kind == "revolute"]
     return {
-        "gravity": tuple(f"compliance{i}" for i in bending_joints(robot)),
+        "gravity": tuple(f"compliance{i}" for i in bending),
         "first harmonic": tuple(f"ecc_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
         "second harmonic": tuple(f"ecc2_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
         "moments": bend_names(robot),

@@ -314,13 +314,23 @@ def overlay(
     What names fewer parameters goes before. ``where`` and ``file`` are named in errors; ``signed``: whether zero and
     negative values are accepted.
     """
-    members = _members(parameters, table)
+    members: dict[str, list[int]] = {}  # whom keys may mean: groups, joint offsets, patterns of the table, names
+    for i, group in enumerate(parameters.groups):
+        members.setdefault(group, []).append(i)
+    offsets = [i for i, name in enumerate(parameters.names) if is_joint_offset(name)]
+    if offsets:
+        members[JOINT_OFFSET] = offsets
+    for key in filter(_PATTERN.search, table):
+        stem, _ = split_unit(key)
+        members[stem] = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
+    members |= {name: [i] for i, name in enumerate(parameters.names)}
+    order = list(members)
     dimensions = np.array(parameters.dimensions)
     accepted = {stem: tuple(sorted(set(dimensions[index].tolist()))) for stem, index in members.items()}
     result = values.copy()
     try:
         stated = quantities(table, accepted, where)
-        for (stem, dimension), value in sorted(stated.items(), key=lambda item: _rank(item[0][0], parameters)):
+        for (stem, dimension), value in sorted(stated.items(), key=lambda item: order.index(item[0][0])):
             if not (value >= SMALLEST or signed):
                 found = f"a number greater than zero, from {SMALLEST:g} on"
                 raise InputError(f"{where}, key {stem}", f"{value:g}", found)
@@ -329,29 +339,6 @@ def overlay(
     except InputError as error:
         raise error.within(file) from None
     return result
-
-
-def _members(parameters: Parameters, table: Mapping[str, float]) -> dict[str, list[int]]:
-    """Return the parameters that keys may mean: of groups, names, joint offsets, and of the table's own patterns."""
-    members: dict[str, list[int]] = {}
-    for i, (name, group) in enumerate(zip(parameters.names, parameters.groups, strict=True)):
-        members.setdefault(group, []).append(i)
-        members[name] = [i]
-        if is_joint_offset(name):
-            members.setdefault(JOINT_OFFSET, []).append(i)
-    for key in filter(_PATTERN.search, table):
-        stem, _ = split_unit(key)
-        members[stem] = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
-    return members
-
-
-def _rank(stem: str, parameters: Parameters) -> int:
-    """Return the order in which keys are carried out: groups, joint offsets, patterns, names."""
-    if stem in parameters.names:
-        return 3
-    if _PATTERN.search(stem):
-        return 2
-    return int(stem == JOINT_OFFSET)
 
 
 # Parameters of a model

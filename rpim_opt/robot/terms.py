@@ -468,15 +468,11 @@ JOINT_TERMS = (
 """Terms of every joint; all parameters are zero in a nominal robot."""
 
 
-def _first_moment(k: int, axis: str, joint: Joint, size: Symbol) -> Symbol:
-    return size * joint.moment(k, axis)
-
-
 @lru_cache
 def terms_of(dof: int) -> tuple[Term, ...]:
     """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``bend{i}_{k}{axis}``."""
     bends = [
-        Term(partial(_first_moment, k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
+        Term(lambda joint, size, k=k, axis=axis: size * joint.moment(k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
         for k in range(1, dof + 1)
         for axis in "xyz"
     ]

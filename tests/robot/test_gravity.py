@@ -158,7 +158,6 @@ def test_families_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -> 
         else:
             effect = np.ones(1)
         assert scale * np.abs(effect).max() == pytest.approx(1e-4)
-    assert ro.robot.bending_joints(ARM) == [2, 3, 4, 5]
     assert ro.robot.family_scales(ARM, ["compliance1"]) == [1e-5]  # a vertical axis has no torque to go by
     with pytest.raises(ro.InputError, match="term of a joint: found 'theta1'"):
         ro.robot.family_scales(ARM, ["theta1"])

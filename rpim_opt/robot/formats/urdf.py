@@ -10,11 +10,12 @@ import functools
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
@@ -235,18 +236,13 @@ def _followed(urdf: _Urdf, joints: Sequence[_Joint]) -> tuple[tuple[str, ...], A
 # Elements
 
 
-@dataclass(eq=False)
-class _Element:
-    """An element: where it starts in the file [byte], and what is in it."""
+class _Placed(ElementTree.Element):
+    """An element that knows where it starts in the file [byte]."""
 
-    tag: str
-    attributes: dict[str, str]
-    start: int
-    children: list[_Element] = field(default_factory=list)
+    start = 0
 
-    def every(self, tag: str) -> list[_Element]:
-        """Return the elements of a tag in it."""
-        return [child for child in self.children if child.tag == tag]
+
+_Element = Any  # _Placed: the stubs of ElementTree know its base alone
 
 
 class _Joint:
@@ -261,7 +257,7 @@ class _Joint:
 
     def _link(self, which: str) -> str:
         element = self._only(which)
-        link = element.attributes.get("link") if element else None
+        link = element.get("link") if element is not None else None
         if not link:
             raise self.error(which, "nothing", f'one <{which} link="...">')
         return link
@@ -271,7 +267,7 @@ class _Joint:
         return InputError(f"joint '{self.name}', {what}", found, accepted, self.path)
 
     def _only(self, tag: str) -> _Element | None:
-        elements = self.element.every(tag)
+        elements = self.element.findall(tag)
         if len(elements) > 1:
             raise self.error(tag, f"{len(elements)} of them", "one")
         return elements[0] if elements else None
@@ -281,7 +277,7 @@ class _Joint:
         element = self._only(tag)
         text = default
         if element is not None:
-            text = element.attributes.get(attribute, default)
+            text = element.get(attribute, default)
         numbers = _numbers(text, count, LARGEST_NUMBER if count > 1 else math.inf)  # limits may be any number
         if numbers is None:
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
@@ -293,7 +289,7 @@ class _Joint:
     @property
     def kind(self) -> str:
         """``"revolute"``, ``"prismatic"``, or nothing for a fixed joint."""
-        kind = self.element.attributes.get("type", "")
+        kind = self.element.get("type", "")
         if kind not in KINDS:
             raise self.error("type", f"'{kind}'", f"{', '.join(KINDS)} between base and tip")
         return KINDS[kind]
@@ -309,7 +305,7 @@ class _Joint:
         )
         if not 0 < abs(multiplier) <= LARGEST_NUMBER:
             raise self.error("mimic multiplier", f"{multiplier:g}", "a number that is not zero")
-        return element.attributes.get("joint", ""), multiplier, offset
+        return element.get("joint", ""), multiplier, offset
 
     @cached_property
     def origin(self) -> Array:
@@ -332,7 +328,7 @@ class _Joint:
         if lower > upper:
             raise self.error("limit", f"{lower:g} to {upper:g}", "lower < upper")
         far = max(abs(lower), abs(upper)) > LARGEST  # 1e16 is how some files say that there is none
-        unlimited = far or lower == upper or self.element.attributes.get("type") == "continuous"
+        unlimited = far or lower == upper or self.element.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
     def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
@@ -461,14 +457,14 @@ def _read(path: Path) -> _Urdf:
     root = _root_element(data, path)
     if root.tag != "robot":
         raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
-    for element in root.children:
+    for element in root:
         if element.tag.startswith("xacro:"):
             raise InputError(f"element <{element.tag}>", "xacro in a file .urdf", "URDF, or a file .xacro", path)
-    links = _named(root.every("link"), path)
+    links = _named(root.findall("link"), path)
     if not links:
         raise InputError("the robot", "no links", "elements <link> and <joint>", path)
     above: dict[str, _Joint] = {}
-    for name, element in _named(root.every("joint"), path).items():
+    for name, element in _named(root.findall("joint"), path).items():
         joint = _Joint(element, name, path)
         for which, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
@@ -481,14 +477,14 @@ def _read(path: Path) -> _Urdf:
         TopologicalSorter({child: {joint.parent} for child, joint in above.items()}).prepare()
     except CycleError as error:
         raise InputError(f"link '{error.args[1][0]}'", "a cycle of joints", "a tree", path) from None
-    return _Urdf(path, data, root.attributes.get("name") or path.stem, links, above)
+    return _Urdf(path, data, root.get("name") or path.stem, links, above)
 
 
 def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
     """Return elements by their names."""
     known: dict[str, _Element] = {}
     for element in elements:
-        name = element.attributes.get("name", "")
+        name = element.get("name", "")
         if not name or name in known:
             found = f"'{name}' twice" if name else "one without a name"
             raise InputError(f"element <{element.tag}>", found, "every one with a name of its own", path)
@@ -498,14 +494,15 @@ def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
 
 def _root_element(data: bytes, path: Path) -> _Element:
     """Return the root element."""
-    top = _Element("", {}, 0)
+    top = _Placed("")
     stack = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if len(stack) > DEEPEST:
             raise InputError(f"element <{tag}>", f"more than {DEEPEST} levels", "a URDF", path)
-        element = _Element(tag, attributes, parser.CurrentByteIndex)
-        stack[-1].children.append(element)
+        element = _Placed(tag, attributes)
+        element.start = parser.CurrentByteIndex
+        stack[-1].append(element)
         stack.append(element)
 
     def doctype(*_: Any) -> None:
@@ -524,7 +521,7 @@ def _root_element(data: bytes, path: Path) -> _Element:
         raise InputError(where, expat.errors.messages[error.code], "well-formed XML", path) from None
     except (LookupError, ValueError) as error:
         raise InputError("the XML declaration", str(error), "UTF-8 text", path) from None
-    return top.children[0]
+    return top[0]
 
 
 def _urdf_text(path: Path) -> bytes:
@@ -592,10 +589,10 @@ def _masses(urdf: _Urdf, steps: Sequence[_Step], table: Array, G: Array) -> Grav
 
 def _inertial(urdf: _Urdf, name: str, body: _Element, required: bool) -> tuple[float, Array]:
     """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
-    inertial = body.every("inertial")
+    inertial = body.findall("inertial")
     if not inertial:
         return 0.0, np.zeros(3)
-    attributes = {e.tag: e.attributes for e in inertial[0].children}
+    attributes = {each.tag: each.attrib for each in inertial[0]}
     mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
     centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
     if mass is not None and centre is not None and mass[0] >= 0:
