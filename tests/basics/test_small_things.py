@@ -8,21 +8,19 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
-from rpim_opt.basics.text import LONGEST, as_html, shortened
+from rpim_opt.basics.text import LONGEST, shortened
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 
 
 def test_a_table_has_no_column_without_a_value_and_blanks_where_one_lacks() -> None:
-    rows = [{"name": "a", "std": None, "note": None}, {"name": "b", "std": 0.123456789, "note": None}]
-    html = as_html(rows, [], "Table")
-    assert "note" not in html
-    assert html.count("<td") == 2
-    assert "0.123457" in html
-    assert "None" not in html
-    empty = as_html([], ["Nothing was found."], "Table")
-    assert "Nothing was found." in empty
-    assert "<td" not in empty
+    parameters = ro.load("position").problem.parameters
+    html = parameters._repr_html_()
+    assert "tolerance" not in html
+    assert "rows more." in html
+    some = parameters.toleranced({"length_mm": 0.5})._repr_html_()
+    assert "tolerance" in some
+    assert "None" not in some + html
 
 
 def test_a_long_title_is_cut() -> None:
