@@ -25,12 +25,8 @@ from rpim_opt.robot.parameters import Parameters
 CRITERIA = ("D", "A", "E", "V")
 SMOOTH = 12
 """Power of the smooth least eigenvalue, (tr M^-p)^(-1/p)."""
-ROUNDINGS = 5
-"""How often the relaxation is rounded: once to the largest weights, then at random by them; the best set stays."""
 ANYWHERE = 1.0
 """Standard deviation of where a touched point is [m]."""
-ENOUGH = 2e-3
-"""Relative gap at which the relaxation is solved well enough."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -210,7 +206,7 @@ def choose(
     weights, bound = _relaxed(A, count, criterion, C, progress)
     progress("rounding")
     rng, value, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
-    for trial in range(ROUNDINGS):
+    for trial in range(5):  # to the largest weights, then at random by them; the best set stays
         start = np.argsort(-weights)[:count]
         if trial:
             share = np.maximum(weights, 1e-6)
@@ -293,7 +289,7 @@ def _relaxed(
         top = np.sum(Z * M) if criterion == "E" else value
         bound = min(bound, float(top + np.sort(gain)[-count:].sum() - gain @ w))
         off = (bound - value) / (n if criterion == "D" else abs(value))
-        if off <= ENOUGH:
+        if off <= 2e-3:
             break
         if k % 200 == 0:
             progress(f"relaxing over {len(A)} candidates: within {100 * off:.2f} %")

@@ -46,8 +46,6 @@ RARE = 1e-6
 """Probability with which chance may explain what is reported."""
 FEWEST = 6
 """Rows on either side of a change, or of which copies are told."""
-MOST_PLACES = 40
-"""Places of a change that are tried."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
@@ -536,7 +534,7 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
 
 def _places(count: int) -> list[int]:
     """Return before which rows a table may be parted."""
-    return np.unique(np.linspace(FEWEST, count - FEWEST, MOST_PLACES).round().astype(int)).tolist()
+    return np.unique(np.linspace(FEWEST, count - FEWEST, 40).round().astype(int)).tolist()
 
 
 # What residuals say

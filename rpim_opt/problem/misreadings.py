@@ -78,15 +78,10 @@ WRONG = 0.02
 """Points that are off by more than this part of their extent fit no drawing of their robot."""
 FEW = 30
 """Rows of a first try; what comes near the best is tried on more."""
-NEAR = 2.0
 SAME = 1.05
 """Readings that leave within this factor the same cannot be told apart."""
 MISTAKES = {False: 3, True: 1}
 """Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
-EXACT = 1e-9
-"""A smaller error [m] is none."""
-BEAM = 8
-"""First mistakes behind which a second one is looked for."""
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
 """How much of another joint a joint may count, of a neighbour and of others."""
 LEAST_ROWS, SOME_ROWS, STARTS, ROW_WRONG = 12, 60, 17, 10.0
@@ -132,7 +127,7 @@ class Better(NamedTuple):
     @property
     def factor(self) -> float:
         """How many times better it fits."""
-        return self.stated / max(self.left, EXACT)
+        return self.stated / max(self.left, 1e-9)
 
     @property
     def sentence(self) -> str:
@@ -381,7 +376,7 @@ def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading
         best = size
     if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
         readings = _readings(robot, points)
-        for i in np.argsort(_tried(robot, points, readings))[:BEAM]:
+        for i in np.argsort(_tried(robot, points, readings))[:8]:
             changed = readings[i].change(points)
             others = [each for each in _readings(robot, changed) if each.what != readings[i].what]
             second, left = _best(robot, changed, others)
@@ -421,7 +416,7 @@ def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[list[R
     least = float(size.min(initial=np.inf))
     if not np.isfinite(least):
         return [], float("inf")
-    near = [readings[i] for i in np.argsort(size) if size[i] <= NEAR * least][:8]
+    near = [readings[i] for i in np.argsort(size) if size[i] <= 2 * least][:8]
     whole = _tried(robot, points, near, len(points.row))
     k = int(np.argmin(whole))
     same = [each for each, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]

@@ -128,8 +128,6 @@ DRAWS = 200
 """Random configurations that are tried for each row."""
 FIRST, FAR = 10, 1e-3
 """After so many draws a row is out of reach from which the nearest configuration is further [m]."""
-STEPS = 40
-"""Newton steps from each: some dozen long ones until the target is near, then a few to rounding."""
 LONGEST, DIFFERENCE = 0.1, 1e-4
 """Largest step, and step of the central differences, in ranges of the joints."""
 DAMPING = 1e-9
@@ -240,7 +238,7 @@ class Target(NamedTuple):
         """Return joint values led from q (M, dof), and which of them (M,) are not there or beyond the limits."""
         low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
         there = np.zeros(len(q), dtype=bool)
-        for _ in range(STEPS):
+        for _ in range(40):  # some dozen long steps until the target is near, then a few to rounding
             way = np.flatnonzero(~there)
             q[way] = np.clip(q[way] + self._step(q[way], rows[way]), low, high)
             there[way] = np.linalg.norm(self.away(q[way], rows[way]), axis=1) < THERE

@@ -23,14 +23,6 @@ FLAT = 1e-6
 """Third singular value of a board's points over the first, below which they are in a plane."""
 LEAST_VIEWS = 3
 """Views that show focal lengths and centre."""
-UNDISTORTING = 30
-"""Rounds by which distortion is taken back; each leaves a small part of the last one's error."""
-BEFORE = 1e-6
-"""Least distance of a point before the camera [m]; what lies behind is seen there."""
-TIGHT = 1e-15
-"""Tolerance of a pose that is refined: to rounding."""
-ALIKE = 1e-9
-"""Fourth singular value of the equations of a focal length over the first, below which views are one."""
 UNCERTAIN = 3.0
 """By how much a view's pose is less certain than its points would be alone."""
 
@@ -45,7 +37,7 @@ def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
     k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
     xy = seen
-    for _ in range(UNDISTORTING):
+    for _ in range(30):  # each leaves a small part of the last one's error
         x, y = xy.T
         r2 = x**2 + y**2
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -144,10 +136,10 @@ def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
 
     def residual(step: Array) -> Array:
         there = transformed(pose_at(step), points)
-        return (there[:, :2] / np.maximum(there[:, 2:], BEFORE) - xy).ravel()
+        return (there[:, :2] / np.maximum(there[:, 2:], 1e-6) - xy).ravel()
 
     found = scipy.optimize.least_squares(
-        residual, np.zeros(6), method="lm", x_scale="jac", xtol=TIGHT, ftol=TIGHT, gtol=TIGHT
+        residual, np.zeros(6), method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
     return pose_at(found.x), float(2 * found.cost)
 
@@ -187,7 +179,7 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     with np.errstate(divide="ignore", invalid="ignore"):
         size = b33 - b13**2 / b11 - b23**2 / b22
         squares = np.array([size / b11, size / b22])
-    if s[3] <= ALIKE * s[0] or not (np.isfinite(squares).all() and (squares > 0).all()):
+    if s[3] <= 1e-9 * s[0] or not (np.isfinite(squares).all() and (squares > 0).all()):
         raise InputError("the camera", "views that tell no focal length", accepted)
     scale = unit[0, 0]
     fx, fy = np.sqrt(squares) / scale

@@ -41,8 +41,6 @@ from rpim_opt.robot.parameters import Parameters, model_parameters
 
 ENOUGH, FEW = 2000, 300
 """Rows of a measurement that register frames, where there are more; of all together, where they are only compared."""
-QUICK_STEPS = 12
-"""Steps of a registration of base and reflectors."""
 MISFIT = 3.0
 """Nominal errors of a robot up to which positions agree with a registration in closed form."""
 FREE = 0.1
@@ -185,7 +183,7 @@ def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Arra
     q = rows.q @ robot.joint_map.T
     spread = np.full(len(places), TOOL_ERROR)
     given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
-    fit = fit_arms(robot, given, QUICK_STEPS)
+    fit = fit_arms(robot, given, steps=12)
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
     _turn(found, fit.base[0], rows)
     return frame_numbers(fit.base[0]), found, fit.error[0]
@@ -244,11 +242,6 @@ def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, dict[str, Array
 
 MISPLACED = 3.0
 """How many scales a frame may be from where it is stated before the statement counts as a mistake."""
-MOST_STEPS = 200
-"""Steps, taken or refused, after which frames are as good as they get."""
-SHORT, ROUNDING = 1e-11, 1e-12
-"""Frames are found when a full step is shorter than the first, relative to 1 + |z|; a step is refused when it raises
-the objective by more than the second."""
 
 
 def problem_from(
@@ -497,19 +490,19 @@ def settled(alone: Source) -> Array:
     z = np.zeros(len(scale))
     model = source.linearize(scale * z)
     damping = 0.0
-    for _ in range(MOST_STEPS):
+    for _ in range(200):
         R = model.triangle[:, :-1]
         A = np.vstack([R, np.eye(len(z))])
         size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
         right = np.concatenate([model.triangle[:, -1] - R @ z, -z, np.zeros(len(z))])
         step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), right, rcond=None)[0]
         candidate = source.linearize(scale * (z + step))
-        if _objective(candidate, z + step) > _objective(model, z) * (1 + ROUNDING):
+        if _objective(candidate, z + step) > _objective(model, z) * (1 + 1e-12):
             damping = max(4 * damping, 1e-3)
             continue
         z = z + step
         model = candidate
-        if damping == 0 and np.linalg.norm(step) <= SHORT * (1 + np.linalg.norm(z)):
+        if damping == 0 and np.linalg.norm(step) <= 1e-11 * (1 + np.linalg.norm(z)):
             break
         damping = damping / 8 if damping > 1e-6 else 0.0
     return scale * z

@@ -30,18 +30,13 @@ EXPLAINED = 3.0
 """A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""
 NEAR_ZERO = 0.2
 """Joint zeros up to this [rad] are left to the calibration, as deviations of theta."""
-ROUND, SNAP = np.pi / 2, np.radians(2)
-"""Zeros this close to a multiple of a quarter turn are that."""
-FEWEST_STARTS, STARTS_PER_SIGNS = 600, 6
+QUARTER = np.pi / 2
 SHORT, LONG = 14, 45
 """Steps of all starts of a round, and of the best quarter."""
 ROUNDS, HITS = 4, 5
 """Rounds at most, and starts that have to end in the best optimum."""
-SAME_OPTIMUM = 1.05
 FEW = 40
 """Rows of a search; the best candidates are fitted to more."""
-KEPT = 64
-"""Candidates that are fitted to all rows."""
 LEAST_NOISE = 5e-5
 """Floor of the error of a point [m]: what is nearer is rounding."""
 ODDS = 30.0
@@ -231,7 +226,7 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
     if small and rms(near)[0] <= UNEXPLAINED * few.extent:
         return None
     signs = np.array(list(product([1.0, -1.0], repeat=n)))
-    count = max(FEWEST_STARTS, STARTS_PER_SIGNS * len(signs))
+    count = max(600, 6 * len(signs))
     pool = [_round(robot, few, *_plain_starts(n, signs, turning))]
     starts = 0
     cost = np.zeros(0)
@@ -241,12 +236,12 @@ def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
         pool.append(_round(robot, few, sign, zero))
         starts += count
         cost = np.concatenate([fit.cost for _, fit in pool])
-        if np.count_nonzero(cost < SAME_OPTIMUM * cost.min() + 1e-12) >= HITS:
+        if np.count_nonzero(cost < 1.05 * cost.min() + 1e-12) >= HITS:
             break
     sign = np.concatenate([each for each, _ in pool])
     zero = np.concatenate([fit.zero for _, fit in pool])
     tools = np.concatenate([fit.tools for _, fit in pool])
-    best = np.argsort(cost)[:KEPT]
+    best = np.argsort(cost)[:64]  # they are fitted to all rows
     candidates = _signed(robot, points, np.vstack([np.ones((1, n)), sign[best]]))
     candidates = candidates._replace(
         zero=np.vstack([near.zero, zero[best]]), tools=np.concatenate([near.tools, tools[best]])
@@ -259,7 +254,7 @@ def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Arr
     """Return what happens most: any joints reversed, or at most one, and one that is a quarter or half a turn off."""
     zero = [np.zeros(n)]
     for i in np.flatnonzero(turning):
-        zero += [angle * np.eye(n)[i] for angle in (ROUND, -ROUND, 2 * ROUND)]
+        zero += [angle * np.eye(n)[i] for angle in (QUARTER, -QUARTER, 2 * QUARTER)]
     one = np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
     sign = np.vstack([signs, np.repeat(one, len(zero) - 1, axis=0)])
     return sign, np.vstack([np.zeros_like(signs), np.tile(zero[1:], (len(one), 1))])
@@ -345,9 +340,9 @@ def _gauged(robot: Robot, zero: Array) -> Array:
         zero[0] = 0.0
     if turning[-1] and robot.mdh[-1, 4] == 0:
         zero[-1] = 0.0
-    quarter = ROUND * np.round(zero / ROUND)
-    quarter = np.where(quarter < -1.5 * ROUND, np.pi, quarter)  # half a turn either way
-    return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < SNAP), quarter, zero)
+    quarter = QUARTER * np.round(zero / QUARTER)
+    quarter = np.where(quarter < -1.5 * QUARTER, np.pi, quarter)  # half a turn either way
+    return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < np.radians(2)), quarter, zero)
 
 
 def _plain(sign: Array, zero: Array) -> tuple[int, int, float]:

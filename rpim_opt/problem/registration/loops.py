@@ -17,23 +17,15 @@ from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, 
 
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
-SINGULAR = 1e-13
 LOSSES = ("squares", "truncated")
 QUANTILE = 0.99
 """Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
-GRADUATION = 1.6
-"""Factor by which the truncated loss comes nearer to itself from one iteration to the next."""
-MOST_ITERATIONS = 100
-SETTLED = 1e-6
-"""Costs that differ by less, relatively, are one."""
 FEWEST = 3
 """Measurements that have to have a weight."""
 MOST_PAIRED = 2000
 """Measurements up to which all pairs are compared."""
 TRIED, FEW = 40, 10
 """Measurements, evenly spread, whose compatible sets are tried, and the most sets that are."""
-ROUNDING = 1e-7
-"""Error of an angle from its cosine [rad]."""
 SURPRISE = 1e-4
 """Probability that a good measurement is off by more than counts as good."""
 
@@ -74,7 +66,7 @@ class Loops:
     def form(self, triangle: Array) -> Array:
         """Return L (n-linear, n-linear), with |L x|^2 the least over translations and scale (a Schur complement)."""
         pivots = np.abs(np.diag(triangle)[: self.linear])
-        if pivots.min() <= SINGULAR * pivots.max():
+        if pivots.min() <= 1e-13 * pivots.max():
             raise InputError("poses", "places that do not determine translations and scale", "places that differ")
         return triangle[self.linear :, self.linear :]
 
@@ -198,7 +190,7 @@ def compatible(loops: Loops, beyond: Array) -> np.ndarray:
         flat = rotations.reshape(-1, 9)
         angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
     chord = loops.sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
-    off = 2 * np.arcsin(np.minimum(1.0, chord)) + ROUNDING
+    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
     known = (loops.group[:, None] == loops.group) & (loops.group >= 0)
     return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
 
@@ -283,7 +275,7 @@ def solve(loops: Loops, loss: str, candidates: Sequence[Array] = ()) -> Solved:
         distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
         found += [solver.graduated(part) for part in distinct if part.sum() >= FEWEST]
     least = min(each.cost for each in found)
-    best = next(each for each in found if each.cost * (1 - SETTLED) <= least)  # the first, up to rounding
+    best = next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
     return replace(best, alone=_alone(loops, best.squares, best.weights > 0, beyond))
 
 
@@ -306,7 +298,7 @@ class Solver:
 
     def repeated(self, solved: Solved) -> Solved:
         """Return the fixed point of weights and solution, the last of which is the relaxation's."""
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(100):
             weights = (solved.squares <= self.beyond).astype(float)
             same = np.array_equal(weights, solved.weights)
             bounded = bool(np.isfinite(solved.smallest.bound))
@@ -326,13 +318,13 @@ class Solver:
         """
         solved = self.weighted(among.astype(float))
         mu = 1 / max(2 * float(np.max(among * solved.squares / self.beyond)) - 1, 1e-3)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(100):
             between = np.sqrt(mu * (mu + 1) * self.beyond / np.maximum(solved.squares, 1e-300)) - mu
             weights = among * np.clip(between, 0.0, 1.0)
             if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
                 break
             solved = self.weighted(weights, near=solved.smallest.rotations)
-            mu *= GRADUATION
+            mu *= 1.6
         return self.repeated(solved)
 
     def begun(self, rotations: Array) -> Solved | None:

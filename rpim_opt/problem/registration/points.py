@@ -27,15 +27,8 @@ LEVER = 0.3
 """Length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions."""
 TRUSTED = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
-REWEIGHTED = 2
-"""Steps between two computations of these weights."""
-QUIET = 5
-"""Steps in a row without a decrease that end a fit."""
-FIRST_DAMPING = 1e-2
 LARGEST_BATCH = 4_000_000
 """Entries of the Jacobians in memory at once."""
-SHORT = 1e-9
-"""Relative decrease of the cost below which a fit has converged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +212,7 @@ class _State(NamedTuple):
 
 def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
     B, N, _ = candidates.y.shape
-    damping = np.full(B, FIRST_DAMPING)
+    damping = np.full(B, 1e-2)
     weights = np.ones((B, N))
     pull = (noise / candidates.spread) ** 2
     y = np.moveaxis(candidates.y, -1, 0)
@@ -228,7 +221,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     size = candidates.tools[0].size
     quiet = 0
     for k in range(steps):
-        if robust and k % REWEIGHTED == 0:
+        if robust and k % 2 == 0:
             error = np.linalg.norm(state.residual, axis=0)
             limit = TRUSTED * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
@@ -243,8 +236,8 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
         before = state.cost
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
         state = state.where(better, candidate)
-        quiet = 0 if (before - state.cost > SHORT * before).any() else quiet + 1
-        if quiet == QUIET:
+        quiet = 0 if (before - state.cost > 1e-9 * before).any() else quiet + 1
+        if quiet == 5:
             break
     turn = np.swapaxes(state.base, 1, 2)
     seen = np.einsum("bij,jbn->bni", turn, state.points)

@@ -20,13 +20,8 @@ where moments are those of several rotations."""
 NEGLIGIBLE = 1e-14
 """Entries of a form that are rounding, relative to the largest: without them Clarabel sees which cliques it falls into
 (Agler et al. 1988, Linear Algebra and its Applications 107:101), and time grows with the number of tools alone."""
-STEPS = 50
-"""Newton steps after which rotations are as good as they get."""
-SHORT = 1e-13
-"""Rotations are found when a step is shorter [rad]."""
 SPREAD = 1e-3
 """Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
-DRAWN = 20
 CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))
 """The matrices of the cross products e_a x."""
 
@@ -187,7 +182,7 @@ def _rounded(moments: Moments) -> list[Array]:
     lifts = [moments.matrix[:, 0]]
     if moments.rank_ratio > SPREAD:
         eigenvalues, vectors = np.linalg.eigh(moments.matrix)
-        normal = np.random.default_rng(0).normal(size=(DRAWN, len(eigenvalues)))
+        normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
         drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
         lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
     return [proper(lift[1:].reshape(-1, 3, 3)) for lift in lifts]
@@ -213,7 +208,7 @@ def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
 def _refined(L: Array, rotations: Array) -> Array:
     """Return the stationary rotations to which Newton's steps lead, uphill directions turned, long steps halved."""
     value = _value(L, rotations)
-    for _ in range(STEPS):
+    for _ in range(50):
         slope, curvature = _derivatives(L, rotations)
         eigenvalues, V = np.linalg.eigh(curvature)
         sizes = np.maximum(np.abs(eigenvalues), 1e-14 * np.abs(eigenvalues).max() + 1e-300)
@@ -229,6 +224,6 @@ def _refined(L: Array, rotations: Array) -> Array:
             return rotations
         rotations = candidate
         value = lower
-        if np.linalg.norm(step) < SHORT:
+        if np.linalg.norm(step) < 1e-13:  # rad
             break
     return rotations
