@@ -660,17 +660,21 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
         "offset of the first joint."
     )
-    scale = _scale(problem, model.A)
-    if scale is None:
+    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
+    known = {problem.labels[i] for block in drawn for i in block.row}
+    alone = _scale(problem, problem.without(known).linearize(x).A)
+    if alone is None:
         yield "All touched points are in one place: the size of the robot rests on its nominal lengths."
         return
-    known = f"Distances between touched places: known to {1e3 * scale:.2g} mm in a metre"
-    if any(tie.kind == "known_distance" for tie in touches.ties):
-        yield f"{known}."
+    distances = "Distances between touched places: known to"
+    by_touches = f"{1e3 * alone:.2g} mm in a metre"
+    if known:
+        with_known = f"{1e3 * (_scale(problem, model.A) or alone):.2g} mm in a metre"
+        yield f"{distances} {with_known}, and to {by_touches} without the stated distances."
     else:
         yield (
-            f"{known} by touches and the scales of the file; a known distance between two of them ([[known_distance]]) "
-            "would determine the size of the robot."
+            f"{distances} {by_touches} by touches and the scales of the file; a known distance between two of them "
+            "([[known_distance]]) would determine the size of the robot."
         )
 
 
