@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
 from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
@@ -37,7 +37,6 @@ from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.select import Selection
 from rpim_opt.convex.trust import trusted_rows
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
 from rpim_opt.problem.blocks import Source, in_parts
@@ -45,7 +44,7 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.global_start import JointMapping
-from rpim_opt.problem.row_functions import bearing, transform
+from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameter_names import own_name
 
@@ -193,7 +192,8 @@ class Outcome:
         >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
         array([ 0.822, -0.026,  0.197])
         """
-        return self._at(q, transform, marker, torque, payload, columns, robot).modelled(self.x)[0].reshape(-1, 4, 4)
+        there = self.problem.sample().measuring(q, transform, marker, torque, payload, columns, robot)
+        return there.modelled(self.x)[0].reshape(-1, 4, 4)
 
     def predict(
         self,
@@ -225,9 +225,8 @@ class Outcome:
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
-        problem = self._at(q, position, marker, torque, payload, columns, robot)
-        noise = position_noise(self.problem)[None]
-        problem = problem.on(replace(problem.data, blocks=(replace(problem.data.blocks[0], covariance=noise),)))
+        noise = position_noise(self.problem)
+        problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
         covariance = self.spread.of_positions(J)
         added = scattered(problem, self.noise_level)
@@ -249,24 +248,6 @@ class Outcome:
         """The measured range of every joint (2, dof) [rad or m], by robot, that of earlier calibrations included."""
         earlier = [(robot, np.array(r)) for each in self.record.earlier for robot, r in each.ranges.items()]
         return diagnosis.widest([*diagnosis.measured_ranges(self.problem).items(), *earlier])
-
-    def _at(
-        self,
-        q: Array,
-        measurement: Measurement,
-        marker: str,
-        torque: Array | None = None,
-        payload: float | Array | None = None,
-        columns: Mapping[str, Array] = MappingProxyType({}),
-        robot: str = "",
-    ) -> CalibrationProblem:
-        """Return the problem with a reflector seen by some measurement at the joint values q (N, dof)."""
-        if robot not in self.problem.arms:
-            raise InputError("robot", f"'{robot}'", choices(robot, self.problem.arms))
-        q = np.atleast_2d(np.asarray(q, dtype=float))
-        data = Dataset.of(q, np.zeros((len(q), len(measurement.columns))), 1.0, measurement=measurement)
-        data = bearing(data, self.problem.data, torque, payload, columns)
-        return self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(marker,), robot=robot),)))
 
     # --- errors ------------------------------------------------------------------------------------------------
 

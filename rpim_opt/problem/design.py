@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import bearing
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
@@ -228,15 +227,10 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
         kind = position
     if kind.points != 1:
         raise InputError("design", f"measurement '{kind.name}' between two points", "measurements of one point")
-    y = np.zeros((len(q), len(kind.columns)))
-    if "qw" in kind.columns:
-        y[:, list(kind.columns).index("qw")] = 1.0
     covariance = np.broadcast_to(np.median(block.covariance, axis=0), block.covariance.shape[1:])
-    data = Dataset.of(q, y, covariance, measurement=kind)
     torque = None if block.torque is None else np.zeros(q.shape)
-    data = bearing(data, problem.data, torque)
-    data = replace(data, blocks=(replace(data.blocks[0], markers=block.markers, fixture=block.fixture),))
-    there, scale = problem.on(data), problem.parameters.free.scale
+    there = problem.measuring(q, kind, torque=torque, covariance=covariance)
+    scale = problem.parameters.free.scale
     x = np.zeros(len(scale))
     rows = there.linearize(x).A if whitened else there.jacobian(x) * scale
     rows = rows.reshape(len(q), -1, len(scale))

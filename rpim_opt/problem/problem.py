@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -15,7 +16,8 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
-from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import Identified, LinearModel, Reweigh, identified_of
 from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
@@ -282,6 +284,56 @@ class CalibrationProblem(RobotModel):
             measured = measured_torques(self.data, name), measured_torques(data, name)
             require_same_torques(self.arms[name], self.parameters.of_robot(name), *measured)
         return replace(self, data=data)
+
+    def measuring(
+        self,
+        q: Array,
+        measurement: Measurement = position,
+        marker: str | None = None,
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        columns: Mapping[str, Any] = MappingProxyType({}),
+        robot: str = "",
+        covariance: float | Array = 1.0,
+    ) -> CalibrationProblem:
+        """Return the same problem with a reflector measured at joint values q (N, dof) [rad or m], all values zero.
+
+        Parameters
+        ----------
+        marker
+            By default that of the first row.
+        torque, payload, columns
+            What the joints bear: (N, dof) [Nm], mass at the flange [kg], one or (N,), further columns by name [SI], one
+            number or (N,). Directions of approach are 0 where the data state them: the joints are in the middle of
+            their backlash.
+        robot
+            Which of several.
+        covariance
+            As `Dataset.of` takes it.
+        """
+        if robot not in self.arms:
+            raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
+        q = np.atleast_2d(np.asarray(q, dtype=float))
+        N = len(q)
+        y = np.zeros((N, len(measurement.columns)))
+        if "qw" in measurement.columns:
+            y[:, list(measurement.columns).index("qw")] = 1.0
+        sided = any(block.approach is not None for block in self.data.blocks)
+        data = Dataset.of(
+            q,
+            y,
+            covariance,
+            measurement=measurement,
+            torque=torque,
+            payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
+            approach=np.zeros(q.shape) if sided else None,
+            columns={name: np.broadcast_to(np.asarray(each, dtype=float), N) for name, each in columns.items()},
+        )
+        first = self.data.blocks[0]
+        own = first.markers[:1] if marker is None else (marker,)
+        fixture = first.fixture if measurement is first.measurement else ""
+        block = replace(data.blocks[0], markers=own, fixture=fixture, robot=robot)
+        return self.on(replace(data, blocks=(block,)))
 
     def without(self, labels: Collection[str]) -> CalibrationProblem:
         """Return the same problem without the rows of these labels."""

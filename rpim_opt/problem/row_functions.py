@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
-from types import MappingProxyType
 from typing import NamedTuple
 
 import casadi as ca
@@ -362,32 +360,6 @@ def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now
         accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"
         raise InputError("compliances", "joint torques", accepted)
     raise InputError("compliances", "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
-
-
-def bearing(
-    data: Dataset,
-    like: Dataset,
-    torque: Array | None = None,
-    payload: float | Array | None = None,
-    columns: Mapping[str, Array] = MappingProxyType({}),
-) -> Dataset:
-    """Return rows of one point in one block with what their joints bear, as rows of a problem with data ``like`` these.
-
-    ``torque``: (N, dof) joint torques [Nm]; ``payload``: mass at the flange [kg], one or (N,); ``columns``: further
-    columns by name [SI], one number or (N,). Directions of approach are 0 where those data state them: the joints are
-    in the middle of their backlash.
-    """
-    (block,) = data.blocks
-    if torque is not None:
-        torque = np.reshape(np.asarray(torque, dtype=float), (len(data), 1, -1))
-    if payload is not None:
-        payload = np.broadcast_to(np.asarray(payload, dtype=float), (len(data),))
-    approach = None
-    if any(each.approach is not None for each in like.blocks):
-        approach = np.zeros(block.q.shape)
-    known = {name: np.broadcast_to(np.asarray(values, dtype=float), len(data)) for name, values in columns.items()}
-    block = replace(block, torque=torque, payload=payload, approach=approach, columns=known)
-    return replace(data, blocks=(block,))
 
 
 def repeatable(block: Block) -> Array:

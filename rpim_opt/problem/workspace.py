@@ -10,17 +10,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
 from rpim_opt.data.measurements.contact import revisit
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.linear import Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.closed_forms import transformed
-from rpim_opt.problem.row_functions import bearing
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
@@ -63,11 +60,7 @@ def _there(machine: Machine, q: Array, marker: str | None, torque: Array | None)
     if not np.isfinite(q).all() or q.shape[1] != robot.dof:
         found = f"joint values of shape {q.shape}"
         raise InputError("positions", found, f"finite numbers (N, {robot.dof}) [rad or m]")
-    data = Dataset.of(q, np.zeros((len(q), 3)), 1.0, measurement=position)
-    data = bearing(data, machine.data, torque)
-    block = replace(data.blocks[0], markers=(markers(machine)[0] if marker is None else marker,))
-    problem = CalibrationProblem(robot, machine.parameters, machine.data)
-    return problem.on(replace(data, blocks=(block,)))
+    return CalibrationProblem(robot, machine.parameters, machine.data).measuring(q, marker=marker, torque=torque)
 
 
 def markers(machine: Machine) -> list[str]:
@@ -181,14 +174,9 @@ def postures_at(
     points = np.atleast_2d(np.asarray(points, dtype=float))
     if x is None:
         x = np.zeros(len(problem.parameters.free))
-    if marker is None:
-        marker = problem.data.blocks[0].markers[0]
 
     def away(q: Array, rows: np.ndarray) -> Array:
-        data = Dataset.of(q, np.empty((len(q), 0)), 1.0, measurement=revisit)
-        data = bearing(data, problem.data, None)
-        block = replace(data.blocks[0], markers=(marker,))
-        return problem.on(Dataset((block,), data.label, data.configuration)).modelled(x)[0] - points[rows]
+        return problem.measuring(q, revisit, marker).modelled(x)[0] - points[rows]
 
     middle = problem.robot.limits.mean(axis=1)
     half = share * np.ptp(problem.robot.limits, axis=1) / 2

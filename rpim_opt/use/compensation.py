@@ -29,7 +29,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import Loads, bearing, loads_on, measured_torques, require_same_torques
+from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
@@ -483,9 +483,7 @@ class _Cell(NamedTuple):
         """Return sqrt(tr (J C J' + R)) (N,) [m] of the positions reached at commands; R is the repeatability's."""
         if self.covariance is None:
             return np.full(len(q), np.inf)
-        data = Dataset.of(q, np.zeros((len(q), 3)), self.noise, measurement=position)
-        data = bearing(data, self.problem.data, torque, payload)
-        problem = self.problem.on(replace(data, blocks=(replace(data.blocks[0], markers=(self.marker,)),)))
+        problem = self.problem.measuring(q, position, self.marker, torque, payload, covariance=self.noise)
         J = problem.jacobian(self.x)
         known = np.isfinite(np.diag(self.covariance))
         C = np.where(np.outer(known, known), self.covariance, 0.0)

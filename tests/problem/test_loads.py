@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.row_functions import Needs, bearing, loads_of, repeatable
+from rpim_opt.problem.row_functions import Needs, loads_of, repeatable
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
@@ -168,16 +168,16 @@ def test_a_distances_second_point_may_come_from_another_side() -> None:
 
 def test_what_rows_bear_is_theirs() -> None:
     problem = ro.load("position").problem
-    data = problem.data.take(np.arange(4))
+    q = problem.data.q[:4]
     torque = np.arange(24.0).reshape(4, 6)
-    found = bearing(data, problem.data, torque, payload=2.5, columns={"heat": 20.0}).blocks[0]
+    found = problem.measuring(q, torque=torque, payload=2.5, columns={"heat": 20.0}).data.blocks[0]
     assert found.torque is not None
     assert np.array_equal(found.torque, torque[:, None])
     assert found.payload is not None
     assert found.payload.tolist() == [2.5] * 4
     assert found.columns["heat"].tolist() == [20.0] * 4
     assert found.approach is None
-    bare = bearing(data, problem.data).blocks[0]
+    bare = problem.measuring(q).data.blocks[0]
     assert bare.torque is None
     assert bare.payload is None
 
