@@ -70,7 +70,20 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     ['spring', 'autumn']
     """
     parts = {**dict(zip(ascii_uppercase, problems, strict=False)), **named}
-    _require_parts(parts, len(problems) + len(named))
+    count = len(problems) + len(named)
+    if len(parts) < max(count, 2):
+        raise InputError("together", f"{count} problems with {len(parts)} names", "two or more, each with its name")
+    for name, part in parts.items():
+        where = f"together, problem '{name}'"
+        if not NAME.fullmatch(name):
+            raise InputError("together", f"the name '{name}'", "letters, digits and _, neither tool nor base")
+        if not isinstance(part, CalibrationProblem):
+            raise InputError(where, type(part).__name__, "a CalibrationProblem, in memory")
+        if len(part.arms) > 1:
+            raise InputError(where, "several robots", "one; give all problems in one call")
+        if part.scatter is not None:
+            accepted = "none: it is estimated, or stated for the whole problem by .scattered()"
+            raise InputError(where, "the robot's repeatability", accepted)
     common = _common(parts, shared)
     tables = []
     for name, part in parts.items():
@@ -85,23 +98,6 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     whole = CalibrationProblem(robots, _concatenated(tables), data)
     met(whole)  # what is touched by several robots is in one place
     return whole
-
-
-def _require_parts(parts: Mapping[str, CalibrationProblem], count: int) -> None:
-    """Refuse what cannot be put together."""
-    if len(parts) < max(count, 2):
-        raise InputError("together", f"{count} problems with {len(parts)} names", "two or more, each with its name")
-    for name, part in parts.items():
-        where = f"together, problem '{name}'"
-        if not NAME.fullmatch(name):
-            raise InputError("together", f"the name '{name}'", "letters, digits and _, neither tool nor base")
-        if not isinstance(part, CalibrationProblem):
-            raise InputError(where, type(part).__name__, "a CalibrationProblem, in memory")
-        if len(part.arms) > 1:
-            raise InputError(where, "several robots", "one; give all problems in one call")
-        if part.scatter is not None:
-            accepted = "none: it is estimated, or stated for the whole problem by .scattered()"
-            raise InputError(where, "the robot's repeatability", accepted)
 
 
 def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> tuple[str, ...]:

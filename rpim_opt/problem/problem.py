@@ -407,7 +407,8 @@ class CalibrationProblem(RobotModel):
         """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
         residual = self._uncentred(x)
         if self.touches is not None:
-            residual, _ = self.touches.centred(residual, np.zeros((len(residual), 0)), self._size)
+            nothing = np.zeros((len(residual), 0))
+            residual, _ = self.touches.centred(residual, nothing, self.touches.size(self._nominal_residual))
         return residual
 
     def _uncentred(self, x: Array) -> Array:
@@ -421,7 +422,7 @@ class CalibrationProblem(RobotModel):
         jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
         if self.touches is None or not centred:
             return residual, jacobian
-        return self.touches.centred(residual, jacobian, self._size)
+        return self.touches.centred(residual, jacobian, self.touches.size(self._nominal_residual))
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
@@ -581,11 +582,6 @@ class CalibrationProblem(RobotModel):
     def _nominal_residual(self) -> Array:
         return self._uncentred(np.zeros(len(self.parameters.free)))
 
-    @cached_property
-    def _size(self) -> float:
-        """How far the nominal robot's touches spread [m]."""
-        return 0.0 if self.touches is None else self.touches.size(self._nominal_residual)
-
     def contrasts(self, values: Array) -> Array:
         """Return what values of the rows' equations (m, c) say without the points that were touched, (k, c).
 
@@ -629,14 +625,17 @@ class CalibrationProblem(RobotModel):
         ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
         they are taken [SI], None for nominal.
         """
-        slopes = self.joint_slopes(at) if joints else None
-        shifts = self._shifts(at)
-        groups = self._equations.grouped(self.data.configuration[self._equations.row])
-        found = [self._equations.stack(index, slopes, shifts) for index in groups]
+        found = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
         return contrasted(self.touches, found, self.touched, stop[self._equations.row])
+
+    def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
+        """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
+        slopes = self.joint_slopes(at) if joints else None
+        shifts = self._shifts(at)
+        return [self._equations.stack(index, slopes, shifts) for index in groups]
 
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].
@@ -647,20 +646,25 @@ class CalibrationProblem(RobotModel):
         if scatter is None:
             found = [block.covariance * reading for block in self.data.blocks]
         else:
-            slopes = self.joint_slopes(scatter.at) if scatter.joint > 0 else None
-            shifts = self._shifts(scatter.at)
-            stacks = [self._equations.stack(index, slopes, shifts) for index in equation_numbers(self.data)]
+            stacks = self._stacked(equation_numbers(self.data), scatter.joint > 0, scatter.at)
             found = [stack.covariance(scatter, reading) for stack in stacks]
         if self.touches is None:
             return found
         return of_rows(self.touches, self.data, found, self.touched, reading)
 
-    def _slopes_by(self, chosen: np.ndarray, at: Array | None) -> list[Array]:
-        """Return the slopes (m, c) of each block by chosen parameters (P,), at values (P,) of all [SI] or nominal."""
-        nominal = self.parameters.nominal if at is None else at
-        alone = self.with_parameters(replace(self.parameters, nominal=nominal, identified=chosen))
-        x = np.zeros(int(chosen.sum()))
-        return [alone._evaluated(block, "jacobian", x)[1].reshape(-1, len(x)) for block in self.data.blocks]
+    def _slopes_by(self, columns: Mapping[str, int], width: int, at: Array | None) -> Array:
+        """Return the slopes (m, width) of modelled values by parameters, summed in the columns that these have.
+
+        They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
+        """
+        p = self.parameters
+        chosen = np.array([name in columns for name in p.names])
+        found = np.zeros((len(self._equations.row), width))
+        if chosen.any():
+            alone = replace(p, nominal=p.nominal if at is None else at, identified=chosen)
+            J = self.with_parameters(alone).slopes(np.zeros(int(chosen.sum())), centred=False)[1]
+            np.add.at(found.T, [columns[name] for name in p.names if name in columns], J.T)
+        return found
 
     def joint_slopes(self, at: Array | None = None) -> Array:
         """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
@@ -673,14 +677,8 @@ class CalibrationProblem(RobotModel):
                 if kind == "revolute":
                     joints[f"theta{i + 1}"] = i
                     joints[f"{name}.theta{i + 1}"] = i
-        names = self.parameters.names
-        chosen = np.array([name in joints for name in names])
-        found = np.zeros((len(self._equations.row), max(len(robot.mdh) for robot in self.arms.values())))
-        if chosen.any():
-            J = np.concatenate(self._slopes_by(chosen, at))
-            # the same joint of several robots: a row has slopes by those of its own robot alone
-            np.add.at(found.T, [joints[name] for name in names if name in joints], J.T)
-        return found
+        # the same joint of several robots: a row has slopes by those of its own robot alone
+        return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)
 
     def _shifts(self, at: Array | None) -> Array | None:
         """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
@@ -691,14 +689,9 @@ class CalibrationProblem(RobotModel):
         seen = [block.measurement.metres is not None for block in self.data.blocks]
         if not any(seen):
             return None
-        names = [own_name(name) for name in self.parameters.names]
-        columns = [SHIFTED.index(name) for name in names if name in SHIFTED]
-        parts = self._slopes_by(np.array([name in SHIFTED for name in names]), at)
-        found = [np.zeros((len(part), 3)) for part in parts]
-        for sums, part, camera in zip(found, parts, seen, strict=True):
-            if camera:
-                np.add.at(sums.T, columns, part.T)
-        return np.concatenate(found)
+        columns = {name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED}
+        camera = np.repeat(seen, [index.size for index in equation_numbers(self.data)])
+        return self._slopes_by(columns, len(SHIFTED), at) * camera[:, None]
 
 
 def error_dimensions(block: Block) -> list[str]:

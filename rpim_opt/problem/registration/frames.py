@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
@@ -342,9 +342,15 @@ def starting_parameters(
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
     for block in data.blocks:
-        given = _own_values(robot, block, base, places[block.markers[0]], own)
-        for name, dimension in block.measurement.parameters.items():
-            entries[of_fixture(name, block.fixture)] = (dimension, float(given.get(name, 0.0)))
+        kind = block.measurement
+        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+        given: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
+        if names and not given and kind.start is not None:  # where the nominal robot puts the fixture
+            tool = numeric_frame(places[block.markers[0]])
+            T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
+            given = kind.start(T[:, :3, 3], block.y)
+        for name, dimension in kind.parameters.items():
+            entries[names[name]] = (dimension, float(given.get(name, 0.0)))
     if temperature is None and len(data.temperatures):
         temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
@@ -366,19 +372,6 @@ def own_frames(data: Dataset) -> tuple[str, ...]:
     """Return the prefixes of the frames that measurements have of their own, ``plane_``."""
     blocks = [(block.measurement, block.fixture) for block in data.blocks]
     return tuple(dict.fromkeys(of_fixture(name + "_", fixture) for kind, fixture in blocks for name in kind.frames))
-
-
-def _own_values(
-    robot: Robot, block: Block, base: Place, tool: Place, stated: Mapping[str, float]
-) -> Mapping[str, float]:
-    """Return what is stated of a measurement's own parameters, or where the nominal robot puts its fixture."""
-    kind = block.measurement
-    names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-    given = {name: stated[full] for name, full in names.items() if full in stated}
-    if given or not names or kind.start is None:
-        return given
-    T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ numeric_frame(tool)
-    return kind.start(T[:, :3, 3], block.y)
 
 
 def relocated(problem: Source) -> Source | None:
