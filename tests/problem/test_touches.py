@@ -233,7 +233,8 @@ def test_in_parts_as_in_memory() -> None:
     problem = ro.load("contact").problem
     rows = [np.flatnonzero(np.isin(problem.data.configuration, some)) for some in (range(4), range(4, 8))]
     x = near(problem)
-    spread = [problem.on(problem.data.take(some))._size for some in rows]
+    halves = [problem.on(problem.data.take(some)) for some in rows]
+    spread = [half.touches.size(half.slopes(0 * x, centred=False)[0]) for half in halves if half.touches]
     parts = [lambda some=some: problem.data.take(some) for some in rows]
     whole = ro.problem.PartitionedProblem(problem.robot, problem.parameters, parts[0](), parts)
     model = whole.linearize(x)
